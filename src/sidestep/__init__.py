@@ -1,0 +1,77 @@
+"""Behavior-aware modeling: learn transition dynamics, and so hidden obstacles, from what people do.
+
+The names here are the public ones; `docs/mathematics.md` explains what they compute.
+"""
+
+from sidestep.demonstrations import Demonstrations, Trajectory, demonstrations, gather
+from sidestep.errors import ImproperTask, InputError, NotConverged, SidestepError
+from sidestep.evaluation import Reward, evaluate, plan_paths
+from sidestep.inference.fit import Fit, Progress, fit
+from sidestep.inference.optimisers import LBFGS, Ascent
+from sidestep.inference.priors import Normal
+from sidestep.io.maps import read_map, write_map
+from sidestep.io.walks import Walks, read_walks, write_walks
+from sidestep.simulation import simulate
+from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax, LogSumExp, Mellowmax
+from sidestep.tabular.graph import Graph, graph, grid_graph
+from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.likelihood import LogLikelihood, log_likelihood
+from sidestep.tabular.models import ObstacleGrid, TabularModel, TransitionModel, true_model
+from sidestep.tabular.planning import Plan, RollOuts, plan, roll_out
+from sidestep.tabular.solve import Solution, check_proper, solve
+from sidestep.tabular.sweeps import Jacobi
+from sidestep.tasks import Task, reach, stack_tasks, task
+
+__all__ = [
+    "LBFGS",
+    "Ascent",
+    "Behavior",
+    "BoltzmannAverage",
+    "Cell",
+    "Demonstrations",
+    "Fit",
+    "Graph",
+    "Grid",
+    "HardMax",
+    "ImproperTask",
+    "InputError",
+    "Jacobi",
+    "LogLikelihood",
+    "LogSumExp",
+    "Mellowmax",
+    "Normal",
+    "NotConverged",
+    "ObstacleGrid",
+    "Plan",
+    "Progress",
+    "Reward",
+    "RollOuts",
+    "SidestepError",
+    "Solution",
+    "TabularModel",
+    "Task",
+    "Trajectory",
+    "TransitionModel",
+    "Walks",
+    "check_proper",
+    "demonstrations",
+    "evaluate",
+    "fit",
+    "gather",
+    "graph",
+    "grid_graph",
+    "log_likelihood",
+    "plan",
+    "plan_paths",
+    "reach",
+    "read_map",
+    "read_walks",
+    "roll_out",
+    "simulate",
+    "solve",
+    "stack_tasks",
+    "task",
+    "true_model",
+    "write_map",
+    "write_walks",
+]

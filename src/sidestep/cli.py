@@ -1,0 +1,270 @@
+"""The command line: it parses, calls `sidestep.commands` and `sidestep.experiments`, and prints."""
+
+import os
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import jax
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from sidestep.commands.evaluate import evaluate_map
+from sidestep.commands.learn import Settings, Terms, learn
+from sidestep.commands.plan import plan_path
+from sidestep.commands.simulate import Walkers, simulate_walks
+from sidestep.errors import SidestepError
+from sidestep.experiments.demo import demo
+from sidestep.experiments.reproduce import reproduce
+from sidestep.inference.fit import Progress as FitProgress
+
+app = typer.Typer(
+    help="Learn the obstacles that nobody touched from the walks of people who knew them.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+console = Console(highlight=False)
+errors = Console(stderr=True, highlight=False)
+
+BackupName = Literal["boltzmann", "max", "logsumexp", "mellowmax"]
+Folder = Annotated[Path, typer.Option("--out", help="The folder to write to.", metavar="DIR")]
+Seed = Annotated[int, typer.Option(help="Draws everything that is random.")]
+Connected = Annotated[Literal["4", "8"], typer.Option(help="Moves: 4 directions, or 8 with diagonals.")]
+Backup = Annotated[BackupName, typer.Option(help="How walkers value a state by its actions.")]
+Discount = Annotated[float, typer.Option(help="γ, above 0 and at most 1.")]
+StepCost = Annotated[
+    float | None,
+    typer.Option(help="Cost of a cell side. Without it, the goal pays 1 and γ < 1 makes haste worthwhile."),
+]
+
+
+@app.command(name="demo", epilog="Example: sidestep demo --out demo")
+def demo_command(out: Folder = Path("sidestep-demo"), seed: Seed = 0) -> None:
+    """An office nobody mapped: simulate walkers, forget the map, learn it, plan to new goals, draw it all."""
+    with _working("simulating, learning, planning") as say:
+        summary = demo(out, seed, report=say)
+    _print_scores({"learned map": summary["scores"]})
+    console.print(f"pictures and numbers in {out}")
+
+
+@app.command(name="reproduce", epilog="Example: sidestep reproduce --out figures")
+def reproduce_command(out: Folder = Path("sidestep-reproduce"), seed: Seed = 0) -> None:
+    """The paper's figures 1-4 as PNG, and the numbers behind them."""
+    with _working("starting") as say:
+        summary = reproduce(out, seed, report=say)
+    rows = {
+        f"{name} {variant}": scores
+        for name, variants in summary["maps"].items()
+        for variant, scores in variants.items()
+    }
+    _print_scores(rows)
+    console.print(f"figures and numbers in {out}")
+
+
+@app.command(name="learn", epilog="Example: sidestep learn walks.csv --map office.yaml --out learned")
+def learn_command(
+    walks: Annotated[Path, typer.Argument(help="CSV or Parquet: walk, step, x, y and optionally goal_x, goal_y.")],
+    map_file: Annotated[Path, typer.Option("--map", help="ROS map: what is already known.", metavar="MAP.yaml")],
+    out: Folder,
+    backup: Backup = Settings.backup,  # pyright: ignore[reportArgumentType]
+    beta: Annotated[
+        float, typer.Option(help="How sharply walkers choose, in units of one over reward.")
+    ] = Settings.beta,
+    discount: Discount = Settings.discount,
+    step_cost: StepCost = Settings.step_cost,
+    prior_mean: Annotated[
+        float, typer.Option(help="Prior mean of an unknown cell's logit (0: P = .5).")
+    ] = Settings.prior_mean,
+    prior_variance: Annotated[
+        float, typer.Option(help="a in the penalty (logit - mean)²/a.")
+    ] = Settings.prior_variance,
+    connectivity: Connected = "4",
+    terms: Annotated[Terms, typer.Option(help="Which parts of the likelihood count.")] = Settings.terms,
+    gradient: Annotated[
+        Literal["exact", "fixed-policy"],
+        typer.Option(help="exact (L-BFGS), or the paper's approximation (ascent)."),
+    ] = "exact",
+    horizon: Annotated[
+        int | None, typer.Option(help="How many moves walkers look ahead; all of them by default.")
+    ] = None,
+    iterations: Annotated[int, typer.Option(help="At most this many.")] = Settings.iterations,
+    sample: Annotated[int | None, typer.Option(help="Learn from this many walks only, drawn by the seed.")] = None,
+    seed: Seed = Settings.seed,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on where an interrupted run stopped.")] = False,
+) -> None:
+    """A learned map from a table of walks: map.yaml, map.pgm, blocked.npy, summary.json, learned.png."""
+    settings = Settings(
+        backup=backup,
+        beta=beta,
+        discount=discount,
+        step_cost=step_cost,
+        prior_mean=prior_mean,
+        prior_variance=prior_variance,
+        connectivity=4 if connectivity == "4" else 8,
+        terms=terms,
+        gradient="exact" if gradient == "exact" else "fixed_policy",
+        horizon=horizon,
+        iterations=iterations,
+        sample=sample,
+        seed=seed,
+    )
+    with _fitting(iterations) as report:
+        summary = learn(walks, map_file, out, settings, report, resume)
+    data = summary["data"]
+    console.print(
+        f"{data['walks']} walks, {data['moves']} moves, {data['goals']} goals, {data['unknown_cells']} unknown cells"
+    )
+    if data["walks_left_out"] or data["moves_left_out"]:
+        console.print(
+            f"left out: {data['walks_left_out']} walks that start at their goal, and {data['moves_left_out']} moves of "
+            "walks that had arrived"
+        )
+    console.print(
+        f"objective {summary['objective']:.4f} after {summary['iterations']} iterations; {summary['message']}"
+    )
+    if not summary["converged"]:
+        errors.print("warning: the fit has not converged; more --iterations may help")
+    console.print(f"learned map in {out}")
+
+
+@app.command(name="plan", epilog="Example: sidestep plan learned --start 0.5,0.5 --goal 3.5,6.5")
+def plan_command(
+    folder: Annotated[Path, typer.Argument(help="A folder that `sidestep learn` has written.", metavar="DIR")],
+    start: Annotated[str, typer.Option(help="Metres.", metavar="X,Y")],
+    goal: Annotated[str, typer.Option(help="Metres.", metavar="X,Y")],
+    out: Annotated[Path | None, typer.Option("--out", help="The folder to write to (DIR/plan).", metavar="DIR")] = None,
+) -> None:
+    """A path in a learned map, as CSV and PNG."""
+    out = out or folder / "plan"
+    summary = plan_path(folder, _position(start, "--start"), _position(goal, "--goal"), out)
+    console.print(
+        f"{summary['moves']} moves, {summary['length_metres']:g} m; the likeliest obstacle on the way has "
+        f"P(blocked) = {summary['max_probability_blocked']:.3f}"
+    )
+    console.print(f"path in {out}")
+
+
+@app.command(name="evaluate", epilog="Example: sidestep evaluate learned --truth office.yaml")
+def evaluate_command(
+    folder: Annotated[Path, typer.Argument(help="A folder that `sidestep learn` has written.", metavar="DIR")],
+    truth: Annotated[Path, typer.Option(help="The true map.", metavar="TRUE.yaml")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Where to write summary.json (added to DIR's own by default).", metavar="DIR"),
+    ] = None,
+    seed: Seed = 0,
+) -> None:
+    """AUC, average precision, recall, and how legal and how long the planned paths are."""
+    with _working("planning between all pairs"):
+        scores = evaluate_map(folder, truth, out, seed)
+    _print_scores({str(folder): scores})
+
+
+@app.command(name="simulate", epilog="Example: sidestep simulate office.yaml --out walks.csv --walks 200 --goals 6")
+def simulate_command(
+    map_file: Annotated[Path, typer.Argument(help="The map that walkers know.", metavar="MAP.yaml")],
+    out: Annotated[Path, typer.Option("--out", help="CSV or Parquet.", metavar="WALKS.csv")],
+    walks: Annotated[int, typer.Option(help="How many.")] = Walkers.walks,
+    goals: Annotated[int, typer.Option(help="How many different goals they have.")] = Walkers.goals,
+    beta: Annotated[
+        float | None, typer.Option(help="How sharply they choose; without it, optimally with ties at random.")
+    ] = Walkers.beta,
+    backup: Backup = Walkers.backup,  # pyright: ignore[reportArgumentType]
+    discount: Discount = Walkers.discount,
+    step_cost: StepCost = Walkers.step_cost,
+    connectivity: Connected = "4",
+    seed: Seed = Walkers.seed,
+) -> None:
+    """Walkers on a known map."""
+    four_or_eight = 4 if connectivity == "4" else 8
+    walkers = Walkers(walks, goals, beta, backup, discount, step_cost, four_or_eight, seed)
+    with _working("walking"):
+        summary = simulate_walks(map_file, out, walkers)
+    console.print(f"{walks} walks, {summary['moves']} moves, in {out}")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the command line and returns its exit code: 0, 1 for an error, 2 for wrong usage."""
+    jax.config.update("jax_enable_x64", True)
+    try:
+        app(args=arguments, prog_name="sidestep", standalone_mode=True)
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else 1
+    except SidestepError as error:
+        errors.print(f"error: {error}", markup=False, soft_wrap=True)
+    except KeyboardInterrupt:
+        errors.print("interrupted; `sidestep learn … --resume` goes on from the last checkpoint")
+    except Exception as error:
+        # a defect of ours: say so in a line, with the details for those who ask
+        if os.environ.get("SIDESTEP_DEBUG"):
+            traceback.print_exc()
+        errors.print(
+            f"error: sidestep failed ({type(error).__name__}: {error}); set SIDESTEP_DEBUG=1 for details to report",
+            markup=False,
+            soft_wrap=True,
+        )
+    return 1
+
+
+def _position(text: str, option: str) -> tuple[float, float]:
+    try:
+        x, y = (float(part) for part in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"expected X,Y in metres, found {text!r}", param_hint=option) from None
+    return x, y
+
+
+@contextmanager
+def _working(text: str) -> Iterator[Callable[[str], None]]:
+    """A spinner on a terminal, with a text that can be changed."""
+    with errors.status(text) as status:
+        yield status.update
+
+
+@contextmanager
+def _fitting(iterations: int) -> Iterator[Callable[[FitProgress], None]]:
+    """A progress bar on a terminal for a fit of at most `iterations`."""
+    columns = (
+        TextColumn("learning"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[state]}"),
+    )
+    with Progress(*columns, console=errors, transient=True) as bar:
+        task = bar.add_task("learning", total=iterations, state="compiling")
+
+        def report(progress: FitProgress) -> None:
+            state = f"objective {progress.objective:.3f}, largest gradient {progress.gradient:.2g}"
+            bar.update(task, completed=progress.iteration, state=state)
+
+        yield report
+
+
+def _print_scores(rows: Mapping[str, Mapping[str, Any]]) -> None:
+    columns = {
+        "auc": "AUC",
+        "average_precision": "average\nprecision",
+        "auc_relevant": "AUC of those\nthat matter",
+        "mean_obstacle": "mean on\nobstacles",
+        "mean_free": "mean on\nfree cells",
+        "max_probability": "highest",
+        "legal_share": "legal\npaths",
+        "excess_length": "excess\nlength",
+    }
+    table = Table("", *columns.values())
+    for name, scores in rows.items():
+        cells = (scores[key] for key in columns)
+        table.add_row(name, *("–" if number is None else f"{number:.3f}" for number in cells))
+    console.print(table)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,32 @@
+"""`sidestep evaluate`: a learned map against the truth."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from sidestep.errors import InputError
+from sidestep.evaluation import evaluate
+from sidestep.io.files import read_whole, write_json
+from sidestep.io.maps import read_map
+from sidestep.runs import read_learned_map
+
+
+def evaluate_map(folder: Path, truth_file: Path, out: Path | None = None, seed: int = 0) -> Mapping[str, Any]:
+    """Scores the learned map of `folder` against a true map and returns the scores (see `sidestep.scoring`).
+
+    They are written to `summary.json` in `out`; without `out`, added to the learned map's own. `seed` draws starts and
+    goals on maps too large for paths between all pairs of free cells. Raises `InputError` for maps of another size.
+    """
+    learned = read_learned_map(folder)
+    truth = read_map(truth_file, connectivity=learned.grid.connectivity)
+    if truth.shape != learned.grid.shape:
+        raise InputError(
+            f"expected the learned map's {learned.grid.shape[0]} × {learned.grid.shape[1]} cells, found "
+            f"{truth.shape[0]} × {truth.shape[1]}",
+            source=truth_file,
+        )
+    scores = evaluate(learned.model(), learned.blocked, truth, learned.unknown, learned.visited, learned.reward, seed)
+    before = json.loads(read_whole(folder / "summary.json")) if out is None else {"command": "evaluate"}
+    write_json((out or folder) / "summary.json", {**before, "truth": str(truth_file), **scores})
+    return scores

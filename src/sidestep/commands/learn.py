@@ -1,0 +1,172 @@
+"""`sidestep learn`: from a map and a table of walks to a learned map."""
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from sidestep.demonstrations import Demonstrations, demonstrations_of_moves
+from sidestep.errors import InputError
+from sidestep.evaluation import Reward
+from sidestep.inference.fit import Fit, Progress, fit
+from sidestep.inference.optimisers import LBFGS, Ascent
+from sidestep.inference.priors import Normal
+from sidestep.io.gridding import grid_walks
+from sidestep.io.maps import read_map
+from sidestep.io.walks import Walks, read_walks
+from sidestep.plotting import figure_fit, save
+from sidestep.runs import LearnedMap, write_learned_map
+from sidestep.tabular.backups import BACKUPS, Behavior, Gradient
+from sidestep.tabular.grid import Connectivity
+from sidestep.tabular.likelihood import Term
+from sidestep.tabular.models import ObstacleGrid
+
+Terms = Literal["both", "actions", "transitions"]
+TERMS: dict[Terms, tuple[Term, ...]] = {
+    "both": ("actions", "transitions"),
+    "actions": ("actions",),
+    "transitions": ("transitions",),
+}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a map is learned; `docs/real-people.md` tells how the defaults were chosen.
+
+    - `backup`: a name in `BACKUPS`; `beta`: β above 0.
+    - `discount`, `step_cost`: the walkers' reward, as in `reach`.
+    - `prior_mean`, `prior_variance`: of every unknown cell's logit.
+    - `connectivity`: 4 or 8. `terms`: which parts of the likelihood count. `gradient`: "exact" climbs by L-BFGS,
+      "fixed_policy" by first-order ascent. `horizon`: how many moves walkers look ahead (None: all).
+    - `iterations`: at most this many.
+    - `sample`: learn from that many walks only, drawn by `seed` (None: from all).
+    """
+
+    backup: str = "boltzmann"
+    beta: float = 10.0
+    discount: float = 0.95
+    step_cost: float | None = None
+    prior_mean: float = 0.0
+    prior_variance: float = 8.0
+    connectivity: Connectivity = 4
+    terms: Terms = "both"
+    gradient: Gradient = "exact"
+    horizon: int | None = None
+    iterations: int = 500
+    sample: int | None = None
+    seed: int = 0
+
+
+def learn(
+    walks: Path,
+    map_file: Path,
+    folder: Path,
+    settings: Settings,
+    report: Callable[[Progress], None] | None = None,
+    resume: bool = False,
+) -> dict[str, Any]:
+    """Learns a map, writes it to a folder (see `sidestep.runs`) and returns the summary.
+
+    While it runs, `fit.checkpoint` in the folder is kept up to date; with `resume` an interrupted run goes on from
+    there. Raises `InputError` for anything wrong with the files or settings.
+    """
+    started = time.monotonic()
+    grid = read_map(map_file, connectivity=settings.connectivity)
+    moves = grid_walks(_sampled(read_walks(walks), settings), grid)
+    demonstrations = demonstrations_of_moves(moves, grid, discount=settings.discount, step_cost=settings.step_cost)
+    checkpoint = folder / "fit.checkpoint"
+    found = fit_map(ObstacleGrid(grid, settings.prior_mean), demonstrations, settings, report, checkpoint, resume)
+    blocked = np.asarray(found.model.blocked, dtype=np.float64)
+    reward = Reward(settings.discount, settings.step_cost)
+    counts = {
+        "walks": demonstrations.trajectories,
+        "walks_left_out": len(moves.goals) - demonstrations.trajectories,
+        "moves": len(demonstrations),
+        "moves_left_out": len(moves.states) - len(demonstrations),
+        "goals": len(demonstrations.tasks.terminal),
+        "unknown_cells": int((grid.known == -1).sum()),
+    }
+    summary = {
+        "command": "learn",
+        "files": {"walks": str(walks), "map": str(map_file)},
+        "settings": asdict(settings),
+        "data": counts,
+        **_outcome(found),
+        "seconds": round(time.monotonic() - started, 3),
+        "peak_memory_bytes": peak_memory(),
+    }
+    objective = np.array([progress.objective for progress in found.history])
+    write_learned_map(folder, LearnedMap(grid, blocked, demonstrations.visited(), reward), summary)
+    save(figure_fit(grid, demonstrations.paths(), blocked, objective), folder / "learned.png")
+    checkpoint.unlink(missing_ok=True)
+    return summary
+
+
+def fit_map(
+    model: ObstacleGrid,
+    demonstrations: Demonstrations,
+    settings: Settings,
+    report: Callable[[Progress], None] | None = None,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+) -> Fit[ObstacleGrid]:
+    """The fit that `settings` describe."""
+    if settings.backup not in BACKUPS:
+        raise InputError(f"expected one of {', '.join(BACKUPS)}, found {settings.backup!r}", field="backup")
+    if settings.iterations < 1:
+        raise InputError(f"expected at least 1, found {settings.iterations}", field="iterations")
+    optimiser = LBFGS if settings.gradient == "exact" else Ascent
+    return fit(
+        model,
+        demonstrations,
+        Behavior(BACKUPS[settings.backup](), settings.beta),
+        prior=Normal(settings.prior_mean, settings.prior_variance),
+        terms=TERMS[settings.terms],
+        gradient=settings.gradient,
+        horizon=settings.horizon,
+        optimiser=optimiser(iterations=settings.iterations),
+        report=report,
+        checkpoint=checkpoint,
+        resume=resume,
+    )
+
+
+def peak_memory() -> int | None:
+    """The most memory that this process has held, in bytes; None where the system does not tell."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def _sampled(walks: Walks, settings: Settings) -> Walks:
+    if settings.sample is None:
+        return walks
+    if not 1 <= settings.sample <= len(walks):
+        raise InputError(f"expected 1…{len(walks)} walks, found {settings.sample}", field="sample")
+    drawn = np.random.default_rng(settings.seed).choice(len(walks), settings.sample, replace=False)
+    return walks.select(np.sort(drawn))
+
+
+def _outcome(found: Fit[ObstacleGrid]) -> dict[str, Any]:
+    final = found.final
+    return {
+        "objective": final.objective,
+        "log_likelihood_actions": final.actions,
+        "log_likelihood_transitions": final.transitions,
+        "log_prior": final.prior,
+        "largest_gradient": final.gradient,
+        "iterations": final.iteration,
+        "converged": found.converged,
+        "message": found.message,
+        "tasks": [
+            {"sweeps": int(sweeps), "residual": float(residual), "converged": bool(converged)}
+            for sweeps, residual, converged in zip(found.sweeps, found.residual, found.task_converged, strict=True)
+        ],
+    }

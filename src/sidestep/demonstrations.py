@@ -1,0 +1,136 @@
+"""Demonstrations: what people did, as flat arrays over all their moves, and the tasks that they pursued."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from sidestep.errors import InputError
+from sidestep.io.gridding import Moves, grid_walks
+from sidestep.io.walks import Walks
+from sidestep.tabular.grid import Grid
+from sidestep.tasks import Task, reach, stack_tasks
+
+
+class Trajectory(NamedTuple):
+    """One walk through a discrete world: s₁, a₁, …, s_{τ+1}, and the index of its task."""
+
+    states: Int[np.ndarray, " moves+1"]
+    actions: Int[np.ndarray, " moves"]
+    task: int
+
+
+class Demonstrations(eqx.Module):
+    """Moves (s, a, s′) of many trajectories on many tasks, one after another.
+
+    - `states`, `actions`, `next_states`: the moves.
+    - `task`, `trajectory`: which task (index into `tasks`) and which trajectory each move belongs to.
+    - `tasks`: all tasks, stacked.
+    """
+
+    states: Int[Array, " moves"]
+    actions: Int[Array, " moves"]
+    next_states: Int[Array, " moves"]
+    task: Int[Array, " moves"]
+    trajectory: Int[Array, " moves"]
+    tasks: Task
+
+    def __len__(self) -> int:
+        """The number of moves."""
+        return len(self.states)
+
+    @property
+    def trajectories(self) -> int:
+        """The number of trajectories."""
+        return int(self.trajectory[-1]) + 1
+
+    def paths(self) -> list[Int[np.ndarray, " steps"]]:
+        """The states along each trajectory, the last one included."""
+        starts = np.flatnonzero(np.diff(np.asarray(self.trajectory))) + 1
+        states, ends = np.asarray(self.states), np.asarray(self.next_states)
+        pieces = zip(np.split(states, starts), np.split(ends, starts), strict=True)
+        return [np.append(piece, end[-1]) for piece, end in pieces]
+
+    def visited(self) -> Int[np.ndarray, "visits 2"]:
+        """The different (state, goal) pairs of all moves; the goal is the first terminal state of the task."""
+        goals = np.asarray(self.tasks.terminal).argmax(axis=-1)[np.asarray(self.task)]
+        return np.unique(np.stack([np.asarray(self.states), goals], axis=1), axis=0)
+
+
+def gather(trajectories: Sequence[Trajectory], tasks: Sequence[Task]) -> Demonstrations:
+    """Demonstrations from trajectories in any discrete world.
+
+    Raises `InputError` for an empty trajectory, lengths that do not fit, a task that is not there, or a trajectory
+    that goes on after a terminal state of its task.
+    """
+    stacked = stack_tasks(tasks)
+    terminal = np.asarray(stacked.terminal)
+    for index, (states, actions, task) in enumerate(trajectories, start=1):
+        if len(actions) == 0 or len(states) != len(actions) + 1:
+            raise InputError(
+                f"expected moves and one state more, found {len(actions)} and {len(states)}",
+                source="trajectory",
+                row=index,
+            )
+        if not 0 <= task < len(tasks):
+            raise InputError(f"expected a task in 0…{len(tasks) - 1}, found {task}", source="trajectory", row=index)
+        if min(states) < 0 or max(states) >= terminal.shape[1] or min(actions) < 0:
+            raise InputError(f"expected states in 0…{terminal.shape[1] - 1}", source="trajectory", row=index)
+        if terminal[task, states[:-1]].any():
+            raise InputError("goes on after a terminal state of its task", source="trajectory", row=index)
+    lengths = [len(trajectory.actions) for trajectory in trajectories]
+    if not lengths:
+        raise InputError("expected at least one trajectory", field="trajectories")
+    return Demonstrations(
+        states=_flat([trajectory.states[:-1] for trajectory in trajectories]),
+        actions=_flat([trajectory.actions for trajectory in trajectories]),
+        next_states=_flat([trajectory.states[1:] for trajectory in trajectories]),
+        task=jnp.asarray(np.repeat([trajectory.task for trajectory in trajectories], lengths), dtype=jnp.int32),
+        trajectory=jnp.asarray(np.repeat(np.arange(len(lengths)), lengths), dtype=jnp.int32),
+        tasks=stacked,
+    )
+
+
+def demonstrations(
+    walks: Walks, grid: Grid, *, discount: float = 0.95, step_cost: float | None = None
+) -> Demonstrations:
+    """Demonstrations on a grid from walks in metres, one task for every goal.
+
+    The walks are gridded (`sidestep.io.gridding`); `discount` and `step_cost` are those of `reach`. Raises `InputError`
+    as the gridding and `demonstrations_of_moves` do.
+    """
+    return demonstrations_of_moves(grid_walks(walks, grid), grid, discount=discount, step_cost=step_cost)
+
+
+def demonstrations_of_moves(
+    moves: Moves, grid: Grid, *, discount: float = 0.95, step_cost: float | None = None
+) -> Demonstrations:
+    """Demonstrations on a grid from gridded walks, one task for every goal.
+
+    What a walk does after it has reached its goal cell is left out, and so is a walk that starts there. Raises
+    `InputError` if no move is left.
+    """
+    goal = moves.goals[moves.walk]
+    arrivals = np.cumsum(moves.states == goal)
+    before_walk = np.searchsorted(moves.walk, moves.walk)
+    pursuing = arrivals == np.append(0, arrivals)[before_walk]
+    if not pursuing.any():
+        raise InputError("every walk starts at its goal: expected moves towards one", source=moves.source)
+    goals, task = np.unique(goal[pursuing], return_inverse=True)
+    _, trajectory = np.unique(moves.walk[pursuing], return_inverse=True)
+    tasks = [reach(grid, int(state), discount=discount, step_cost=step_cost) for state in goals]
+    return Demonstrations(
+        states=_flat([moves.states[pursuing]]),
+        actions=_flat([moves.actions[pursuing]]),
+        next_states=_flat([moves.next_states[pursuing]]),
+        task=_flat([task]),
+        trajectory=_flat([trajectory]),
+        tasks=stack_tasks(tasks),
+    )
+
+
+def _flat(parts: Sequence[np.ndarray]) -> Int[Array, " moves"]:
+    return jnp.asarray(np.concatenate(parts), dtype=jnp.int32)

@@ -1,0 +1,1 @@
+"""Worlds to try the library on: the grids of the paper's experiments, and offices as large as you like."""

@@ -1,0 +1,38 @@
+"""Everything that `sidestep` refuses, and why: each error says what was wrong, where, and what was expected."""
+
+
+class SidestepError(Exception):
+    """The base of all errors that the library raises on purpose; the command line prints it and exits with 1."""
+
+
+class InputError(SidestepError):
+    """Data or a setting that cannot be used.
+
+    `message` says what was wrong and what was expected; `source` names the file (or the argument), `row` the
+    data row as a person counts it (the first row under the header is 1) and `field` the column or key.
+
+    >>> print(InputError("expected a number, found 'abc'", source="walks.csv", row=3, field="x"))
+    walks.csv, row 3, field 'x': expected a number, found 'abc'
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        source: object | None = None,
+        row: int | None = None,
+        field: str | None = None,
+    ):
+        self.source, self.row, self.field = source, row, field
+        place = [str(source)] if source is not None else []
+        place += [f"row {row}"] if row is not None else []
+        place += [f"field '{field}'"] if field is not None else []
+        super().__init__(f"{', '.join(place)}: {message}" if place else message)
+
+
+class ImproperTask(SidestepError):
+    """A task whose values are infinite or not unique, such as a soft walker who never wants to arrive."""
+
+
+class NotConverged(SidestepError):
+    """A solve that stopped before its values settled; its numbers must not be used."""

@@ -1,0 +1,79 @@
+"""A first look: an office nobody mapped, learned from the walks of those who work there.
+
+Walkers who know the office cross it between a few places. The map is forgotten, learned again from their walks alone,
+and used to plan between places that nobody walked between.
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sidestep.commands.learn import Settings, fit_map
+from sidestep.commands.simulate import Walkers, walk
+from sidestep.demonstrations import demonstrations
+from sidestep.domains.offices import office, places
+from sidestep.evaluation import Reward, evaluate, plan_paths
+from sidestep.io.files import write_json
+from sidestep.io.maps import write_map
+from sidestep.io.trajectories import walks_of_trajectories
+from sidestep.io.walks import write_walks
+from sidestep.plotting import Panel, figure_learned, save
+from sidestep.runs import LearnedMap, write_learned_map
+from sidestep.tabular.models import ObstacleGrid
+
+ROWS, COLUMNS = 16, 26
+WALKERS = Walkers(walks=400, goals=14)
+SETTINGS = Settings()
+NEW_PLACES = 4
+
+
+def demo(folder: Path, seed: int = 0, report: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Runs the demonstration, writes `demo.png`, the true map, the walks and the learned map to a folder, and returns
+    the summary. `seed` draws the office, its walkers and the new goals; `report` is told what is being done.
+    """
+    truth = office(ROWS, COLUMNS, seed)
+    report("walkers cross the office")
+    trajectories, goals = walk(truth, replace(WALKERS, seed=seed))
+    walks = walks_of_trajectories(trajectories, goals, truth)
+    write_map(folder / "truth.yaml", truth.known.astype(np.float64), truth)
+    write_walks(folder / "walks.csv", walks)
+
+    report("learning the map from their walks")
+    blank = truth.forget()
+    reward = Reward(SETTINGS.discount, SETTINGS.step_cost)
+    shown = demonstrations(walks, blank, discount=reward.discount, step_cost=reward.step_cost)
+    found = fit_map(ObstacleGrid(blank, SETTINGS.prior_mean), shown, SETTINGS)
+    blocked = np.asarray(found.model.blocked)
+
+    report("planning between all pairs of places")
+    scores = evaluate(found.model, blocked, truth, np.ones(truth.shape, bool), shown.visited(), reward)
+    new = places(truth, NEW_PLACES, seed + 1)
+    paths, _ = plan_paths(found.model, truth, new[:1], new[1:], reward)
+    panels = [
+        Panel(f"{len(walks)} walks in an office", truth, paths=shown.paths(), goals=goals),
+        Panel(
+            "what they say of its walls, and new plans",
+            blank,
+            blocked,
+            truth,
+            paths,
+            new[:1].tolist(),
+            new[1:].tolist(),
+        ),
+    ]
+    save(figure_learned(panels), folder / "demo.png")
+    summary = {
+        "command": "demo",
+        "settings": asdict(SETTINGS),
+        "walkers": asdict(replace(WALKERS, seed=seed)),
+        "objective": found.final.objective,
+        "converged": found.converged,
+        "message": found.message,
+        "scores": scores,
+    }
+    write_learned_map(folder / "learned", LearnedMap(blank, blocked, shown.visited(), reward), summary)
+    write_json(folder / "summary.json", summary)
+    return summary

@@ -1,0 +1,1 @@
+"""From likelihood to a learned model: priors, and fits that maximise the posterior."""

@@ -1,0 +1,102 @@
+"""Learned maps on disk: the folder that `sidestep learn` writes and that `plan` and `evaluate` read.
+
+| file           | what it holds                                                                            |
+|----------------|------------------------------------------------------------------------------------------|
+| `map.yaml`, `map.pgm` | the learned map for ROS (`map_server`, mode scale)                                 |
+| `blocked.npy`  | P(blocked) of each cell, row 0 at the top; exactly 0 or 1 where the map knew             |
+| `visited.npy`  | the (state, goal) pairs of the moves that it was learned from                            |
+| `summary.json` | settings, the final objective and its parts, the convergence of every task, time, memory |
+| `learned.png`  | the picture                                                                              |
+"""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from sidestep.errors import InputError
+from sidestep.evaluation import Reward
+from sidestep.io.files import read_whole, write_array, write_json
+from sidestep.io.maps import read_map, write_map
+from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.models import ObstacleGrid
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedMap:
+    """A learned map with what later steps need to know of how it was learned.
+
+    - `grid`: geometry and moves, and what was known beforehand.
+    - `blocked`: P(blocked), exactly 0 or 1 where the map knew.
+    - `visited`: the (state, goal) pairs of the moves that it was learned from.
+    - `reward`: what the walkers were taken to pursue, and what plans pursue.
+    """
+
+    grid: Grid
+    blocked: Float[np.ndarray, "rows columns"]
+    visited: Int[np.ndarray, "visits 2"]
+    reward: Reward
+
+    @property
+    def unknown(self) -> Bool[np.ndarray, "rows columns"]:
+        """The cells that had to be learned."""
+        return self.grid.known == Cell.UNKNOWN
+
+    def model(self) -> ObstacleGrid:
+        """The transition model of the learned map."""
+        with np.errstate(divide="ignore"):
+            logits = np.log(self.blocked) - np.log1p(-self.blocked)
+        return ObstacleGrid(self.grid, np.where(self.unknown, logits, 0.0).reshape(-1))
+
+
+def write_learned_map(folder: Path, learned: LearnedMap, summary: dict[str, Any]) -> None:
+    """Writes the numbers of a learned map, each file whole or not at all, `summary.json` last."""
+    write_map(folder / "map.yaml", learned.blocked, learned.grid)
+    write_array(folder / "blocked.npy", learned.blocked)
+    write_array(folder / "visited.npy", learned.visited)
+    write_json(folder / "summary.json", summary)
+
+
+def read_learned_map(folder: Path) -> LearnedMap:
+    """A learned map back from its folder; raises `InputError` for a file that is missing or does not fit."""
+    summary = _read_json(folder / "summary.json")
+    settings = summary.get("settings", {}) if isinstance(summary, dict) else {}
+    missing = {"connectivity", "discount", "step_cost"} - set(settings)
+    if missing:
+        raise InputError(
+            f"expected the settings {sorted(missing)}, as `sidestep learn` writes them",
+            source=folder / "summary.json",
+        )
+    geometry = read_map(folder / "map.yaml", connectivity=settings["connectivity"])
+    blocked = _read_array(folder / "blocked.npy")
+    if blocked.shape != geometry.shape or not ((blocked >= 0) & (blocked <= 1)).all():
+        raise InputError(
+            f"expected probabilities in the map's shape {geometry.shape}, found shape {blocked.shape}",
+            source=folder / "blocked.npy",
+        )
+    visited = _read_array(folder / "visited.npy")
+    known = np.where(blocked == 0, Cell.FREE, np.where(blocked == 1, Cell.OCCUPIED, Cell.UNKNOWN))
+    return LearnedMap(
+        replace(geometry, known=known.astype(np.int64)),
+        blocked.astype(np.float64),
+        visited.astype(np.int64),
+        Reward(settings["discount"], settings["step_cost"]),
+    )
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(read_whole(path))
+    except ValueError as error:
+        raise InputError(f"expected JSON: {error}", source=path) from error
+
+
+def _read_array(path: Path) -> np.ndarray:
+    read_whole(path)
+    try:
+        return np.load(path, allow_pickle=False)
+    except ValueError as error:
+        raise InputError(f"expected a NumPy array: {error}", source=path) from error

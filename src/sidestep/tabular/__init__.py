@@ -1,0 +1,1 @@
+"""Discrete worlds: graphs, transition models, backups, solvers, likelihood and planning."""

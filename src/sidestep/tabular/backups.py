@@ -1,0 +1,145 @@
+"""Backups: how people value a state by its actions, V(s) = B(Q(s, ·)).
+
+| backup             | V(s)                           | weights ∂V/∂Q(a)      | fixed-policy weights |
+|--------------------|--------------------------------|-----------------------|----------------------|
+| `HardMax`          | max_a Q(a)                     | uniform over the ties | the same (eq. 10)    |
+| `BoltzmannAverage` | Σ_a π(a) Q(a) (eq. 5)          | π(1 + β(Q − V)), eq. 8| π, eq. 9             |
+| `LogSumExp`        | (1/β) log Σ_a exp βQ(a)        | π                     | π                    |
+| `Mellowmax`        | (1/β) log mean_a exp βQ(a)     | π                     | π                    |
+
+with π(a) ∝ exp βQ(a), which is how people act under every backup (eqs. 2 and 3). Weights always sum to one.
+Equation numbers are those of the behavior-aware modeling paper; mellowmax is from Asadi & Littman (2017), the
+log-sum-exp from Ziebart's maximum causal entropy (2010).
+"""
+
+import abc
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jaxtyping import Array, Float, Scalar
+
+from sidestep.errors import InputError
+
+Gradient = Literal["exact", "fixed_policy"]
+"""Which derivative a backup has: its own, or that of the average under the policy held fixed (eqs. 9 and 10)."""
+
+Values = Float[Array, "*states"]
+ActionValues = Float[Array, "*states actions"]
+
+
+class Backup(eqx.Module):
+    """How the values of a state's actions make the value of the state, at sharpness β."""
+
+    @abc.abstractmethod
+    def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
+        """V = B(q) over the last axis, differentiable in both arguments with the exact gradient."""
+
+    @abc.abstractmethod
+    def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
+        """The exact gradient ∂V/∂q; sums to one over the last axis."""
+
+    def fixed_policy_weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
+        """The weights of the average under a policy that is held fixed: π for the soft backups (eq. 9)."""
+        return jax.nn.softmax(beta * q, axis=-1)
+
+
+class HardMax(Backup):
+    """V = max_a Q(a): people who follow an optimal policy (eq. 2).
+
+    Actions within `tie` of the best, relative to its size, count as ties and share the gradient equally (eq. 10).
+    """
+
+    tie: float = eqx.field(default=1e-9, static=True)
+
+    def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
+        """The best action's value."""
+        best = jax.lax.stop_gradient(q.max(axis=-1))
+        weights = jax.lax.stop_gradient(self.weights(q, beta))
+        return best + jnp.sum(weights * (q - jax.lax.stop_gradient(q)), axis=-1)
+
+    def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
+        """One over the number of best actions, on each of them."""
+        del beta
+        best = q.max(axis=-1, keepdims=True)
+        tolerance = jnp.maximum(self.tie, 64 * jnp.finfo(q.dtype).eps) * jnp.abs(best)
+        ties = (q >= best - tolerance).astype(q.dtype)
+        return ties / ties.sum(axis=-1, keepdims=True)
+
+    def fixed_policy_weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
+        """The optimal policy, uniform over ties (eq. 10), which is also the gradient of the maximum."""
+        return self.weights(q, beta)
+
+
+class BoltzmannAverage(Backup):
+    """V = Σ_a π(a) Q(a): the expected value of acting by π (eqs. 3–5), the paper's choice.
+
+    It lies below the maximum and is neither monotone nor in general a contraction, so a solve may fail to converge.
+    """
+
+    def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
+        """The average of the actions' values under π."""
+        return jnp.sum(jax.nn.softmax(beta * q, axis=-1) * q, axis=-1)
+
+    def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
+        """π(1 + β(Q − V)), eq. 8: an action's own value counts, and how its share grows with it."""
+        policy = jax.nn.softmax(beta * q, axis=-1)
+        value = jnp.sum(policy * q, axis=-1, keepdims=True)
+        return policy * (1 + beta * (q - value))
+
+
+class LogSumExp(Backup):
+    """V = (1/β) log Σ_a exp βQ(a): maximum causal entropy; every choice adds to the value of a state."""
+
+    def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
+        """The soft maximum, above the maximum by at most log(actions)/β."""
+        return jax.nn.logsumexp(beta * q, axis=-1) / beta
+
+    def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
+        """π, so that eq. 9 is exact here."""
+        return self.fixed_policy_weights(q, beta)
+
+
+class Mellowmax(Backup):
+    """V = (1/β) log mean_a exp βQ(a): the log-sum-exp without its bonus of log(actions)/β a step."""
+
+    def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
+        """A soft maximum between the mean and the maximum."""
+        return (jax.nn.logsumexp(beta * q, axis=-1) - jnp.log(q.shape[-1])) / beta
+
+    def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
+        """π, as for the log-sum-exp."""
+        return self.fixed_policy_weights(q, beta)
+
+
+BACKUPS: Mapping[str, Callable[[], Backup]] = MappingProxyType(
+    {"boltzmann": BoltzmannAverage, "max": HardMax, "logsumexp": LogSumExp, "mellowmax": Mellowmax}
+)
+"""The backups by the names that settings and the command line use."""
+
+
+class Behavior(eqx.Module):
+    """How people act: the backup they value states with, and how sharply they choose.
+
+    The probability of an action is ∝ exp(β Q(s, a)) (eqs. 2 and 3). `beta` is in units of one over reward, above 0.
+    Raises `InputError` for β ≤ 0 or not finite.
+
+    >>> people = Behavior(BoltzmannAverage(), beta=10.0)
+    """
+
+    backup: Backup
+    beta: Float[Array, ""]
+
+    def __init__(self, backup: Backup, beta: float | Float[Array, ""] = 10.0):
+        self.backup = backup
+        self.beta = jnp.asarray(beta, dtype=jnp.result_type(float))
+        if not isinstance(self.beta, Tracer) and not (jnp.isfinite(self.beta) and self.beta > 0):
+            raise InputError(f"expected a finite number above 0, found {beta}", field="beta")
+
+    def log_policy(self, q: ActionValues) -> ActionValues:
+        """log π(a | s) from action values."""
+        return jax.nn.log_softmax(self.beta * q, axis=-1)

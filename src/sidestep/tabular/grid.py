@@ -1,0 +1,129 @@
+"""Grids: where cells are in the world, which are known already, and which moves a walker has.
+
+A grid is a rectangle of square cells. Row 0 is the *top* row, as in an image; cell (row, column) is the state
+`row * columns + column`. Positions are in metres in the map's frame: the lower-left corner of the grid lies at
+`origin = (x, y, yaw)`, and for yaw 0 the centre of column c, row r counted from the bottom, is at
+`origin + ((c + .5), (r + .5)) * resolution`.
+"""
+
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Integer
+
+from sidestep.errors import InputError
+
+Connectivity = Literal[4, 8]
+
+_STEPS = np.array([[-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [-1, 1], [1, -1], [1, 1]])
+"""Row and column change of each action: up, down, left, right, then the four diagonals."""
+
+
+class Cell(IntEnum):
+    """What a map says of a cell."""
+
+    UNKNOWN = -1
+    FREE = 0
+    OCCUPIED = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """The geometry of a map, what is already known of it, and the moves on it.
+
+    - `known`: one `Cell` value a cell, row 0 at the top.
+    - `resolution`: the side of a cell in metres.
+    - `origin`: x, y (metres) and yaw (radians) of the lower-left corner.
+    - `connectivity`: 4 (up, down, left, right) or 8 (and diagonals).
+
+    Raises `InputError` for an empty grid, values that are not `Cell`s, a resolution that is not positive, an origin
+    that is not finite, or another connectivity.
+
+    >>> grid = Grid.unknown(rows=2, columns=3)
+    >>> int(grid.states(np.array([[0.5, 0.5]]))[0])  # the lower-left cell: row 1, column 0
+    3
+    """
+
+    known: Int[np.ndarray, "rows columns"]
+    resolution: float = 1.0
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    connectivity: Connectivity = 4
+
+    def __post_init__(self):
+        if self.known.size == 0 or not np.isin(self.known, list(Cell)).all():
+            raise InputError("expected at least one cell, each -1 (unknown), 0 (free) or 1 (occupied)", field="known")
+        if not (np.isfinite(self.resolution) and self.resolution > 0):
+            raise InputError(f"expected metres above 0, found {self.resolution}", field="resolution")
+        if len(self.origin) != 3 or not np.isfinite(self.origin).all():
+            raise InputError(f"expected three finite numbers x, y, yaw, found {self.origin}", field="origin")
+        if self.connectivity not in (4, 8):
+            raise InputError(f"expected 4 or 8, found {self.connectivity}", field="connectivity")
+
+    @classmethod
+    def unknown(cls, rows: int, columns: int, connectivity: Connectivity = 4) -> "Grid":
+        """A grid of which nothing is known, cells one metre wide, its lower-left corner at (0, 0)."""
+        return cls(np.full((rows, columns), Cell.UNKNOWN, dtype=np.int64), connectivity=connectivity)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.known.shape[0], self.known.shape[1]
+
+    @property
+    def size(self) -> int:
+        """The number of cells, which is the number of states."""
+        return self.known.size
+
+    @property
+    def steps(self) -> Int[np.ndarray, "actions 2"]:
+        """Row and column change of each action: up, down, left, right, then (8-connected) the diagonals."""
+        return _STEPS[: self.connectivity]
+
+    def forget(self) -> "Grid":
+        """The same grid with nothing known."""
+        return replace(self, known=np.full_like(self.known, Cell.UNKNOWN))
+
+    def contains(self, positions: Float[np.ndarray, "points 2"]) -> Bool[np.ndarray, " points"]:
+        """Whether each position (metres) lies on the grid; a position that is not finite does not."""
+        rows, columns = self.shape
+        with np.errstate(invalid="ignore"):
+            column, row_up = self.to_cell_units(positions).T
+            slack = 1e-9 * max(rows, columns)
+            return (column >= -slack) & (column <= columns + slack) & (row_up >= -slack) & (row_up <= rows + slack)
+
+    def states(self, positions: Float[np.ndarray, "points 2"]) -> Int[np.ndarray, " points"]:
+        """The state whose cell holds each position (metres); raises `InputError` for one outside the grid."""
+        inside = self.contains(positions)
+        if not inside.all():
+            index = int(np.argmin(inside))
+            raise InputError(f"position {tuple(positions[index].tolist())} lies outside the map", row=index + 1)
+        return self.states_of_cell_units(self.to_cell_units(positions))
+
+    def centres(self, states: Integer[np.ndarray, " points"]) -> Float[np.ndarray, "points 2"]:
+        """The position (metres) of the centre of each state's cell."""
+        rows, columns = self.shape
+        row, column = np.divmod(np.asarray(states), columns)
+        return self.to_metres(np.stack([column + 0.5, rows - row - 0.5], axis=-1))
+
+    def to_cell_units(self, positions: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 2"]:
+        """Positions in metres as (columns from the left, rows from the *bottom*), not rounded."""
+        offset = np.asarray(positions, dtype=np.float64) - np.asarray(self.origin[:2])
+        return offset @ _rotation(self.origin[2]) / self.resolution
+
+    def to_metres(self, cell_units: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 2"]:
+        """The inverse of `to_cell_units`."""
+        return cell_units * self.resolution @ _rotation(self.origin[2]).T + np.asarray(self.origin[:2])
+
+    def states_of_cell_units(self, cell_units: Float[np.ndarray, "points 2"]) -> Int[np.ndarray, " points"]:
+        """The state of each point given in cell units; points on the outer edge belong to the cell inside it."""
+        rows, columns = self.shape
+        column, row_up = np.floor(cell_units).astype(np.int64).T
+        row = rows - 1 - np.clip(row_up, 0, rows - 1)
+        return row * columns + np.clip(column, 0, columns - 1)
+
+
+def _rotation(yaw: float) -> Float[np.ndarray, "2 2"]:
+    """The matrix R that turns a vector by `yaw`; row vectors turn forward by `v @ R.T` and back by `v @ R`."""
+    return np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])

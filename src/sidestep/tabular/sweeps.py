@@ -1,0 +1,235 @@
+"""Solvers of the Bellman equation and of its adjoint, by sweeps over all states at once.
+
+**Values.** With P the outcomes' probabilities and B a backup,
+
+    Q(s, a) = R(s, a) + γ Σ_k P(s, a, k) V(succ(s, a, k)),      V(s) = B(Q(s, ·)),      V(terminal) = final reward.
+
+A move that mostly fails leads mostly back to its own state, and plain sweeps then crawl. So every sweep solves each
+state's own equation with its neighbours' values held. With p(a) the probability of staying,
+c(a) = R + γ Σ_{elsewhere} P V and l(a) = 1 − γ p(a), the advantage of an action over the state's value v is A(a) =
+c(a) − l(a) v, and since every backup moves with a constant, V = B(Q) reads B(A) = 0. A Newton step on it is
+
+    v ← v + B(A) / Σ_a w(a) l(a),          w = the backup's weights at A.
+
+The *escape*, max_a c(a)/l(a), is the best that one action tried for ever can give. It bounds the root: from above where
+B(A) ≤ 0 there (averages), from below otherwise (the log-sum-exp's bonus). Steps start and end on the root's side of it;
+otherwise a state whose value was too high would seem best off trying an action that never leaves. A state not reached
+yet starts from its escape. 1 − γp is summed as Σ_{elsewhere} P + (1 − γ) p, so that nothing cancels in a trapped
+state.
+
+The Boltzmann average may have several fixed points. Dividing by no less than Σ π l keeps the steps short where B(A)
+grows with v, so that the sweeps end in a stable one.
+
+**Adjoint.** For a scalar function with gradient g with respect to V, λ solves λ = g + Wᵀλ, where
+W(s, s′) = γ Σ_a w(a) Σ_{k → s′} P(s, a, k) and w are the weights of the gradient that is asked for (exact or fixed
+policy). Self-loops are divided out as above. Both iterations have the same spectrum at the fixed point (for the exact
+gradient), so the adjoint converges where the values did.
+
+At discount 1 the values of states that cannot reach a terminal state are −∞; they are held at `lowest(dtype)`, so low
+that an action which may lead there is never taken. Sweeps start from such values everywhere, and reach outwards from
+the terminal states as a shortest-path search does.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Scalar
+
+from sidestep.tabular.backups import Backup, Gradient
+
+Beta = Float[Scalar, ""]
+
+
+class DecisionProcess(eqx.Module):
+    """A task under a model: all that a solver needs to know (fields as in `Graph`, `TransitionModel` and `Task`)."""
+
+    successors: Int[Array, "states actions outcomes"]
+    probabilities: Float[Array, "states actions outcomes"]
+    reward: Float[Array, "#states #actions"]
+    final_reward: Float[Array, "#states"]
+    terminal: Bool[Array, " states"]
+    discount: Float[Array, ""]
+
+    def action_values(self, values: Float[Array, " states"]) -> Float[Array, "states actions"]:
+        """Q(s, a) = R(s, a) + γ Σ T V (eq. 4)."""
+        expected = jnp.sum(self.probabilities * values[self.successors], axis=-1)
+        return self.reward + self.discount * expected
+
+    def end(self, values: Float[Array, " states"]) -> Float[Array, " states"]:
+        """The values with those of terminal states put in."""
+        return jnp.where(self.terminal, self.final_reward, values)
+
+
+class Sweeps(NamedTuple):
+    """What a solver found, and how it went.
+
+    `residual` is the largest change in the last sweep, relative to the value (or to the largest reward, where that is
+    larger); `converged` says that it is within the tolerance.
+    """
+
+    values: Float[Array, " states"]
+    sweeps: Int[Array, ""]
+    residual: Float[Array, ""]
+    converged: Bool[Array, ""]
+
+
+class Jacobi(eqx.Module):
+    """Sweeps over all states at once, on any device.
+
+    - `tolerance`: relative change at which to stop; by default 1e-10 in 64-bit and 1e-5 in 32-bit numbers.
+    - `max_sweeps`: when to give up (and say so).
+    """
+
+    tolerance: float | None = eqx.field(default=None, static=True)
+    max_sweeps: int = eqx.field(default=20_000, static=True)
+
+    def values(self, process: DecisionProcess, backup: Backup, beta: Beta) -> Sweeps:
+        """V of the fixed point."""
+        split = _split(process)
+        scale = jnp.maximum(jnp.abs(process.reward).max(), jnp.abs(process.final_reward).max())
+
+        def sweep(values: Float[Array, " states"]) -> Float[Array, " states"]:
+            elsewhere = process.reward + jnp.sum(split.elsewhere * values[process.successors], axis=-1)
+            return process.end(_own_equation(backup, beta, elsewhere, split, values))
+
+        return self._iterate(sweep, process.end(_start(process)), scale)
+
+    def adjoint(
+        self,
+        process: DecisionProcess,
+        weights: Float[Array, "states actions"],
+        policy: Float[Array, "states actions"],
+        cotangent: Float[Array, " states"],
+    ) -> Sweeps:
+        """λ = g + Wᵀλ for the gradient g = `cotangent`; `values` of what it returns is λ.
+
+        `weights` are those in W, `policy` those of the policy held fixed.
+        """
+        split = _split(process)
+        moving = ~process.terminal
+        spread = jnp.where(moving[:, None], weights, 0)[..., None] * split.elsewhere
+        leaving = jnp.where(moving, jnp.sum(weights * split.leaving, axis=-1), 1)
+        divisor = jnp.where(moving, _divisor(weights, policy, split.leaving), 1)
+
+        def sweep(adjoint: Float[Array, " states"]) -> Float[Array, " states"]:
+            arriving = jnp.zeros_like(adjoint).at[process.successors].add(spread * adjoint[:, None, None])
+            return (cotangent + arriving + (divisor - leaving) * adjoint) / divisor
+
+        return self._iterate(sweep, jnp.zeros_like(cotangent), jnp.abs(cotangent).max())
+
+    def _iterate(self, sweep, start: Float[Array, " states"], scale: Float[Array, ""]) -> Sweeps:
+        tolerance = self.tolerance or (1e-10 if start.dtype == jnp.float64 else 1e-5)
+
+        def unfinished(state: Sweeps) -> Bool[Array, ""]:
+            return ~state.converged & (state.sweeps < self.max_sweeps) & ~jnp.isnan(state.residual)
+
+        def step(state: Sweeps) -> Sweeps:
+            values = sweep(state.values)
+            size = jnp.maximum(jnp.abs(values), scale)
+            change = jnp.abs(values - state.values) / jnp.where(size > 0, size, 1)
+            residual = jnp.max(change)
+            return Sweeps(values, state.sweeps + 1, residual, residual <= tolerance)
+
+        none = Sweeps(start, jnp.asarray(0), jnp.asarray(jnp.inf, start.dtype), jnp.asarray(False))
+        return jax.lax.while_loop(unfinished, step, none)
+
+
+def finite_horizon(
+    process: DecisionProcess, backup: Backup, beta: Beta, horizon: int, gradient: Gradient
+) -> Float[Array, " states"]:
+    """V after `horizon` backups from nothing: what is worth having within that many actions.
+
+    Differentiable by JAX itself; `gradient` chooses the exact one or that of the policies held fixed.
+    """
+
+    def step(values: Float[Array, " states"], _: None) -> tuple[Float[Array, " states"], None]:
+        q = process.action_values(values)
+        if gradient == "exact":
+            return process.end(backup.value(q, beta)), None
+        return process.end(at_fixed_policy(backup, beta, q)), None
+
+    start = process.end(jnp.zeros(process.terminal.shape, process.probabilities.dtype))
+    return jax.lax.scan(step, start, length=horizon)[0]
+
+
+def lowest(dtype: jnp.dtype) -> float:
+    """The stand-in for −∞: so low that a step cost more makes no difference to it."""
+    return -1e200 if dtype == jnp.float64 else -1e25
+
+
+def reachable(values: Float[Array, "*states"]) -> Bool[Array, "*states"]:
+    """Whether a terminal state can be reached, by values at discount 1: whether they are not a share of `lowest`."""
+    return values > -((-lowest(values.dtype)) ** 0.5)
+
+
+class _Split(NamedTuple):
+    """The outcomes of a process, self-loops apart."""
+
+    elsewhere: Float[Array, "states actions outcomes"]  # γ P of the outcomes that leave the state, 0 for the others
+    staying: Float[Array, "states actions"]  # γ p
+    leaving: Float[Array, "states actions"]  # 1 − γ p
+
+
+def _split(process: DecisionProcess) -> _Split:
+    own = process.successors == jnp.arange(len(process.successors))[:, None, None]
+    moves = jnp.where(own, 0, process.probabilities)
+    stays = jnp.where(own, process.probabilities, 0).sum(axis=-1)
+    gamma = process.discount
+    return _Split(gamma * moves, gamma * stays, moves.sum(axis=-1) + (1 - gamma) * stays)
+
+
+def _start(process: DecisionProcess) -> Float[Array, " states"]:
+    """A lower bound of the values: below discount 1, the best action of the worst state for ever."""
+    dtype = process.probabilities.dtype
+    best = jnp.broadcast_to(process.reward.max(axis=-1), process.terminal.shape)
+    worst = jnp.where(process.terminal, jnp.inf, best).min()
+    worst = jnp.where(jnp.isfinite(worst), worst, 0)
+    remaining = 1 - process.discount
+    bound = jnp.where(remaining > 0, worst / jnp.where(remaining > 0, remaining, 1), lowest(dtype))
+    return jnp.broadcast_to(bound.astype(dtype), process.terminal.shape)
+
+
+def _own_equation(
+    backup: Backup,
+    beta: Beta,
+    elsewhere: Float[Array, "states actions"],
+    split: _Split,
+    old: Float[Array, " states"],
+) -> Float[Array, " states"]:
+    """One Newton step on each state's own equation, from its old value, kept on the right side of the escape."""
+    bottom = lowest(old.dtype)
+    can_leave = split.leaving > 0
+    escapes = jnp.where(can_leave, elsewhere / jnp.where(can_leave, split.leaving, 1), bottom)
+    escape = jnp.maximum(escapes.max(axis=-1), bottom)
+
+    def advantage(value: Float[Array, " states"]) -> Float[Array, "states actions"]:
+        return elsewhere - split.leaving * value[:, None]
+
+    above = backup.value(advantage(escape), beta) > 0
+    low, high = jnp.where(above, escape, bottom), jnp.where(above, jnp.inf, escape)
+    start = jnp.where(reachable(old), jnp.clip(old, low, high), escape)
+    a = advantage(start)
+    divisor = _divisor(backup.weights(a, beta), backup.fixed_policy_weights(a, beta), split.leaving)
+    solved = jnp.clip(start + backup.value(a, beta) / divisor, low, high)
+    return jnp.where(reachable(escape), solved, bottom)
+
+
+def _divisor(
+    weights: Float[Array, "states actions"],
+    policy: Float[Array, "states actions"],
+    leaving: Float[Array, "states actions"],
+) -> Float[Array, " states"]:
+    """What a state's own equation is divided by: Σ w l, and never less than Σ π l, so that no step is too long.
+
+    A state that no action leaves is divided by 1: it gives nothing to its neighbours and takes nothing from them.
+    """
+    divisor = jnp.maximum(jnp.sum(weights * leaving, axis=-1), jnp.sum(policy * leaving, axis=-1))
+    return jnp.where(divisor > 0, divisor, 1)
+
+
+def at_fixed_policy(backup: Backup, beta: Beta, q: Float[Array, "states actions"]) -> Float[Array, " states"]:
+    """The backup's value with the gradient of the average under its policy, held fixed (eqs. 9 and 10)."""
+    weights, value = jax.lax.stop_gradient((backup.fixed_policy_weights(q, beta), backup.value(q, beta)))
+    return value + jnp.sum(weights * (q - jax.lax.stop_gradient(q)), axis=-1)

@@ -1,0 +1,17 @@
+"""All tests run in 64-bit numbers; `sidestep` itself never changes JAX's configuration.
+
+Import nothing of `sidestep` here: jaxtyping's checks must be switched on first.
+"""
+
+import os
+
+# The suite compiles hundreds of small functions and runs each for milliseconds: compile them quickly instead.
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")
+
+import jax
+from hypothesis import settings
+
+jax.config.update("jax_enable_x64", True)
+
+settings.register_profile("sidestep", deadline=None, max_examples=25)
+settings.load_profile("sidestep")

@@ -1,0 +1,74 @@
+"""Output files appear whole or not at all."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sidestep.errors import InputError
+from sidestep.io.files import read_whole, write_array, write_json, write_whole
+
+
+def test_a_file_is_written_into_a_new_folder(tmp_path):
+    write_whole(tmp_path / "new" / "note.txt", lambda file: file.write(b"done"))
+    assert (tmp_path / "new" / "note.txt").read_bytes() == b"done"
+    assert [entry.name for entry in (tmp_path / "new").iterdir()] == ["note.txt"]
+
+
+@pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, failure):
+    path = tmp_path / "note.txt"
+    path.write_bytes(b"old")
+
+    def fail(file):
+        file.write(b"half")
+        raise failure
+
+    with pytest.raises(failure):
+        write_whole(path, fail)
+    assert path.read_bytes() == b"old"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["note.txt"]
+
+
+def test_a_folder_in_the_way_is_an_error_and_leaves_nothing(tmp_path):
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(InputError, match=r"taken: cannot be written"):
+        write_whole(tmp_path / "taken", lambda file: file.write(b"done"))
+    assert [entry.name for entry in tmp_path.iterdir()] == ["taken"]
+
+
+def test_a_file_in_the_place_of_the_folder_is_an_error(tmp_path):
+    (tmp_path / "file").write_bytes(b"x")
+    with pytest.raises(InputError, match="cannot be written"):
+        write_whole(tmp_path / "file" / "note.txt", lambda file: file.write(b"done"))
+
+
+def test_json_keeps_its_order_and_takes_numpy_numbers(tmp_path):
+    data = {"z": np.float32(0.5), "a": np.int64(3), "list": np.arange(2), "none": None, "is": np.bool_(True)}
+    write_json(tmp_path / "summary.json", data)
+    read = json.loads((tmp_path / "summary.json").read_text())
+    assert list(read.items()) == [("z", 0.5), ("a", 3), ("list", [0, 1]), ("none", None), ("is", True)]
+
+
+@pytest.mark.parametrize("value", [float("nan"), np.float32("inf"), object()])
+def test_json_refuses_what_it_cannot_hold(tmp_path, value):
+    with pytest.raises(InputError, match=r"summary\.json: cannot be written as JSON"):
+        write_json(tmp_path / "summary.json", {"loss": value})
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_array_comes_back(tmp_path):
+    write_array(tmp_path / "blocked.npy", np.array([[0.25, 1.0]]))
+    np.testing.assert_array_equal(np.load(tmp_path / "blocked.npy"), [[0.25, 1.0]])
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    (tmp_path / "empty").write_bytes(b" \n")
+    for name, message in (
+        ("absent", "No such file"),
+        (".", "Is a directory"),
+        ("empty", "is empty"),
+        ("\0", "null"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_whole(tmp_path / name)

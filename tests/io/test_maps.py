@@ -1,0 +1,286 @@
+"""ROS maps: what is read, what is refused, and that a learned map comes back as it was written."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from sidestep.errors import InputError
+from sidestep.io.maps import read_map, write_map
+from sidestep.tabular.grid import Cell, Grid
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+SETTINGS = {
+    "image": "map.pgm",
+    "resolution": 0.05,
+    "origin": [1.0, -2.5, 0.25],
+    "negate": 0,
+    "occupied_thresh": 0.65,
+    "free_thresh": 0.196,
+}
+FREE, UNKNOWN, OCCUPIED = int(Cell.FREE), int(Cell.UNKNOWN), int(Cell.OCCUPIED)
+
+
+def make_map(folder, pixels, **changes):
+    """A map in `folder`; a setting changed to None is left out."""
+    settings = {key: value for key, value in (SETTINGS | changes).items() if value is not None}
+    image = pixels if isinstance(pixels, Image.Image) else Image.fromarray(np.asarray(pixels))
+    image.save(folder / settings.get("image", "map.pgm"))
+    (folder / "map.yaml").write_text(yaml.safe_dump(settings))
+    return folder / "map.yaml"
+
+
+def grey(*values):
+    return np.array([values], dtype=np.uint8)
+
+
+def test_geometry_and_orientation(tmp_path):
+    grid = read_map(make_map(tmp_path, np.array([[0, 254], [205, 254], [254, 254]], dtype=np.uint8)), connectivity=8)
+    assert (grid.resolution, grid.origin, grid.connectivity) == (0.05, (1.0, -2.5, 0.25), 8)
+    np.testing.assert_array_equal(grid.known, [[OCCUPIED, FREE], [UNKNOWN, FREE], [FREE, FREE]])
+
+
+@pytest.mark.parametrize("mode", [None, "trinary", "scale"])
+def test_thresholds_are_strict(tmp_path, mode):
+    path = make_map(tmp_path, grey(203, 204, 205, 50, 51, 52), mode=mode, free_thresh=0.2, occupied_thresh=0.8)
+    assert read_map(path).known.tolist() == [[UNKNOWN, UNKNOWN, FREE, OCCUPIED, UNKNOWN, UNKNOWN]]
+
+
+@pytest.mark.parametrize("negate", [1, True])
+def test_negate_swaps_black_and_white(tmp_path, negate):
+    assert read_map(make_map(tmp_path, grey(0, 255, 128), negate=negate)).known.tolist() == [[FREE, OCCUPIED, UNKNOWN]]
+
+
+@pytest.mark.parametrize("negate", [0, 1])
+def test_raw_mode_reads_percent(tmp_path, negate):
+    path = make_map(tmp_path, grey(0, 19, 20, 65, 66, 100, 101, 255), mode="raw", negate=negate)
+    expected = [[FREE, FREE, UNKNOWN, UNKNOWN, OCCUPIED, OCCUPIED, UNKNOWN, UNKNOWN]]
+    assert read_map(path).known.tolist() == expected
+
+
+def test_png_in_colour_counts_the_mean_of_the_channels(tmp_path):
+    pixels = np.array([[[255, 0, 0], [255, 255, 250], [0, 0, 0]]], dtype=np.uint8)
+    assert read_map(make_map(tmp_path, pixels, image="map.png")).known.tolist() == [[OCCUPIED, FREE, OCCUPIED]]
+
+
+def test_transparent_pixels_are_unknown(tmp_path):
+    colour = np.array([[[0, 0, 0, 0], [0, 0, 0, 255], [255, 255, 255, 255]]], dtype=np.uint8)
+    assert read_map(make_map(tmp_path, colour, image="map.png")).known.tolist() == [[UNKNOWN, OCCUPIED, FREE]]
+    two = Image.fromarray(np.array([[[0, 0], [0, 255], [255, 255]]], dtype=np.uint8), "LA")
+    assert read_map(make_map(tmp_path, two, image="map.png")).known.tolist() == [[UNKNOWN, OCCUPIED, FREE]]
+
+
+def test_a_palette_is_looked_up(tmp_path):
+    image = Image.fromarray(grey(0, 1))
+    image.putpalette([255, 255, 255, 0, 0, 0])
+    assert read_map(make_map(tmp_path, image, image="map.png")).known.tolist() == [[FREE, OCCUPIED]]
+
+
+@pytest.mark.parametrize("name", ["map.png", "map.pgm"])
+def test_sixteen_bits_are_scaled(tmp_path, name):
+    pixels = np.array([[0, 65535, 205 * 257]], dtype=np.uint16)
+    assert read_map(make_map(tmp_path, pixels, image=name)).known.tolist() == [[OCCUPIED, FREE, UNKNOWN]]
+
+
+def test_an_image_of_one_bit(tmp_path):
+    image = Image.fromarray(grey(0, 255)).convert("1")
+    assert read_map(make_map(tmp_path, image, image="map.png")).known.tolist() == [[OCCUPIED, FREE]]
+
+
+def test_numbers_that_yaml_takes_for_text(tmp_path):
+    path = make_map(tmp_path, grey(0))
+    path.write_text(path.read_text().replace("resolution: 0.05", "resolution: 5e-2"))
+    assert read_map(path).resolution == 0.05
+
+
+@pytest.mark.parametrize("key", sorted(SETTINGS))
+def test_a_missing_key_is_named(tmp_path, key):
+    with pytest.raises(InputError, match=rf"map\.yaml, field '{key}': the key is missing"):
+        read_map(make_map(tmp_path, grey(0), **{key: None}))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("resolution", "wide", "a finite number"),
+        ("resolution", float("nan"), "a finite number"),
+        ("resolution", [1], "a finite number"),
+        ("resolution", True, "a finite number"),
+        ("resolution", 0.0, "metres above 0"),
+        ("resolution", -1, "metres above 0"),
+        ("origin", 3, "three numbers"),
+        ("origin", [0, 0], "three numbers"),
+        ("origin", [0, 0, float("inf")], "a finite number"),
+        ("negate", 2, "0 or 1"),
+        ("negate", "no", "0 or 1"),
+        ("occupied_thresh", 1.5, "a number from 0 to 1"),
+        ("free_thresh", -0.1, "a number from 0 to 1"),
+        ("free_thresh", 0.65, "less than occupied_thresh"),
+        ("mode", "fancy", "trinary, scale or raw"),
+        ("mode", ["raw"], "trinary, scale or raw"),
+    ],
+)
+def test_a_wrong_value_is_named(tmp_path, key, value, expected):
+    with pytest.raises(InputError, match=rf"map\.yaml, field '{key}': expected {expected}"):
+        read_map(make_map(tmp_path, grey(0), **{key: value}))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("image: [", "expected YAML"),
+        ("- 1\n- 2", "expected YAML with keys"),
+        ("just words", "expected YAML with keys"),
+        ("\x07", "expected YAML"),
+        ("when: 2020-13-45", "expected YAML"),
+        ("[" * 5000, "expected YAML"),
+        ("", "the file is empty"),
+    ],
+)
+def test_text_that_is_no_map(tmp_path, text, message):
+    (tmp_path / "map.yaml").write_text(text)
+    with pytest.raises(InputError, match=rf"map\.yaml: {message}"):
+        read_map(tmp_path / "map.yaml")
+
+
+def test_bytes_that_are_no_text(tmp_path):
+    (tmp_path / "map.yaml").write_bytes(b"image: \xff\xfe\xfa")
+    with pytest.raises(InputError, match=r"map\.yaml: expected YAML"):
+        read_map(tmp_path / "map.yaml")
+
+
+def test_a_map_that_is_absent(tmp_path):
+    with pytest.raises(InputError, match=r"map\.yaml: cannot be read: No such file"):
+        read_map(tmp_path / "map.yaml")
+
+
+@pytest.mark.parametrize("image", ["../map.pgm", "below/../../map.pgm", "link.pgm", "{absolute}"])
+def test_an_image_outside_the_folder_is_refused(tmp_path, image):
+    Image.fromarray(grey(0)).save(tmp_path / "map.pgm")
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    path = make_map(folder, grey(0))
+    (folder / "link.pgm").symlink_to(tmp_path / "map.pgm")
+    settings = SETTINGS | {"image": image.format(absolute=folder / "map.pgm")}
+    path.write_text(yaml.safe_dump(settings))
+    with pytest.raises(InputError, match=r"map\.yaml, field 'image': expected an image inside the folder"):
+        read_map(path)
+
+
+def test_an_image_in_a_folder_below_is_fine(tmp_path):
+    (tmp_path / "images").mkdir()
+    assert read_map(make_map(tmp_path, grey(0), image="images/map.pgm")).shape == (1, 1)
+
+
+@pytest.mark.parametrize("image", ["absent.pgm", ".", 3, "nul\0.pgm", ""])
+def test_an_image_that_is_none(tmp_path, image):
+    path = make_map(tmp_path, grey(0))
+    path.write_text(yaml.safe_dump(SETTINGS | {"image": image}))
+    with pytest.raises(InputError, match=r"map\.yaml, field 'image'"):
+        read_map(path)
+
+
+def test_a_link_that_leads_to_itself(tmp_path):
+    path = make_map(tmp_path, grey(0))
+    (tmp_path / "map.pgm").unlink()
+    (tmp_path / "map.pgm").symlink_to("map.pgm")
+    with pytest.raises(InputError, match=r"map\.yaml, field 'image'"):
+        read_map(path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"not an image", b"P5\n4 4\n255\nab", b"P2\n2 1\n255\nx y\n", b"\x89PNG\r\n\x1a\n", b"P5\n0 0\n255\n"],
+)
+def test_an_image_that_is_broken(tmp_path, content):
+    path = make_map(tmp_path, grey(0))
+    (tmp_path / "map.pgm").write_bytes(content)
+    with pytest.raises(InputError, match=r"map\.pgm: expected"):
+        read_map(path)
+
+
+def test_an_image_of_fractions_is_refused(tmp_path):
+    path = make_map(tmp_path, grey(0))
+    (tmp_path / "map.pgm").write_bytes(b"Pf\n1 1\n-1.0\n" + np.float32(0.5).tobytes())
+    with pytest.raises(InputError, match=r"map\.pgm: expected an image in PGM or PNG"):
+        read_map(path)
+
+
+@pytest.mark.parametrize("size", ["10001 10000", "30000 30000"])
+def test_an_absurd_size_is_refused_before_decoding(tmp_path, size):
+    path = make_map(tmp_path, grey(0))
+    (tmp_path / "map.pgm").write_bytes(f"P5\n{size}\n255\n".encode())
+    with pytest.raises(InputError, match=r"map\.pgm: expected (from 1 to|at most) 100,000,000 pixels"):
+        read_map(path)
+
+
+def test_an_unknown_connectivity(tmp_path):
+    with pytest.raises(Exception, match="connectivity"):
+        read_map(make_map(tmp_path, grey(0)), connectivity=6)  # pyright: ignore[reportArgumentType]
+
+
+numbers = st.floats(-1e6, 1e6, allow_nan=False)
+
+
+@given(
+    st.integers(1, 5).flatmap(
+        lambda columns: st.lists(st.lists(st.floats(0, 1), min_size=columns, max_size=columns), min_size=1)
+    ),
+    st.floats(1e-6, 1e3),
+    st.tuples(numbers, numbers, numbers),
+)
+def test_a_learned_map_comes_back(tmp_path_factory, rows, resolution, origin):
+    folder, blocked = tmp_path_factory.mktemp("maps"), np.array(rows)
+    grid = Grid(np.full(blocked.shape, -1), resolution, origin)
+    write_map(folder / "learned.yaml", blocked, grid)
+    read = read_map(folder / "learned.yaml")
+    assert (read.resolution, read.origin) == (resolution, origin)
+    pixels = np.asarray(Image.open(folder / "learned.pgm"))
+    assert np.abs(1 - pixels / 255 - blocked).max() <= 0.5 / 255 + 1e-12
+    sure = np.abs(blocked[..., None] - [0.65, 0.196]).min(axis=-1) > 0.01
+    expected = np.where(blocked > 0.65, OCCUPIED, np.where(blocked < 0.196, FREE, UNKNOWN))
+    np.testing.assert_array_equal(read.known[sure], expected[sure])
+
+
+def test_a_learned_map_says_what_nav2_needs(tmp_path):
+    write_map(tmp_path / "new" / "learned.yaml", np.array([[0.0, 1.0]]), Grid.unknown(1, 2))
+    settings = yaml.safe_load((tmp_path / "new" / "learned.yaml").read_text())
+    assert settings == {
+        "image": "learned.pgm",
+        "mode": "scale",
+        "resolution": 1.0,
+        "origin": [0.0, 0.0, 0.0],
+        "negate": 0,
+        "occupied_thresh": 0.65,
+        "free_thresh": 0.196,
+    }
+    assert np.asarray(Image.open(tmp_path / "new" / "learned.pgm")).tolist() == [[255, 0]]
+
+
+@pytest.mark.parametrize("value", [-0.01, 1.01, float("nan")])
+def test_values_that_are_no_probabilities_are_not_written(tmp_path, value):
+    with pytest.raises(InputError, match="expected probabilities"):
+        write_map(tmp_path / "map.yaml", np.array([[value]]), Grid.unknown(1, 1))
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_array_of_another_shape_is_not_written(tmp_path):
+    with pytest.raises(InputError, match=r"expected an array of shape \(1, 1\), found \(1, 2\)"):
+        write_map(tmp_path / "map.yaml", np.zeros((1, 2)), Grid.unknown(1, 1))
+
+
+def test_a_map_needs_a_name_in_yaml(tmp_path):
+    with pytest.raises(InputError, match=r"ends in \.yaml"):
+        write_map(tmp_path / "map.pgm", np.zeros((1, 1)), Grid.unknown(1, 1))
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="needs the data folder beside the checkout")
+def test_maps_of_nav2():
+    depot, warehouse = read_map(DATA / "maps" / "depot.yaml"), read_map(DATA / "maps" / "warehouse.yaml")
+    assert (depot.shape, warehouse.shape) == ((307, 604), (1674, 1006))
+    assert warehouse.origin == (-15.1, -25.0, 0.0)
+    assert (warehouse.known == Cell.UNKNOWN).sum() == 230801

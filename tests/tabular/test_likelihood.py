@@ -1,0 +1,90 @@
+"""The likelihood by hand, its terms, and what gives none."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sidestep.demonstrations import Trajectory, gather
+from sidestep.tabular.backups import Behavior, HardMax
+from sidestep.tabular.graph import graph
+from sidestep.tabular.grid import Grid
+from sidestep.tabular.likelihood import log_likelihood
+from sidestep.tabular.models import ObstacleGrid, TabularModel
+from sidestep.tasks import reach
+
+# In a corridor of three cells, each blocked with p = 1/4, at γ = 1/2, a walker at 0 tries left, right, right; the
+# first attempt and one more fail. With g = γ(1−p)/(1−γp) = 3/7: V = g², g, 1.
+G = 3 / 7
+WALK = Trajectory(np.array([0, 0, 0, 1, 2]), np.array([2, 3, 3, 3]), 0)
+BETA = 2.0
+
+
+def corridor_likelihood(**kwargs):
+    grid = Grid.unknown(1, 3)
+    demos = gather([WALK], [reach(grid, 2, discount=0.5)])
+    return log_likelihood(ObstacleGrid(grid, -float(np.log(3))), demos, Behavior(HardMax(), BETA), **kwargs)
+
+
+def actions_by_hand() -> float:
+    stay, right = 0.5 * G**2, G**2  # at 0: up, down and left are off the map
+    at_0 = np.log(3 * np.exp(BETA * stay) + np.exp(BETA * right))
+    left = 0.5 * (0.75 * G**2 + 0.25 * G)
+    at_1 = np.log(2 * np.exp(BETA * 0.5 * G) + np.exp(BETA * left) + np.exp(BETA * G))
+    return BETA * (stay + 2 * right + G) - 3 * at_0 - at_1
+
+
+TRANSITIONS = np.log(1) + np.log(1 / 4) + 2 * np.log(3 / 4)
+
+
+@pytest.mark.parametrize(("terms", "actions", "transitions"), [
+    (("actions", "transitions"), actions_by_hand(), TRANSITIONS),
+    (("actions",), actions_by_hand(), 0),
+    (("transitions",), 0, TRANSITIONS),
+])  # fmt: skip
+def test_by_hand(terms, actions, transitions):
+    found = corridor_likelihood(terms=terms)
+    assert float(found.actions) == pytest.approx(actions, rel=1e-9)
+    assert float(found.transitions) == pytest.approx(transitions, rel=1e-12)
+    assert float(found.total) == pytest.approx(actions + transitions, rel=1e-9)
+
+
+def test_one_action_ahead_only_the_cell_before_the_goal_is_worth_something():
+    """Horizon 1: V = 0 at 0, v = γ(1−p) at 1 and 1 at the goal; Q looks one action further."""
+    v = 0.5 * 3 / 4
+    right, stay = 0.5 * v * 3 / 4, 0.0
+    at_0 = np.log(3 * np.exp(BETA * stay) + np.exp(BETA * right))
+    stay_1, left_1, right_1 = 0.5 * v, 0.5 * v / 4, 0.5 * (3 / 4 + v / 4)
+    at_1 = np.log(2 * np.exp(BETA * stay_1) + np.exp(BETA * left_1) + np.exp(BETA * right_1))
+    expected = BETA * (stay + 2 * right + right_1) - 3 * at_0 - at_1
+    found = corridor_likelihood(terms=("actions",), horizon=1)
+    assert float(found.actions) == pytest.approx(expected, rel=1e-12)
+
+
+def test_outcomes_that_lead_to_the_same_state_add_up():
+    world = graph(np.array([[[1, 1, 0]], [[0, 0, 1]]]))
+    model = TabularModel(world, jnp.log(jnp.asarray([[[0.2, 0.3, 0.5]], [[0.6, 0.3, 0.1]]])))
+    demos = gather([Trajectory(np.array([0, 0, 1]), np.array([0, 0]), 0)], [reach(world, 1)])
+    found = log_likelihood(model, demos, Behavior(HardMax(), 1.0))
+    assert float(found.transitions) == pytest.approx(2 * np.log(0.5), rel=1e-12)
+    assert float(found.actions) == 0  # a single action is no choice
+
+
+def test_each_trajectory_is_judged_by_its_own_task():
+    grid = Grid.unknown(1, 3)
+    tasks = [reach(grid, 0, discount=0.5), reach(grid, 2, discount=0.5)]
+    model, people = ObstacleGrid(grid, -1.0), Behavior(HardMax(), BETA)
+    right = Trajectory(np.array([1, 2]), np.array([3]), 1)
+    left = Trajectory(np.array([1, 0]), np.array([2]), 0)
+    wrong_way = Trajectory(np.array([1, 2]), np.array([3]), 0)
+    apart = [float(log_likelihood(model, gather([each], tasks), people).total) for each in (left, right, wrong_way)]
+    assert apart[0] == pytest.approx(apart[1], rel=1e-12)
+    assert apart[2] < apart[1]
+    together = log_likelihood(model, gather([left, wrong_way, right], tasks), people)
+    assert float(together.total) == pytest.approx(sum(apart), rel=1e-12)
+
+
+def test_transitions_that_cannot_happen_have_likelihood_0():
+    grid = Grid.unknown(1, 3)
+    demos = gather([Trajectory(np.array([0, 2]), np.array([3]), 0)], [reach(grid, 1)])
+    found = log_likelihood(ObstacleGrid(grid), demos, Behavior(HardMax(), 1.0), terms=("transitions",))
+    assert found.total == -jnp.inf

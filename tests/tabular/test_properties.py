@@ -1,0 +1,120 @@
+"""What must hold for any map, any people and any task."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from problems import BACKUPS, random_problem, solve_jit
+
+from sidestep.demonstrations import Demonstrations, Trajectory, gather
+from sidestep.tabular.backups import Behavior
+from sidestep.tabular.graph import graph
+from sidestep.tabular.grid import Grid
+from sidestep.tabular.likelihood import log_likelihood
+from sidestep.tabular.models import ObstacleGrid, TabularModel
+from sidestep.tasks import Task, reach
+
+ROWS, COLUMNS = 3, 4
+
+each_backup = pytest.mark.parametrize("name", BACKUPS)
+seeds = st.integers(0, 2**32 - 1)
+connectivities = st.sampled_from([4, 8])
+forms = st.sampled_from([{"discount": 0.95}, {"discount": 1.0, "step_cost": 1.0}])
+
+
+def some_map(rng, connectivity):
+    return Grid.unknown(ROWS, COLUMNS, connectivity), rng.normal(-1, 2, (ROWS, COLUMNS))
+
+
+def values_of(name, grid, theta, goal, form, beta=10.0):
+    task = reach(grid, goal, **form)
+    found = solve_jit(ObstacleGrid(grid, jnp.asarray(theta.reshape(-1))), task, Behavior(BACKUPS[name], beta))
+    assert found.converged
+    return np.asarray(found.values).reshape(ROWS, COLUMNS)
+
+
+@given(seed=seeds, connectivity=connectivities, form=forms)
+def test_values_fall_as_cells_block(seed, connectivity, form):
+    rng = np.random.default_rng(seed)
+    grid, theta = some_map(rng, connectivity)
+    before = values_of("hard max", grid, theta, 0, form)
+    after = values_of("hard max", grid, theta + rng.choice([0, 0, 1, 5], theta.shape), 0, form)
+    assert (after <= before + 1e-8 * np.abs(before)).all()
+
+
+@each_backup
+@given(seed=seeds, connectivity=connectivities, form=forms)
+def test_mirrored_maps_have_mirrored_values(name, seed, connectivity, form):
+    rng = np.random.default_rng(seed)
+    grid, theta = some_map(rng, connectivity)
+    row, column = divmod(int(rng.integers(grid.size)), COLUMNS)
+    values = values_of(name, grid, theta, row * COLUMNS + column, form)
+    left_right = values_of(name, grid, theta[:, ::-1], row * COLUMNS + COLUMNS - 1 - column, form)
+    up_down = values_of(name, grid, theta[::-1], (ROWS - 1 - row) * COLUMNS + column, form)
+    np.testing.assert_allclose(left_right[:, ::-1], values, rtol=1e-7)
+    np.testing.assert_allclose(up_down[::-1], values, rtol=1e-7)
+
+
+@each_backup
+@given(seed=seeds)
+def test_relabelling_states_changes_nothing(name, seed):
+    rng = np.random.default_rng(seed)
+    model = random_problem(seed=seed).model
+    assert isinstance(model, TabularModel)
+    order = rng.permutation(model.graph.states)  # new state i is the old state order[i]
+    new_name = np.argsort(order)
+    renamed = TabularModel(graph(new_name[np.asarray(model.graph.successors)[order]]), model.parameters[order])
+    reward, terminal = rng.normal(-1, 0.2, (7, 3)), np.arange(7) == 0
+    gamma, people = jnp.asarray(0.95), Behavior(BACKUPS[name], 5.0)
+    old = Task(jnp.asarray(reward), jnp.ones(7), jnp.asarray(terminal), gamma)
+    new = Task(jnp.asarray(reward[order]), jnp.ones(7), jnp.asarray(terminal[order]), gamma)
+    expected = solve_jit(model, old, people).values[order]
+    np.testing.assert_allclose(solve_jit(renamed, new, people).values, expected, rtol=1e-7)
+
+
+@given(seed=seeds, connectivity=connectivities, form=forms)
+def test_backups_in_order(seed, connectivity, form):
+    """Log-sum-exp ≥ hard max ≥ Boltzmann average and mellowmax, as values of every state."""
+    rng = np.random.default_rng(seed)
+    grid, theta = some_map(rng, connectivity)
+    goal, beta = int(rng.integers(grid.size)), 10 ** rng.uniform(0.5, 2)
+    value = {name: values_of(name, grid, theta, goal, form, float(beta)) for name in BACKUPS}
+    slack = 1e-7 * np.abs(value["hard max"])
+    assert (value["log-sum-exp"] >= value["hard max"] - slack).all()
+    assert (value["hard max"] >= value["Boltzmann"] - slack).all()
+    assert (value["hard max"] >= value["mellowmax"] - slack).all()
+
+
+def random_demonstrations(rng, copies: int) -> Demonstrations:
+    model = random_problem(states=7).model
+    successors = np.asarray(model.graph.successors)
+    trajectories, tasks = [], [reach(model.graph, 0), reach(model.graph, 0, discount=0.8)]
+    for task in (0, 1, 1):
+        states, actions = [6], []
+        while len(actions) < 5 and states[-1] != 0:
+            actions.append(int(rng.integers(3)))
+            states.append(int(rng.choice(successors[states[-1], actions[-1]])))
+        trajectories.append(Trajectory(np.array(states), np.array(actions), task))
+    again = [Trajectory(t.states, t.actions, t.task + 2 * copy) for copy in range(copies) for t in trajectories]
+    return gather(again, tasks * copies)
+
+
+@each_backup
+def test_copies_of_tasks_and_trajectories_double_the_likelihood(name):
+    model, people = random_problem(states=7).model, Behavior(BACKUPS[name], 5.0)
+
+    @jax.jit
+    @partial(jax.value_and_grad, has_aux=True)
+    def likelihood(parameters, demos):
+        found = log_likelihood(model.with_parameters(parameters), demos, people)
+        return found.total, found
+
+    once, twice = (
+        likelihood(model.parameters, random_demonstrations(np.random.default_rng(0), copies)) for copies in (1, 2)
+    )
+    for single, double in zip(jax.tree.leaves(once), jax.tree.leaves(twice), strict=True):
+        np.testing.assert_allclose(double, 2 * np.asarray(single), rtol=1e-9, atol=1e-12)

@@ -1,0 +1,383 @@
+"""Values: closed forms, problems solved by hand or by enumeration, hard cases, and what happens without convergence."""
+
+from functools import partial
+from itertools import product
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from problems import BACKUPS, plain_backup, random_problem, solve_jit
+from scipy.optimize import brentq
+
+from sidestep.demonstrations import Trajectory, gather
+from sidestep.errors import ImproperTask, InputError
+from sidestep.tabular.backups import Behavior
+from sidestep.tabular.graph import graph
+from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.likelihood import log_likelihood
+from sidestep.tabular.models import ObstacleGrid, TabularModel, true_model
+from sidestep.tabular.solve import check_proper, solve
+from sidestep.tabular.sweeps import Jacobi, lowest
+from sidestep.tasks import Task, reach, stack_tasks, task
+
+each_backup = pytest.mark.parametrize("name", BACKUPS)
+
+
+def people(name: str, beta: float = 10.0) -> Behavior:
+    return Behavior(BACKUPS[name], beta)
+
+
+def logit(blocked: float) -> float:
+    return float(np.log(blocked) - np.log1p(-blocked))
+
+
+def corridor(cells: int, logits) -> ObstacleGrid:
+    return ObstacleGrid(Grid.unknown(1, cells), logits)
+
+
+# Closed forms
+
+
+@pytest.mark.parametrize(
+    ("blocked", "gamma", "cells"), [(0.1, 0.95, 12), (0.7, 0.9, 12), (0.98, 0.99, 12), (0.2, 0.999, 500)]
+)
+def test_corridor_with_a_goal_that_pays(blocked, gamma, cells):
+    """V = (γ(1−p)/(1−γp))^d."""
+    model = corridor(cells, logit(blocked))
+    found = solve_jit(model, reach(model_grid(cells), 0, discount=gamma), people("hard max"))
+    distance = np.arange(cells)
+    assert found.converged
+    np.testing.assert_allclose(found.values, (gamma * (1 - blocked) / (1 - gamma * blocked)) ** distance, rtol=1e-8)
+
+
+def model_grid(cells: int) -> Grid:
+    return Grid.unknown(1, cells)
+
+
+@pytest.mark.parametrize(("blocked", "cells"), [(0.1, 12), (0.98, 12), (0.5, 500)])
+@pytest.mark.parametrize("beta", [10.0, 1e4])
+def test_corridor_with_a_step_cost(blocked, cells, beta):
+    """V = −d/(1−p) at discount 1."""
+    model = corridor(cells, logit(blocked))
+    found = solve_jit(model, reach(model_grid(cells), 0, discount=1.0, step_cost=1.0), people("hard max", beta))
+    assert found.converged
+    np.testing.assert_allclose(found.values, -np.arange(cells) / (1 - blocked), rtol=1e-8)
+
+
+@each_backup
+def test_equal_actions(name):
+    """n equal actions that pay r and reach F, or stay with p: V = (r + γ(1−p)F [+ log n/β]) / (1 − γp)."""
+    n, r, final, gamma, p, beta = 5, -0.3, 2.0, 0.8, 0.6, 3.0
+    successors = np.tile([1, 0], (2, n, 1))
+    logits = jnp.tile(jnp.log(jnp.asarray([1 - p, p])), (2, n, 1))
+    ends = Task(jnp.full((1, 1), r), jnp.asarray([0.0, final]), jnp.asarray([False, True]), jnp.asarray(gamma))
+    found = solve_jit(TabularModel(graph(successors), logits), ends, people(name, beta))
+    bonus = np.log(n) / beta if name == "log-sum-exp" else 0
+    assert float(found.values[0]) == pytest.approx((r + gamma * (1 - p) * final + bonus) / (1 - gamma * p), rel=1e-9)
+
+
+ESCAPE_OR_STAY = {
+    "hard max": lambda go, stay, _: max(go, stay),
+    "Boltzmann": lambda go, stay, beta: stay + (go - stay) / (1 + np.exp(beta * (stay - go))),
+    "log-sum-exp": lambda go, stay, beta: np.log(np.exp(beta * go) + np.exp(beta * stay)) / beta,
+    "mellowmax": lambda go, stay, beta: np.log((np.exp(beta * go) + np.exp(beta * stay)) / 2) / beta,
+}
+
+
+@each_backup
+def test_leaving_or_staying(name):
+    """One action reaches the goal, the other stays for good: V = B(γ, γV), a scalar equation."""
+    gamma, beta = 0.9, 4.0
+    model = TabularModel(graph(np.array([[[1], [0]], [[1], [1]]])), jnp.zeros((2, 2, 1)))
+    found = solve_jit(model, reach(model.graph, 1, discount=gamma), people(name, beta))
+    expected = brentq(lambda v: ESCAPE_OR_STAY[name](gamma, gamma * v, beta) - v, 0, 5, xtol=1e-14)
+    assert float(found.values[0]) == pytest.approx(expected, rel=1e-9)
+
+
+# Enumeration
+
+
+@pytest.mark.parametrize(("gamma", "cost"), [(0.95, None), (0.9, 0.5), (1.0, 1.0)])
+@pytest.mark.parametrize(("rows", "columns"), [(2, 2), (2, 3)])
+def test_hard_max_is_the_best_of_all_policies(rows, columns, gamma, cost):
+    """Every deterministic policy of a small grid, each by a linear solve."""
+    grid = Grid.unknown(rows, columns)
+    theta = np.random.default_rng(1).normal(-0.5, 1.5, grid.size)
+    model, goal = ObstacleGrid(grid, jnp.asarray(theta)), reach(grid, 0, discount=gamma, step_cost=cost)
+    probabilities, successors = np.asarray(model.probabilities()), np.asarray(model.graph.successors)
+    transitions = (probabilities[..., None] * np.eye(grid.size)[successors]).sum(axis=2)
+    policies = np.array([(0, *choice) for choice in product(range(4), repeat=grid.size - 1)])
+    chosen = gamma * transitions[np.arange(grid.size), policies]
+    chosen[:, 0] = 0
+    matrix = np.eye(grid.size) - chosen
+    ends = np.abs(np.linalg.det(matrix)) > 1e-9  # the others never arrive
+    pay = np.full(grid.size, -cost if cost else 0.0)
+    pay[0] = 0 if cost else 1
+    values = np.linalg.solve(matrix[ends], np.broadcast_to(pay, (ends.sum(), grid.size))[..., None])[..., 0]
+    np.testing.assert_allclose(solve(model, goal, people("hard max")).values, values.max(axis=0), rtol=1e-9)
+
+
+def test_log_sum_exp_sums_over_paths():
+    """Deterministic dynamics at discount 1: exp βV(s) = Σ_paths exp β(reward), and paths are drawn in proportion."""
+    grid = Grid(np.zeros((2, 3), dtype=np.int64))
+    beta, cost = 8.0, 1.0
+    wanted = reach(grid, 5, discount=1.0, step_cost=cost)
+    found = solve_jit(true_model(grid), wanted, people("log-sum-exp", beta))
+    successors = np.asarray(true_model(grid).graph.successors)[:, :, 0]
+
+    def weight(state: int, left: int) -> float:
+        """Σ over paths of at most `left` actions, one by one; each action more is worth 4e^−8."""
+        if state == 5:
+            return 1.0
+        if left == 0:
+            return 0.0
+        return sum(np.exp(-beta * cost) * weight(int(s), left - 1) for s in successors[state])
+
+    sums = np.array([weight(state, 8) for state in range(6)])
+    np.testing.assert_allclose(found.values, np.log(sums) / beta, rtol=1e-9, atol=1e-12)
+    along = [(0, 3), (1, 3), (2, 1)]  # right, right, down
+    log_policy = people("log-sum-exp", beta).log_policy(found.action_values)
+    chance = sum(float(log_policy[s, a]) for s, a in along)
+    assert chance == pytest.approx(-3 * beta * cost - np.log(sums[0]), rel=1e-9)
+
+
+def test_finite_horizon_sums_over_action_sequences():
+    """What log-sum-exp people can get within 4 actions, over all 4⁴ of them."""
+    grid = Grid(np.zeros((2, 2), dtype=np.int64))
+    beta, gamma, horizon = 3.0, 0.9, 4
+    reward = np.random.default_rng(2).normal(size=(4, 4))
+    wanted = task(reward, gamma, np.arange(4) == 3)
+    successors = np.asarray(true_model(grid).graph.successors)[:, :, 0]
+    found = solve_jit(true_model(grid), wanted, people("hard max", beta), horizon=horizon)
+
+    def best(state: int) -> float:
+        returns = []
+        for actions in product(range(4), repeat=horizon):
+            at, total = state, 0.0
+            for step, action in enumerate(actions):
+                total += 0 if at == 3 else gamma**step * reward[at, action]
+                at = at if at == 3 else successors[at, action]
+            returns.append(total)
+        return max(returns)
+
+    np.testing.assert_allclose(found.values, [best(state) for state in range(4)], rtol=1e-12)
+
+
+# Hard cases
+
+
+@each_backup
+@pytest.mark.parametrize("beta", [10.0, 1e3, 1e4])
+@pytest.mark.parametrize(("spread", "gamma", "cost"), [(3.0, 0.95, None), (3.0, 1.0, 1.0), (40.0, 0.95, None)])
+def test_extremes_are_finite_and_solve_the_bellman_equation(name, beta, spread, gamma, cost):
+    """Logits up to ±40: cells all but surely blocked, or free."""
+    grid = Grid.unknown(5, 5)
+    theta = jnp.asarray(np.random.default_rng(4).uniform(-spread, spread, grid.size))
+    wanted = reach(grid, 12, discount=gamma, step_cost=cost)
+    values, slope = value_and_gradient(ObstacleGrid(grid), theta, wanted, people(name, beta))
+    assert np.isfinite(values).all()
+    assert np.isfinite(slope).all()
+    found = solve_jit(ObstacleGrid(grid, theta), wanted, people(name, beta))
+    assert found.converged
+    assert residual(name, found, wanted, beta) < 1e-8
+
+
+WALLS = np.array([[0, 0, 0, 1, 0], [1, 1, 0, 1, 0], [0, 0, 0, 1, 0], [0, 1, 1, 1, 0], [0, 0, 0, 0, 0]])
+
+
+@each_backup
+@pytest.mark.parametrize("beta", [1e3, 1e4])
+def test_walls_of_logit_40_are_walls(name, beta):
+    """Sharp people need as many steps as the map says (a walker inside a wall walks out)."""
+    grid = Grid.unknown(5, 5)
+    theta = jnp.where(WALLS.reshape(-1) == 1, 40.0, -40.0)
+    wanted = reach(grid, 0, discount=1.0, step_cost=1.0)
+    values, slope = value_and_gradient(ObstacleGrid(grid), theta, wanted, people(name, beta))
+    free = WALLS == 0
+    steps = shortest_paths(free)
+    np.testing.assert_allclose(-values.reshape(5, 5)[free], steps[free], atol=np.log(4) / beta * 20)
+    assert np.isfinite(values).all()
+    assert np.isfinite(slope).all()
+
+
+def shortest_paths(free: np.ndarray) -> np.ndarray:
+    """Steps to the top left cell of a 5×5 map, by flooding it."""
+    steps = np.full(free.shape, np.inf)
+    steps[0, 0] = 0
+    for _ in range(free.size):
+        around = np.pad(steps, 1, constant_values=np.inf)
+        nearest = np.min([around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:]], axis=0)
+        steps = np.where(free, np.minimum(steps, nearest + 1), np.inf)
+    return steps
+
+
+@eqx.filter_jit
+def value_and_gradient(model, theta, wanted, behavior):
+    def total(theta):
+        values = solve(model.with_parameters(theta), wanted, behavior).values
+        return jnp.where(values > -1e100, values, 0).sum(), values
+
+    slope, values = jax.grad(total, has_aux=True)(theta)
+    return values, slope
+
+
+def residual(name: str, found, wanted, beta) -> float:
+    """How far V is from B(Q(V)) at states that act, relative to the size of V and Q."""
+    acting = ~np.asarray(wanted.terminal)
+    backed_up = np.asarray(plain_backup(name, found.action_values, beta))[acting]
+    values = np.asarray(found.values)[acting]
+    return float(np.max(np.abs(values - backed_up) / np.maximum(np.abs(values), 1)))
+
+
+def test_nearly_blocked_corridor():
+    """P(free) = 1e−9: each of 20 cells takes 1e9 tries; dV/dθ = −P(blocked)/P(free)."""
+    theta = jnp.full(20, logit(1 - 1e-9))
+    wanted = reach(model_grid(20), 0, discount=1.0, step_cost=1.0)
+    values, slope = value_and_gradient(corridor(20, 0.0), theta, wanted, people("hard max"))
+    tries = 1 + np.exp(float(theta[0]))
+    np.testing.assert_allclose(values, -np.arange(20) * tries, rtol=1e-9)
+    np.testing.assert_allclose(slope, -(tries - 1) * np.arange(19, -1, -1), rtol=1e-8)
+
+
+@each_backup
+@pytest.mark.parametrize("theta", [4.0, 12.0])
+def test_nearly_blocked_grid_takes_few_sweeps(name, theta):
+    """The longest path has 18 steps; plain sweeps would need thousands."""
+    grid = Grid.unknown(10, 10)
+    found = solve_jit(ObstacleGrid(grid, theta), reach(grid, 0, discount=1.0, step_cost=1.0), people(name))
+    assert found.converged
+    assert found.sweeps <= 40
+
+
+@pytest.mark.parametrize("solver", [Jacobi(max_sweeps=3), None], ids=["stopped", "ample"])
+def test_a_solve_that_did_not_converge_is_never_used(solver):
+    """The likelihood and its gradient are NaN; with sweeps enough they are not."""
+    grid = Grid.unknown(1, 12)
+    demos = gather([Trajectory(np.arange(12), np.full(11, 3), 0)], [reach(grid, 11, discount=0.95)])
+
+    @jax.jit
+    @jax.value_and_grad
+    def likelihood(theta):
+        return log_likelihood(ObstacleGrid(grid, theta), demos, people("Boltzmann"), solver=solver).total
+
+    value, slope = likelihood(jnp.zeros(12))
+    found = solve_jit(ObstacleGrid(grid, 0.0), demos.tasks, people("Boltzmann"), solver=solver)
+    stopped = solver is not None
+    assert bool(found.converged.all()) is not stopped
+    assert bool(jnp.isnan(value)) is stopped
+    assert bool(jnp.isnan(slope).any()) is stopped
+
+
+def test_an_adjoint_that_did_not_converge_gives_nan():
+    """Values that are right from the start need two sweeps, their adjoint in this corridor many more."""
+    wanted = task(np.ones((12, 4)), 0.9, np.zeros(12, dtype=bool))  # V = 10 everywhere
+    solver = Jacobi(max_sweeps=3)
+
+    @jax.jit
+    @partial(jax.grad, has_aux=True)
+    def slope_and_converged(theta):
+        found = solve(corridor(12, theta), wanted, people("hard max"), solver=solver)
+        return found.values.sum(), found.converged
+
+    slope, converged = slope_and_converged(jnp.zeros(12))
+    assert converged
+    assert jnp.isnan(slope).any()
+
+
+@each_backup
+def test_enclosed_cells_at_discount_1(name):
+    """Two cells behind known walls are worth about `lowest`; the others and the gradient do not notice."""
+    known = np.full((4, 5), Cell.UNKNOWN, dtype=np.int64)
+    known[:3, 2] = known[2, :3] = Cell.OCCUPIED
+    grid = Grid(known, connectivity=8)
+    enclosed, walls = np.array([0, 1, 5, 6]), np.flatnonzero(known == Cell.OCCUPIED)
+    wanted = reach(grid, 19, discount=1.0, step_cost=1.0)
+    theta = jnp.zeros(grid.size)
+    values, slope = value_and_gradient(ObstacleGrid(grid), theta, wanted, people(name))
+    assert (values[enclosed] <= 0.9 * lowest(jnp.dtype(jnp.float64))).all()
+    others = np.setdiff1d(np.arange(grid.size), [*enclosed, *walls])
+    assert (values[others] > -100).all()
+    assert np.isfinite(slope).all()
+    assert (slope[np.array([*enclosed, *walls])] == 0).all()
+    assert (slope[others] != 0).sum() > 5
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@each_backup
+def test_numbers_keep_their_precision(name, dtype):
+    """A model, a task and people in 32-bit numbers give good 32-bit values, 64-bit switched on."""
+    problem = random_problem()
+    wanted = reach(problem.model.graph, 0)
+    exact = solve_jit(problem.model, wanted, people(name))
+    inputs = jax.tree.map(
+        lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, (problem.model, wanted, people(name))
+    )
+    found = solve_jit(*inputs)
+    assert found.values.dtype == found.action_values.dtype == found.residual.dtype == dtype
+    assert found.converged
+    np.testing.assert_allclose(found.values, exact.values, rtol=1e-3 if dtype == jnp.float32 else 1e-12)
+
+
+# Improper problems, bad settings
+
+
+@pytest.mark.parametrize(("name", "cost", "refused"), [
+    ("log-sum-exp", 0.9, True),
+    ("log-sum-exp", 1.1, False),
+    ("mellowmax", 0.9, False),
+    ("Boltzmann", 0.9, False),
+    ("hard max", 0.9, False),
+])  # fmt: skip
+def test_improper_soft_tasks(name, cost, refused):
+    """log(4)/β = 1 is what a choice among four is worth; a stack is refused for one such task in it."""
+    behavior = people(name, float(np.log(4)))
+    grid = Grid.unknown(2, 2)
+    tasks = [reach(grid, 0), reach(grid, 0, discount=1.0, step_cost=cost)]
+    for each in (tasks[1], stack_tasks(tasks)):
+        if refused:
+            with pytest.raises(ImproperTask, match="log-sum-exp"):
+                check_proper(each, behavior, actions=4)
+        else:
+            check_proper(each, behavior, actions=4)
+    check_proper(tasks[0], behavior, actions=4)
+    check_proper(tasks[1], behavior, actions=4, horizon=3)
+
+
+def test_discount_1_needs_an_end_and_a_cost():
+    nowhere = task(np.full(3, -1.0), 1.0, np.zeros(3, dtype=bool))
+    with pytest.raises(ImproperTask, match="terminal"):
+        check_proper(nowhere, people("hard max"), actions=2)
+    one_free = task(np.array([[-1.0, 0.0], [-1.0, -1.0], [0.0, 0.0]]), 1.0, np.arange(3) == 2)
+    with pytest.raises(ImproperTask, match="cost"):
+        check_proper(one_free, people("hard max"), actions=2)
+
+
+def test_horizon_must_be_an_action_at_least():
+    grid = Grid.unknown(2, 2)
+    with pytest.raises(InputError, match="horizon"):
+        solve(ObstacleGrid(grid), reach(grid, 0), people("hard max"), horizon=0)
+
+
+# Any model
+
+
+@each_backup
+@given(seed=st.integers(0, 2**32 - 1), cost=st.booleans(), kind=st.sampled_from([4, 8, "tabular"]))
+def test_values_solve_the_bellman_equation(name, seed, cost, kind):
+    rng = np.random.default_rng(seed)
+    beta = float(10 ** rng.uniform(0.5, 3))
+    if kind == "tabular":
+        model = random_problem(seed=seed).model
+        world, goal = model.graph, 0
+    else:
+        world, goal = Grid.unknown(3, 4, kind), int(rng.integers(12))
+        model = ObstacleGrid(world, jnp.asarray(rng.normal(0, 4, 12)))
+    gamma = float(rng.uniform(0.5, 0.99))
+    wanted = reach(world, goal, discount=1.0 if cost else gamma, step_cost=1.0 if cost else None)
+    found = solve_jit(model, wanted, people(name, beta))
+    assert found.converged
+    assert residual(name, found, wanted, beta) < 1e-8
