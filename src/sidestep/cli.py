@@ -15,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from sidestep.commands.evaluate import evaluate_map
-from sidestep.commands.learn import Settings, Terms, learn
+from sidestep.commands.learn import Settings, Terms, learn, optimiser_of
 from sidestep.commands.plan import plan_path
 from sidestep.commands.simulate import Walkers, simulate_walks
 from sidestep.errors import SidestepError
@@ -30,7 +30,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-console = Console(highlight=False)
+console = Console(highlight=False, width=None if sys.stdout.isatty() else 140)
 errors = Console(stderr=True, highlight=False)
 
 BackupName = Literal["boltzmann", "max", "logsumexp", "mellowmax"]
@@ -94,7 +94,7 @@ def learn_command(
     horizon: Annotated[
         int | None, typer.Option(help="How many moves walkers look ahead; all of them by default.")
     ] = None,
-    iterations: Annotated[int, typer.Option(help="At most this many.")] = Settings.iterations,
+    iterations: Annotated[int | None, typer.Option(help="At most this many.")] = None,
     sample: Annotated[int | None, typer.Option(help="Learn from this many walks only, drawn by the seed.")] = None,
     seed: Seed = Settings.seed,
     resume: Annotated[bool, typer.Option("--resume", help="Go on where an interrupted run stopped.")] = False,
@@ -115,7 +115,7 @@ def learn_command(
         sample=sample,
         seed=seed,
     )
-    with _fitting(iterations) as report:
+    with _fitting(optimiser_of(settings).iterations) as report:
         summary = learn(walks, map_file, out, settings, report, resume)
     data = summary["data"]
     console.print(
@@ -126,6 +126,8 @@ def learn_command(
             f"left out: {data['walks_left_out']} walks that start at their goal, and {data['moves_left_out']} moves of "
             "walks that had arrived"
         )
+    for note in summary["notes"]:
+        errors.print(f"note: {note}", soft_wrap=True)
     console.print(
         f"objective {summary['objective']:.4f} after {summary['iterations']} iterations; {summary['message']}"
     )
@@ -258,6 +260,7 @@ def _print_scores(rows: Mapping[str, Mapping[str, Any]]) -> None:
         "max_probability": "highest",
         "legal_share": "legal\npaths",
         "excess_length": "excess\nlength",
+        "regret": "regret",
     }
     table = Table("", *columns.values())
     for name, scores in rows.items():

@@ -9,6 +9,7 @@
 | `learned.png`  | the picture                                                                              |
 """
 
+import io
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from sidestep.errors import InputError
 from sidestep.evaluation import Reward
 from sidestep.io.files import read_whole, write_array, write_json
 from sidestep.io.maps import read_map, write_map
-from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.grid import Cell, Connectivity, Grid
 from sidestep.tabular.models import ObstacleGrid
 
 
@@ -62,29 +63,45 @@ def write_learned_map(folder: Path, learned: LearnedMap, summary: dict[str, Any]
 
 def read_learned_map(folder: Path) -> LearnedMap:
     """A learned map back from its folder; raises `InputError` for a file that is missing or does not fit."""
-    summary = _read_json(folder / "summary.json")
-    settings = summary.get("settings", {}) if isinstance(summary, dict) else {}
-    missing = {"connectivity", "discount", "step_cost"} - set(settings)
-    if missing:
-        raise InputError(
-            f"expected the settings {sorted(missing)}, as `sidestep learn` writes them",
-            source=folder / "summary.json",
-        )
-    geometry = read_map(folder / "map.yaml", connectivity=settings["connectivity"])
-    blocked = _read_array(folder / "blocked.npy")
+    connectivity, reward = _settings(folder / "summary.json")
+    geometry = read_map(folder / "map.yaml", connectivity=connectivity)
+    blocked = _read_array(folder / "blocked.npy", kinds="f")
     if blocked.shape != geometry.shape or not ((blocked >= 0) & (blocked <= 1)).all():
         raise InputError(
             f"expected probabilities in the map's shape {geometry.shape}, found shape {blocked.shape}",
             source=folder / "blocked.npy",
         )
-    visited = _read_array(folder / "visited.npy")
+    visited = _read_array(folder / "visited.npy", kinds="iu")
+    if visited.ndim != 2 or visited.shape[1] != 2 or not ((visited >= 0) & (visited < blocked.size)).all():
+        raise InputError(
+            f"expected pairs of states in 0…{blocked.size - 1}, found shape {visited.shape}",
+            source=folder / "visited.npy",
+        )
     known = np.where(blocked == 0, Cell.FREE, np.where(blocked == 1, Cell.OCCUPIED, Cell.UNKNOWN))
     return LearnedMap(
         replace(geometry, known=known.astype(np.int64)),
         blocked.astype(np.float64),
         visited.astype(np.int64),
-        Reward(settings["discount"], settings["step_cost"]),
+        reward,
     )
+
+
+def _settings(path: Path) -> tuple[Connectivity, Reward]:
+    """The connectivity and the reward that a map was learned with, from its summary."""
+    summary = _read_json(path)
+    settings = summary.get("settings") if isinstance(summary, dict) else None
+    if not isinstance(settings, dict) or not {"connectivity", "discount", "step_cost"} <= set(settings):
+        raise InputError(
+            "expected settings with connectivity, discount and step_cost, as `sidestep learn` writes them", source=path
+        )
+    if settings["connectivity"] not in (4, 8):
+        raise InputError(f"expected 4 or 8, found {settings['connectivity']!r}", source=path, field="connectivity")
+    discount, step_cost = settings["discount"], settings["step_cost"]
+    if not isinstance(discount, int | float) or not 0 < discount <= 1:
+        raise InputError(f"expected a number above 0 and at most 1, found {discount!r}", source=path, field="discount")
+    if step_cost is not None and not (isinstance(step_cost, int | float) and 0 < step_cost < np.inf):
+        raise InputError(f"expected a number above 0, found {step_cost!r}", source=path, field="step_cost")
+    return settings["connectivity"], Reward(float(discount), None if step_cost is None else float(step_cost))
 
 
 def _read_json(path: Path) -> Any:
@@ -94,9 +111,13 @@ def _read_json(path: Path) -> Any:
         raise InputError(f"expected JSON: {error}", source=path) from error
 
 
-def _read_array(path: Path) -> np.ndarray:
-    read_whole(path)
+def _read_array(path: Path, kinds: str) -> np.ndarray:
+    """An array whose dtype is of one of `kinds` ("f" floats, "iu" whole numbers)."""
+    content = read_whole(path)
     try:
-        return np.load(path, allow_pickle=False)
-    except ValueError as error:
+        array = np.load(io.BytesIO(content), allow_pickle=False)
+    except Exception as error:  # what is not an array raises errors of many kinds
         raise InputError(f"expected a NumPy array: {error}", source=path) from error
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in kinds:
+        raise InputError("expected a NumPy array of numbers, as `sidestep learn` writes it", source=path)
+    return array

@@ -146,23 +146,36 @@ def score_paths(
     goals: Sequence[int] | Integer[np.ndarray, " paths"],
     truth: Grid,
 ) -> PathScores:
-    """Scores of planned paths.
-
-    - `paths`: the states along each path, the start first. A path that repeats a state in place is not legal.
-    - `goals`: the state that each path was planned to.
-
-    Pairs of start and goal between which the truth has no way are left out. Raises `InputError` for a path
-    without states, a number of goals that differs from the number of paths, and states that are not on the
-    map.
+    """Scores of planned paths; arguments and errors as for `path_lengths`.
 
     >>> truth = Grid(np.array([[0, 1, 0], [0, 0, 0]]))
     >>> score_paths([np.array([0, 3, 4, 5, 2]), np.array([0, 1, 2])], [2, 2], truth)
     PathScores(legal_share=0.5, excess_length=0.0)
     """
+    lengths, shortest = path_lengths(paths, goals, truth)
+    possible = np.isfinite(shortest)
+    legal = possible & np.isfinite(lengths)
+    return PathScores(_mean(legal[possible]), _mean(lengths[legal] - shortest[legal]))
+
+
+def path_lengths(
+    paths: Sequence[Integer[np.ndarray, " _"]],
+    goals: Sequence[int] | Integer[np.ndarray, " paths"],
+    truth: Grid,
+) -> tuple[Float[np.ndarray, " paths"], Float[np.ndarray, " paths"]]:
+    """The length of each path and of the shortest way between its ends, in cell sides.
+
+    - `paths`: the states along each path, the start first. A path that repeats a state in place is not legal.
+    - `goals`: the state that each path was planned to.
+
+    A path that is not legal in the truth or does not arrive has infinite length, and a pair of start and goal between
+    which the truth has no way has an infinite shortest way. Raises `InputError` for a path without states, a number of
+    goals that differs from the number of paths, and states that are not on the map.
+    """
     if len(paths) != len(goals):
         raise InputError(f"expected {len(paths)}, one for each path, found {len(goals)}", field="goals")
     if not len(paths):
-        return PathScores(None, None)
+        return np.zeros(0), np.zeros(0)
     sizes = np.array([len(path) for path in paths])
     if not sizes.all():
         raise InputError("expected at least one state", source="path", row=int(np.argmin(sizes)) + 1)
@@ -172,12 +185,10 @@ def score_paths(
     graph = walkable_graph(truth)
     last = np.cumsum(sizes) - 1
     starts = states[last - sizes + 1]
-    lengths = _path_lengths(graph, states, last)
-    shortest = _shortest_lengths(graph, starts, wanted)
+    lengths = np.where(states[last] == wanted, _path_lengths(graph, states, last), np.inf)
     # a lone start on an obstacle has made no move that could be illegal
-    possible = np.isfinite(shortest) & _free(truth)[starts]
-    legal = possible & np.isfinite(lengths) & (states[last] == wanted)
-    return PathScores(_mean(legal[possible]), _mean(lengths[legal] - shortest[legal]))
+    shortest = np.where(_free(truth)[starts], _shortest_lengths(graph, starts, wanted), np.inf)
+    return lengths, shortest
 
 
 def visit_ranking(visited: Integer[np.ndarray, " moves"], grid: Grid) -> Float[np.ndarray, "rows columns"]:

@@ -41,7 +41,8 @@ def simulate(
         states, actions = np.asarray(own)[:, None], np.zeros((len(own), 0), dtype=np.int64)
         while not (arrived := np.asarray(made.terminal)[states[:, -1]]).all() and actions.shape[1] < most:
             key, walking = jax.random.split(key)
-            walked = roll_out(walking, world, made.policy, made.terminal, jnp.asarray(states[:, -1]), _TOGETHER)
+            together = min(_TOGETHER, most - actions.shape[1])
+            walked = roll_out(walking, world, made.policy, made.terminal, jnp.asarray(states[:, -1]), together)
             states = np.concatenate([states, np.asarray(walked.states)[:, 1:]], axis=1)
             actions = np.concatenate([actions, np.asarray(walked.actions)], axis=1)
         if not arrived.all():

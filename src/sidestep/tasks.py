@@ -123,7 +123,7 @@ def _goal_state(world: Grid | Graph, goal: int | tuple[float, float]) -> tuple[i
             position = np.asarray([goal], dtype=np.float64)
             if position.shape != (1, 2) or not world.contains(position)[0]:
                 raise InputError(f"the goal {goal} lies outside the map", field="goal")
-            goal = int(world.states(position)[0])
+            goal = world.state(goal)
         if 0 <= goal < states and world.known.flat[goal] == 1:
             raise InputError(f"the goal (state {goal}) lies in a known obstacle", field="goal")
     if not 0 <= goal < states:

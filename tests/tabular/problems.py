@@ -1,4 +1,4 @@
-"""Small problems for the tabular tests, and the mathematics written out once more, plainly and densely.
+"""Small problems for the tabular tests, and the mathematics written out once more, plain and dense.
 
 Nothing here uses the library's formulas: transitions are dense arrays T[s, a, s′], and values come from plain value
 iteration, V ← B(R + γ T V), without any of the solver's care for self-loops.
@@ -32,26 +32,30 @@ STEPS = ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1))
 solve_jit = eqx.filter_jit(solve)
 
 
+NAMES = list(BACKUPS)
+
+
 def plain_policy(q, beta):
     """π ∝ exp βQ."""
-    odds = jnp.exp(beta * (q - q.max(axis=-1, keepdims=True)))
+    odds = jnp.exp(beta * (q - jax.lax.stop_gradient(q.max(axis=-1, keepdims=True))))
     return odds / odds.sum(axis=-1, keepdims=True)
 
 
-def plain_backup(name: str, q, beta):
-    """V = B(Q), from the table in DESIGN section 1."""
+def plain_backup(name, q, beta):
+    """V = B(Q), from the table in DESIGN section 1; `name` may be a traced index into `NAMES`."""
     best = jax.lax.stop_gradient(q.max(axis=-1))
     total = jnp.exp(beta * (q - best[..., None])).sum(axis=-1)
-    return {
+    values = {
         "hard max": q.max(axis=-1),
         "Boltzmann": (plain_policy(q, beta) * q).sum(axis=-1),
         "log-sum-exp": best + jnp.log(total) / beta,
         "mellowmax": best + jnp.log(total / q.shape[-1]) / beta,
-    }[name]
+    }
+    return values[name] if isinstance(name, str) else jnp.stack([values[each] for each in NAMES])[name]
 
 
-def plain_values(name: str, transitions, task: Task, beta, sweeps: int):
-    """(V, Q) by value iteration from nothing; differentiable through every sweep."""
+def plain_values(name, transitions, task: Task, beta, sweeps, at_most: int = 900):
+    """(V, Q) by value iteration from nothing, differentiable through every one of `sweeps` (which may be traced)."""
 
     def q_of(values):
         return task.reward + task.discount * jnp.einsum("sat,t->sa", transitions, values)
@@ -59,10 +63,11 @@ def plain_values(name: str, transitions, task: Task, beta, sweeps: int):
     def ended(values):
         return jnp.where(task.terminal, task.final_reward, values)
 
-    def sweep(values, _):
-        return ended(plain_backup(name, q_of(values), beta)), None
+    def sweep(values, index):
+        swept = ended(plain_backup(name, q_of(values), beta))
+        return jnp.where(index < sweeps, swept, values), None
 
-    values, _ = jax.lax.scan(sweep, ended(jnp.zeros(len(transitions))), length=sweeps)
+    values, _ = jax.lax.scan(sweep, ended(jnp.zeros(len(transitions))), jnp.arange(at_most))
     return values, q_of(values)
 
 
@@ -132,7 +137,7 @@ PROBLEMS: dict[str, Problem] = {
 
 
 def generic_task(problem: Problem, discount: float, seed: int = 0) -> Task:
-    """A task without ties: below discount 1 mostly the goal pays, at discount 1 every action costs about 1."""
+    """A task without ties: below discount 1 mostly the goal pays, at 1 every action costs about 1."""
     rng = np.random.default_rng(seed)
     reward = rng.uniform(-0.3, 0.3, (problem.states, problem.actions))
     reward = reward - 1 if discount == 1 else reward / 5

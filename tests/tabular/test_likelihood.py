@@ -12,8 +12,8 @@ from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import ObstacleGrid, TabularModel
 from sidestep.tasks import reach
 
-# In a corridor of three cells, each blocked with p = 1/4, at γ = 1/2, a walker at 0 tries left, right, right; the
-# first attempt and one more fail. With g = γ(1−p)/(1−γp) = 3/7: V = g², g, 1.
+# In a corridor of three cells, each blocked with p = 1/4, at γ = 1/2, a walker at 0 tries left, right, right;
+# the first two fail; then right again. With g = γ(1−p)/(1−γp) = 3/7: V = g², g, 1.
 G = 3 / 7
 WALK = Trajectory(np.array([0, 0, 0, 1, 2]), np.array([2, 3, 3, 3]), 0)
 BETA = 2.0

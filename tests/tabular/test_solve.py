@@ -1,4 +1,4 @@
-"""Values: closed forms, problems solved by hand or by enumeration, hard cases, and what happens without convergence."""
+"""Values: closed forms, problems solved by hand or by enumeration, hard cases, and solves that do not converge."""
 
 from functools import partial
 from itertools import product
@@ -122,7 +122,7 @@ def test_hard_max_is_the_best_of_all_policies(rows, columns, gamma, cost):
 
 
 def test_log_sum_exp_sums_over_paths():
-    """Deterministic dynamics at discount 1: exp βV(s) = Σ_paths exp β(reward), and paths are drawn in proportion."""
+    """Deterministic dynamics at discount 1: exp βV(s) = Σ_paths exp β(reward), and so are paths drawn."""
     grid = Grid(np.zeros((2, 3), dtype=np.int64))
     beta, cost = 8.0, 1.0
     wanted = reach(grid, 5, discount=1.0, step_cost=cost)

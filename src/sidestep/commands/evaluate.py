@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sidestep.errors import InputError
 from sidestep.evaluation import evaluate
 from sidestep.io.files import read_whole, write_json
@@ -26,7 +28,13 @@ def evaluate_map(folder: Path, truth_file: Path, out: Path | None = None, seed: 
             f"{truth.shape[0]} × {truth.shape[1]}",
             source=truth_file,
         )
-    scores = evaluate(learned.model(), learned.blocked, truth, learned.unknown, learned.visited, learned.reward, seed)
+    if not np.isclose(truth.resolution, learned.grid.resolution):
+        raise InputError(
+            f"expected the learned map's {learned.grid.resolution} metres a cell, found {truth.resolution}",
+            source=truth_file,
+            field="resolution",
+        )
+    scores = evaluate(learned.model(), truth, learned.unknown, learned.visited, learned.reward, seed)
     before = json.loads(read_whole(folder / "summary.json")) if out is None else {"command": "evaluate"}
     write_json((out or folder) / "summary.json", {**before, "truth": str(truth_file), **scores})
     return scores

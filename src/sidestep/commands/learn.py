@@ -13,7 +13,7 @@ from sidestep.demonstrations import Demonstrations, demonstrations_of_moves
 from sidestep.errors import InputError
 from sidestep.evaluation import Reward
 from sidestep.inference.fit import Fit, Progress, fit
-from sidestep.inference.optimisers import LBFGS, Ascent
+from sidestep.inference.optimisers import LBFGS, Ascent, Optimiser
 from sidestep.inference.priors import Normal
 from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map
@@ -42,7 +42,7 @@ class Settings:
     - `prior_mean`, `prior_variance`: of every unknown cell's logit.
     - `connectivity`: 4 or 8. `terms`: which parts of the likelihood count. `gradient`: "exact" climbs by L-BFGS,
       "fixed_policy" by first-order ascent. `horizon`: how many moves walkers look ahead (None: all).
-    - `iterations`: at most this many.
+    - `iterations`: at most this many (None: the optimiser's own limit).
     - `sample`: learn from that many walks only, drawn by `seed` (None: from all).
     """
 
@@ -56,7 +56,7 @@ class Settings:
     terms: Terms = "both"
     gradient: Gradient = "exact"
     horizon: int | None = None
-    iterations: int = 500
+    iterations: int | None = None
     sample: int | None = None
     seed: int = 0
 
@@ -90,16 +90,17 @@ def learn(
         "goals": len(demonstrations.tasks.terminal),
         "unknown_cells": int((grid.known == -1).sum()),
     }
+    objective = np.array([progress.objective for progress in found.history])
     summary = {
         "command": "learn",
         "files": {"walks": str(walks), "map": str(map_file)},
         "settings": asdict(settings),
         "data": counts,
+        "notes": _notes(demonstrations, settings),
         **_outcome(found),
         "seconds": round(time.monotonic() - started, 3),
         "peak_memory_bytes": peak_memory(),
     }
-    objective = np.array([progress.objective for progress in found.history])
     write_learned_map(folder, LearnedMap(grid, blocked, demonstrations.visited(), reward), summary)
     save(figure_fit(grid, demonstrations.paths(), blocked, objective), folder / "learned.png")
     checkpoint.unlink(missing_ok=True)
@@ -117,9 +118,6 @@ def fit_map(
     """The fit that `settings` describe."""
     if settings.backup not in BACKUPS:
         raise InputError(f"expected one of {', '.join(BACKUPS)}, found {settings.backup!r}", field="backup")
-    if settings.iterations < 1:
-        raise InputError(f"expected at least 1, found {settings.iterations}", field="iterations")
-    optimiser = LBFGS if settings.gradient == "exact" else Ascent
     return fit(
         model,
         demonstrations,
@@ -128,11 +126,21 @@ def fit_map(
         terms=TERMS[settings.terms],
         gradient=settings.gradient,
         horizon=settings.horizon,
-        optimiser=optimiser(iterations=settings.iterations),
+        optimiser=optimiser_of(settings),
         report=report,
         checkpoint=checkpoint,
         resume=resume,
     )
+
+
+def optimiser_of(settings: Settings) -> Optimiser:
+    """L-BFGS for the exact gradient, first-order ascent for the fixed-policy one."""
+    kind = LBFGS if settings.gradient == "exact" else Ascent
+    if settings.iterations is None:
+        return kind()
+    if settings.iterations < 1:
+        raise InputError(f"expected at least 1, found {settings.iterations}", field="iterations")
+    return kind(iterations=settings.iterations)
 
 
 def peak_memory() -> int | None:
@@ -152,6 +160,19 @@ def _sampled(walks: Walks, settings: Settings) -> Walks:
         raise InputError(f"expected 1…{len(walks)} walks, found {settings.sample}", field="sample")
     drawn = np.random.default_rng(settings.seed).choice(len(walks), settings.sample, replace=False)
     return walks.select(np.sort(drawn))
+
+
+def _notes(demonstrations: Demonstrations, settings: Settings) -> list[str]:
+    """What a person should know before trusting the numbers."""
+    moves = int(np.median(np.bincount(demonstrations.trajectory)))
+    difference = settings.beta * (1 - settings.discount**2) * settings.discount**moves
+    if settings.step_cost is None and difference < 0.05:
+        return [
+            f"half of the walks have {moves} moves or more; so far from the goal a step towards it and one away "
+            f"differ by {difference:.1g} in log-probability, and walks say next to nothing: "
+            "consider --step-cost 1 --discount 1"
+        ]
+    return []
 
 
 def _outcome(found: Fit[ObstacleGrid]) -> dict[str, Any]:

@@ -50,7 +50,7 @@ def _state(grid: Grid, position: Position, name: str) -> int:
     point = np.array([position], dtype=np.float64)
     if not grid.contains(point)[0]:
         raise InputError(f"{position} lies outside the map", field=name)
-    state = int(grid.states(point)[0])
+    state = grid.state(position)
     if grid.known.flat[state] == Cell.OCCUPIED:
         raise InputError(f"{position} lies in a known obstacle", field=name)
     return state

@@ -26,7 +26,7 @@ from sidestep.tabular.models import ObstacleGrid
 
 ROWS, COLUMNS = 16, 26
 WALKERS = Walkers(walks=400, goals=14)
-SETTINGS = Settings()
+SETTINGS = Settings(beta=20.0, discount=0.97)
 NEW_PLACES = 4
 
 
@@ -49,7 +49,7 @@ def demo(folder: Path, seed: int = 0, report: Callable[[str], None] = lambda _: 
     blocked = np.asarray(found.model.blocked)
 
     report("planning between all pairs of places")
-    scores = evaluate(found.model, blocked, truth, np.ones(truth.shape, bool), shown.visited(), reward)
+    scores = evaluate(found.model, truth, np.ones(truth.shape, bool), shown.visited(), reward)
     new = places(truth, NEW_PLACES, seed + 1)
     paths, _ = plan_paths(found.model, truth, new[:1], new[1:], reward)
     panels = [

@@ -108,7 +108,6 @@ def _learn(world: World, demonstrations: Demonstrations, variant: Variant) -> Fi
 def _scores(world: World, demonstrations: Demonstrations, found: Fit[ObstacleGrid]) -> dict[str, Any]:
     scores = evaluate(
         found.model,
-        np.asarray(found.model.blocked),
         world.truth,
         np.ones(world.truth.shape, dtype=bool),
         demonstrations.visited(),

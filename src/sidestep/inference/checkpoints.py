@@ -4,6 +4,7 @@ The first line is JSON (what was being fitted, and the history so far), the rest
 """
 
 import hashlib
+import io
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from sidestep.errors import InputError
-from sidestep.io.files import write_whole
+from sidestep.io.files import read_whole, write_whole
 
 
 def fingerprint(problem: PyTree) -> str:
@@ -29,7 +30,7 @@ def fingerprint(problem: PyTree) -> str:
     return digest.hexdigest()
 
 
-def save_checkpoint(path: Path, key: str, carried: PyTree, history: Sequence[Sequence[float]]) -> None:
+def save_checkpoint(path: Path, key: str, carried: PyTree, history: Sequence[Sequence[int | float]]) -> None:
     """Writes a checkpoint, whole or not at all."""
 
     def write(file: BinaryIO) -> None:
@@ -39,19 +40,23 @@ def save_checkpoint(path: Path, key: str, carried: PyTree, history: Sequence[Seq
     write_whole(path, write)
 
 
-def load_checkpoint(path: Path, key: str, like: PyTree) -> tuple[PyTree, list[list[float]]]:
+def load_checkpoint(path: Path, key: str, like: PyTree) -> tuple[PyTree, list[list[int | float]]]:
     """What the optimiser carried, in the structure of `like`, and the history.
 
     Raises `InputError` for a file that is no checkpoint, or one of a fit of other data or with other settings.
     """
-    with path.open("rb") as file:
-        try:
-            header = json.loads(file.readline())
-        except ValueError as error:
-            raise InputError("not a checkpoint", source=path) from error
-        if header["fit"] != key:
-            raise InputError(
-                "belongs to a fit of other data or with other settings; start without resuming to replace it",
-                source=path,
-            )
-        return eqx.tree_deserialise_leaves(file, like), header["history"]
+    file = io.BytesIO(read_whole(path))
+    try:
+        header = json.loads(file.readline())
+        key_found, history = header["fit"], header["history"]
+    except (ValueError, TypeError, KeyError) as error:
+        raise InputError("not a checkpoint", source=path) from error
+    if key_found != key:
+        raise InputError(
+            "belongs to a fit of other data or with other settings; start without resuming to replace it",
+            source=path,
+        )
+    try:
+        return eqx.tree_deserialise_leaves(file, like), history
+    except Exception as error:  # what is not an array raises errors of many kinds
+        raise InputError("not a checkpoint: the arrays cannot be read", source=path) from error

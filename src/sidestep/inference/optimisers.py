@@ -61,7 +61,7 @@ class Ascent(eqx.Module):
     - `tolerance`: as for `LBFGS`.
     """
 
-    iterations: int = eqx.field(default=500, static=True)
+    iterations: int = eqx.field(default=2000, static=True)
     learning_rate: float = eqx.field(default=0.2, static=True)
     tolerance: float = eqx.field(default=1e-2, static=True)
 
@@ -90,7 +90,12 @@ Optimiser = LBFGS | Ascent
 
 
 @eqx.filter_jit
-def _lbfgs_direction(memory: int, slope: Vector, state: PyTree[Array], x: Vector) -> tuple[Array, PyTree[Array]]:
+def _lbfgs_direction(
+    memory: int,
+    slope: Float[Array | np.ndarray, " parameters"],
+    state: PyTree[Array],
+    x: Float[Array | np.ndarray, " parameters"],
+) -> tuple[Array, PyTree[Array]]:
     direction, state = optax.scale_by_lbfgs(memory).update(jnp.asarray(slope), state, jnp.asarray(x))
     return jnp.asarray(direction), state
 
@@ -99,7 +104,9 @@ def _best_along(direction: Vector, evaluate: Evaluate, x: Vector, value: float, 
     """The best point that a line search for the strong Wolfe conditions meets; None if none is better than `x`."""
     tried: dict[float, Vector] = {value: x}
 
+    # the search computes in 64-bit numbers whatever the parameters are
     def loss(point: Vector) -> float:
+        point = point.astype(x.dtype)
         found = evaluate(point)[0]
         tried[found] = point
         return found
@@ -107,6 +114,8 @@ def _best_along(direction: Vector, evaluate: Evaluate, x: Vector, value: float, 
     with warnings.catch_warnings():
         # a search that meets no point with the right curvature says so; its best point may gain all the same
         warnings.simplefilter("ignore", RuntimeWarning)
-        line_search(loss, lambda point: evaluate(point)[1], x, direction, gfk=slope, old_fval=value, maxiter=20)
+        line_search(
+            loss, lambda point: evaluate(point.astype(x.dtype))[1], x, direction, gfk=slope, old_fval=value, maxiter=20
+        )
     best = min(tried)
     return None if best >= value else tried[best]

@@ -34,5 +34,8 @@ class Normal(eqx.Module):
 
     def log_density(self, parameters: PyTree[Float[Array, "..."]]) -> Float[Array, ""]:
         """−Σ (θ − b)²/a over all parameters."""
-        penalties = [jnp.sum((leaf - self.mean) ** 2 / self.variance) for leaf in jax.tree.leaves(parameters)]
+        penalties = [
+            jnp.sum((leaf - self.mean.astype(leaf.dtype)) ** 2 / self.variance.astype(leaf.dtype))
+            for leaf in jax.tree.leaves(parameters)
+        ]
         return -jnp.sum(jnp.stack(penalties))

@@ -15,7 +15,7 @@ log-sum-exp from Ziebart's maximum causal entropy (2010).
 import abc
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Literal
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -33,7 +33,12 @@ ActionValues = Float[Array, "*states actions"]
 
 
 class Backup(eqx.Module):
-    """How the values of a state's actions make the value of the state, at sharpness β."""
+    """How the values of a state's actions make the value of the state, at sharpness β.
+
+    `above_maximum` says on which side of the best action's value the backup lies: never below it, or never above.
+    """
+
+    above_maximum: ClassVar[bool] = False
 
     @abc.abstractmethod
     def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
@@ -67,7 +72,9 @@ class HardMax(Backup):
         del beta
         best = q.max(axis=-1, keepdims=True)
         tolerance = jnp.maximum(self.tie, 64 * jnp.finfo(q.dtype).eps) * jnp.abs(best)
-        ties = (q >= best - tolerance).astype(q.dtype)
+        # the first of the best counts even if a compiler, rounding twice, finds none as good as the best
+        first = jax.nn.one_hot(q.argmax(axis=-1), q.shape[-1], dtype=bool)
+        ties = ((q >= best - tolerance) | first).astype(q.dtype)
         return ties / ties.sum(axis=-1, keepdims=True)
 
     def fixed_policy_weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
@@ -94,6 +101,8 @@ class BoltzmannAverage(Backup):
 
 class LogSumExp(Backup):
     """V = (1/β) log Σ_a exp βQ(a): maximum causal entropy; every choice adds to the value of a state."""
+
+    above_maximum: ClassVar[bool] = True
 
     def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
         """The soft maximum, above the maximum by at most log(actions)/β."""
@@ -142,4 +151,4 @@ class Behavior(eqx.Module):
 
     def log_policy(self, q: ActionValues) -> ActionValues:
         """log π(a | s) from action values."""
-        return jax.nn.log_softmax(self.beta * q, axis=-1)
+        return jax.nn.log_softmax(self.beta.astype(q.dtype) * q, axis=-1)

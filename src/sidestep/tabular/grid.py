@@ -101,6 +101,10 @@ class Grid:
             raise InputError(f"position {tuple(positions[index].tolist())} lies outside the map", row=index + 1)
         return self.states_of_cell_units(self.to_cell_units(positions))
 
+    def state(self, position: tuple[float, float]) -> int:
+        """The state whose cell holds one position (metres); raises `InputError` outside the grid."""
+        return int(self.states(np.array([position], dtype=np.float64))[0])
+
     def centres(self, states: Integer[np.ndarray, " points"]) -> Float[np.ndarray, "points 2"]:
         """The position (metres) of the centre of each state's cell."""
         rows, columns = self.shape

@@ -48,8 +48,7 @@ def log_likelihood(
     `terms` are those that count; the other arguments are those of `solve`. The actions' term is NaN if a task's values
     did not converge.
     """
-    nothing = jnp.zeros((), jnp.result_type(float))
-    actions = transitions = nothing
+    actions = transitions = jnp.zeros((), model.probabilities().dtype)
     if "actions" in terms:
         actions = action_log_likelihood(
             model, demonstrations, behavior, horizon=horizon, gradient=gradient, solver=solver

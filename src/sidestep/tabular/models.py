@@ -97,7 +97,8 @@ class ObstacleGrid(TransitionModel):
         self.graph = grid_graph(grid)
         self.known = jnp.asarray(grid.known)
         self._needed = jnp.asarray(moves_into(grid), dtype=jnp.int32)
-        self.parameters = jnp.broadcast_to(jnp.asarray(logits, jnp.result_type(float)), (grid.size,))
+        dtype = logits.dtype if isinstance(logits, (jax.Array, np.ndarray)) else jnp.result_type(float)
+        self.parameters = jnp.broadcast_to(jnp.asarray(logits, dtype), (grid.size,))
 
     @property
     def blocked(self) -> Float[Array, "rows columns"]:

@@ -54,21 +54,23 @@ def solve(
     - `gradient`: what derivatives of the solution mean, "exact" or "fixed_policy" (eqs. 9, 10).
     - `solver`: how the fixed point is found.
 
-    May be used under `jit`, `vmap` and `grad`. Look at `converged` before you use the numbers; `check_proper` tells
-    beforehand whether values exist.
+    The numbers have the dtype of the model's probabilities. May be used under `jit`, `vmap` and `grad`. Look at
+    `converged` before you use the numbers; `check_proper` tells beforehand whether values exist.
     """
     if horizon is not None and horizon < 1:
         raise InputError(f"expected at least one action, found {horizon}", field="horizon")
     probabilities = model.probabilities()
+    dtype = probabilities.dtype
+    behavior = eqx.tree_at(lambda people: people.beta, behavior, behavior.beta.astype(dtype))
 
     def one(task: Task) -> Solution:
         process = DecisionProcess(
             model.graph.successors,
             probabilities,
-            task.reward,
-            task.final_reward,
+            task.reward.astype(dtype),
+            task.final_reward.astype(dtype),
             task.terminal,
-            task.discount,
+            task.discount.astype(dtype),
         )
         if horizon is None:
             found = _solve_fixed_point(process, behavior, gradient, solver or Jacobi())

@@ -11,8 +11,8 @@ c(a) − l(a) v, and since every backup moves with a constant, V = B(Q) reads B(
 
     v ← v + B(A) / Σ_a w(a) l(a),          w = the backup's weights at A.
 
-The *escape*, max_a c(a)/l(a), is the best that one action tried for ever can give. It bounds the root: from above where
-B(A) ≤ 0 there (averages), from below otherwise (the log-sum-exp's bonus). Steps start and end on the root's side of it;
+The *escape*, max_a c(a)/l(a), is the best that one action tried for ever can give. It bounds the root: from above for
+backups that never exceed the best action, from below for the log-sum-exp. Steps start and end on the root's side of it;
 otherwise a state whose value was too high would seem best off trying an action that never leaves. A state not reached
 yet starts from its escape. 1 − γp is summed as Σ_{elsewhere} P + (1 − γ) p, so that nothing cancels in a trapped
 state.
@@ -88,10 +88,11 @@ class Jacobi(eqx.Module):
     def values(self, process: DecisionProcess, backup: Backup, beta: Beta) -> Sweeps:
         """V of the fixed point."""
         split = _split(process)
+        reward = jnp.broadcast_to(process.reward, process.successors.shape[:2]).T
         scale = jnp.maximum(jnp.abs(process.reward).max(), jnp.abs(process.final_reward).max())
 
         def sweep(values: Float[Array, " states"]) -> Float[Array, " states"]:
-            elsewhere = process.reward + jnp.sum(split.elsewhere * values[process.successors], axis=-1)
+            elsewhere = reward + jnp.sum(split.elsewhere * values[split.successors], axis=1)
             return process.end(_own_equation(backup, beta, elsewhere, split, values))
 
         return self._iterate(sweep, process.end(_start(process)), scale)
@@ -109,12 +110,12 @@ class Jacobi(eqx.Module):
         """
         split = _split(process)
         moving = ~process.terminal
-        spread = jnp.where(moving[:, None], weights, 0)[..., None] * split.elsewhere
-        leaving = jnp.where(moving, jnp.sum(weights * split.leaving, axis=-1), 1)
-        divisor = jnp.where(moving, _divisor(weights, policy, split.leaving), 1)
+        spread = jnp.where(moving, weights.T, 0)[:, None] * split.elsewhere
+        leaving = jnp.where(moving, jnp.sum(weights.T * split.leaving, axis=0), 1)
+        divisor = jnp.where(moving, _divisor(weights, policy, split), 1)
 
         def sweep(adjoint: Float[Array, " states"]) -> Float[Array, " states"]:
-            arriving = jnp.zeros_like(adjoint).at[process.successors].add(spread * adjoint[:, None, None])
+            arriving = jnp.zeros_like(adjoint).at[split.successors].add(spread * adjoint)
             return (cotangent + arriving + (divisor - leaving) * adjoint) / divisor
 
         return self._iterate(sweep, jnp.zeros_like(cotangent), jnp.abs(cotangent).max())
@@ -165,19 +166,21 @@ def reachable(values: Float[Array, "*states"]) -> Bool[Array, "*states"]:
 
 
 class _Split(NamedTuple):
-    """The outcomes of a process, self-loops apart."""
+    """The outcomes of a process, self-loops apart; states come last, so that they are contiguous in memory."""
 
-    elsewhere: Float[Array, "states actions outcomes"]  # γ P of the outcomes that leave the state, 0 for the others
-    staying: Float[Array, "states actions"]  # γ p
-    leaving: Float[Array, "states actions"]  # 1 − γ p
+    successors: Int[Array, "actions outcomes states"]
+    elsewhere: Float[Array, "actions outcomes states"]  # γ P of the outcomes that leave the state, 0 for the others
+    leaving: Float[Array, "actions states"]  # l = 1 − γ p
 
 
 def _split(process: DecisionProcess) -> _Split:
-    own = process.successors == jnp.arange(len(process.successors))[:, None, None]
-    moves = jnp.where(own, 0, process.probabilities)
-    stays = jnp.where(own, process.probabilities, 0).sum(axis=-1)
+    successors = jnp.moveaxis(process.successors, 0, -1)
+    probabilities = jnp.moveaxis(process.probabilities, 0, -1)
+    own = successors == jnp.arange(len(process.successors))
+    moves = jnp.where(own, 0, probabilities)
+    stays = jnp.where(own, probabilities, 0).sum(axis=1)
     gamma = process.discount
-    return _Split(gamma * moves, gamma * stays, moves.sum(axis=-1) + (1 - gamma) * stays)
+    return _Split(successors, gamma * moves, moves.sum(axis=1) + (1 - gamma) * stays)
 
 
 def _start(process: DecisionProcess) -> Float[Array, " states"]:
@@ -194,7 +197,7 @@ def _start(process: DecisionProcess) -> Float[Array, " states"]:
 def _own_equation(
     backup: Backup,
     beta: Beta,
-    elsewhere: Float[Array, "states actions"],
+    elsewhere: Float[Array, "actions states"],
     split: _Split,
     old: Float[Array, " states"],
 ) -> Float[Array, " states"]:
@@ -202,30 +205,25 @@ def _own_equation(
     bottom = lowest(old.dtype)
     can_leave = split.leaving > 0
     escapes = jnp.where(can_leave, elsewhere / jnp.where(can_leave, split.leaving, 1), bottom)
-    escape = jnp.maximum(escapes.max(axis=-1), bottom)
-
-    def advantage(value: Float[Array, " states"]) -> Float[Array, "states actions"]:
-        return elsewhere - split.leaving * value[:, None]
-
-    above = backup.value(advantage(escape), beta) > 0
-    low, high = jnp.where(above, escape, bottom), jnp.where(above, jnp.inf, escape)
-    start = jnp.where(reachable(old), jnp.clip(old, low, high), escape)
-    a = advantage(start)
-    divisor = _divisor(backup.weights(a, beta), backup.fixed_policy_weights(a, beta), split.leaving)
-    solved = jnp.clip(start + backup.value(a, beta) / divisor, low, high)
-    return jnp.where(reachable(escape), solved, bottom)
+    escape = jnp.maximum(escapes.max(axis=0), bottom)
+    toward = jnp.maximum if backup.above_maximum else jnp.minimum
+    start = jnp.where(reachable(old), toward(old, escape), escape)
+    advantage = (elsewhere - split.leaving * start).T
+    divisor = _divisor(backup.weights(advantage, beta), backup.fixed_policy_weights(advantage, beta), split)
+    solved = toward(start + backup.value(advantage, beta) / divisor, escape)
+    return jnp.where(reachable(escape), jnp.maximum(solved, bottom), bottom)
 
 
 def _divisor(
-    weights: Float[Array, "states actions"],
-    policy: Float[Array, "states actions"],
-    leaving: Float[Array, "states actions"],
+    weights: Float[Array, "states actions"], policy: Float[Array, "states actions"], split: _Split
 ) -> Float[Array, " states"]:
     """What a state's own equation is divided by: Σ w l, and never less than Σ π l, so that no step is too long.
 
     A state that no action leaves is divided by 1: it gives nothing to its neighbours and takes nothing from them.
     """
-    divisor = jnp.maximum(jnp.sum(weights * leaving, axis=-1), jnp.sum(policy * leaving, axis=-1))
+    of_weights = jnp.sum(weights.T * split.leaving, axis=0)
+    of_policy = jnp.sum(policy.T * split.leaving, axis=0)
+    divisor = jnp.maximum(of_weights, of_policy)
     return jnp.where(divisor > 0, divisor, 1)
 
 

@@ -1,0 +1,227 @@
+"""How well walls that nobody bumped into are learned from the walks of real people (or rats).
+
+    python benchmarks/real_people.py
+    python benchmarks/real_people.py --set beta=5 prior_mean=-2
+    python benchmarks/real_people.py --animal rats --json rats.json
+
+Tartarus (de Cothi et al. 2022): twelve mazes of 10×10 cells of which the learner is told nothing. The layout is learned
+over trials 1–10, so trials 5–10 are the purposeful ones. Of these, N walks are drawn by seed without replacement (all
+of them where there are no more), a map is learned with the defaults of `sidestep learn`, and all cells are scored
+against the truth, beside the ranking of cells by how rarely the same walks visit them. Scores are averaged over the
+seeds of a maze, then over mazes.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+import jax
+import numpy as np
+import yaml
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from sidestep.commands.learn import Settings, fit_map
+from sidestep.demonstrations import demonstrations
+from sidestep.errors import InputError, SidestepError
+from sidestep.io.files import write_json
+from sidestep.io.maps import read_map
+from sidestep.io.walks import Walks, read_walks
+from sidestep.scoring import relevant_obstacles, score_map, visit_ranking
+from sidestep.tabular.grid import Grid
+from sidestep.tabular.models import ObstacleGrid
+
+DATA = Path(__file__).parents[2] / "shared" / "data" / "tartarus"
+TRIALS = (5, 10)
+HINTS = {name: hint for name, hint in get_type_hints(Settings).items() if name not in ("sample", "seed")}
+"""The settings that may be changed, with their types; how many walks are drawn is this script's own business."""
+SCORES = ("auc", "average_precision", "auc_relevant", "average_precision_relevant")
+
+
+@dataclass(frozen=True)
+class Maze:
+    """A maze, what the learner is told of it, and the purposeful walks in it."""
+
+    name: str
+    blank: Grid
+    truth: Grid
+    walks: Walks
+
+
+def read_maze(folder: Path, animal: str, settings: Settings) -> Maze:
+    """The maze in a folder; raises `InputError` for missing files and walks without numbers of trials."""
+    source = folder / f"{animal}.csv"
+    walks = read_walks(source)
+    if "trial" not in walks.metadata.column_names:
+        raise InputError("expected this column", source=source, field="trial")
+    trial = np.asarray(walks.metadata["trial"])[walks.offsets[:-1]]
+    first, last = TRIALS
+    return Maze(
+        folder.name,
+        read_map(folder / "blank.yaml", connectivity=settings.connectivity),
+        read_map(folder / "truth.yaml", connectivity=settings.connectivity),
+        walks.select((trial >= first) & (trial <= last)),
+    )
+
+
+def draws(maze: Maze, count: int, seeds: int) -> Iterator[tuple[int, Walks]]:
+    """`count` walks for each seed; all walks, once, where there are no more."""
+    if count >= len(maze.walks):
+        yield 0, maze.walks
+        return
+    for seed in range(seeds):
+        drawn = np.random.default_rng(seed).choice(len(maze.walks), count, replace=False)
+        yield seed, maze.walks.select(np.sort(drawn))
+
+
+def score(maze: Maze, walks: Walks, settings: Settings) -> dict[str, Any]:
+    """The scores of the map learned from some walks, and of the ranking by visits."""
+    started = time.perf_counter()
+    demos = demonstrations(walks, maze.blank, discount=settings.discount, step_cost=settings.step_cost)
+    found = fit_map(ObstacleGrid(maze.blank, settings.prior_mean), demos, settings)
+    seconds = time.perf_counter() - started
+    visited = demos.visited()
+    relevant = relevant_obstacles(maze.truth, visited[:, 0], visited[:, 1])
+    rankings = {
+        "learned": np.asarray(found.model.blocked, dtype=np.float64),
+        "visits": visit_ranking(np.concatenate(demos.paths()), maze.blank),
+    }
+    everywhere = np.ones(maze.truth.shape, dtype=bool)
+    scores = {name: asdict(score_map(ranking, maze.truth, everywhere, relevant)) for name, ranking in rankings.items()}
+    return {
+        "learned": scores["learned"],
+        "visits": {key: scores["visits"][key] for key in SCORES},
+        "moves": len(demos),
+        "iterations": found.final.iteration,
+        "converged": found.converged,
+        "seconds": round(seconds, 3),
+    }
+
+
+def measure(mazes: Sequence[Maze], counts: Sequence[int], seeds: int, settings: Settings) -> list[dict[str, Any]]:
+    """One record for every maze, number of walks and seed."""
+    work = [(maze, count, *draw) for count in counts for maze in mazes for draw in draws(maze, count, seeds)]
+    records = []
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        for maze, count, seed, walks in bar.track(work, description="learning"):
+            label = {"maze": maze.name, "walks": count, "walks_found": len(walks), "seed": seed}
+            records.append({**label, **score(maze, walks, settings)})
+    return records
+
+
+def mean_over_mazes(records: Iterable[dict[str, Any]], method: str, key: str) -> float:
+    """The mean of a score over mazes, each the mean over its seeds; NaN where no maze has one."""
+    by_maze: dict[str, list[float]] = {}
+    for record in records:
+        if (value := record[method][key]) is not None:
+            by_maze.setdefault(record["maze"], []).append(value)
+    return float(np.mean([np.mean(values) for values in by_maze.values()])) if by_maze else float("nan")
+
+
+def summarise(records: Sequence[dict[str, Any]], counts: Sequence[int]) -> list[dict[str, Any]]:
+    """The mean scores for every number of walks."""
+    rows = []
+    for count in counts:
+        own = [record for record in records if record["walks"] == count]
+        row: dict[str, Any] = {"walks": count, "converged": all(record["converged"] for record in own)}
+        for method in ("learned", "visits"):
+            row[method] = {key: mean_over_mazes(own, method, key) for key in SCORES}
+        rows.append(row)
+    return rows
+
+
+def print_summary(rows: Sequence[dict[str, Any]], title: str) -> None:
+    """The table."""
+    table = Table(title=title)
+    table.add_column("walks", justify="right")
+    for name in ("AUC", "average precision", "AUC of those that matter"):
+        for method in ("learned", "visits"):
+            table.add_column(f"{name}\n{method}", justify="right")
+    for row in rows:
+        cells = (row[method][key] for key in SCORES[:3] for method in ("learned", "visits"))
+        table.add_row(str(row["walks"]), *(f"{value:.3f}" for value in cells))
+    Console().print(table)
+
+
+def changed(settings: Settings, overrides: Sequence[str]) -> Settings:
+    """Settings with some fields changed, each given as `field=value`; `null` is None."""
+    values = {}
+    for override in overrides:
+        name, _, text = override.partition("=")
+        if name not in HINTS:
+            raise InputError(f"expected one of {', '.join(HINTS)} and a value, found {override!r}", source="--set")
+        values[name] = yaml.safe_load(text)
+        if not _fits(values[name], HINTS[name]):
+            raise InputError(f"cannot be {text!r}", source="--set", field=name)
+    return replace(settings, **values)
+
+
+def _fits(value: object, hint: Any) -> bool:
+    """Whether a value is of a setting's type; whole numbers pass for others."""
+    if get_origin(hint) is Literal:
+        return value in get_args(hint)
+    if get_args(hint):
+        return any(_fits(value, one) for one in get_args(hint))
+    return isinstance(value, (int, float) if hint is float else hint) and not isinstance(value, bool)
+
+
+def _described(settings: Settings) -> str:
+    """What differs from the shipped defaults."""
+    names = [field.name for field in fields(Settings)]
+    different = [f"{n}={getattr(settings, n)}" for n in names if getattr(settings, n) != getattr(Settings(), n)]
+    return ", ".join(different) or "shipped defaults"
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description="Maps learned from real walks, against the truth.")
+    parser.add_argument("--data", type=Path, default=DATA, metavar="DIR", help="maze_*/ with walks and maps")
+    parser.add_argument("--walks", type=int, nargs="+", default=[10, 40, 150], metavar="N", help="how many to draw")
+    parser.add_argument("--seeds", type=int, default=3, help="how many draws")
+    parser.add_argument("--animal", choices=("humans", "rats"), default="humans")
+    parser.add_argument("--set", nargs="+", default=[], metavar="FIELD=VALUE", help=f"settings: {', '.join(HINTS)}")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the means and every record")
+    parser.add_argument("--quick", action="store_true", help="every fourth maze, 10 walks, one draw")
+    arguments = parser.parse_args()
+    if min(*arguments.walks, arguments.seeds) < 1:
+        parser.error("--walks and --seeds: expected numbers above 0")
+    if arguments.quick:
+        arguments.walks, arguments.seeds = [10], 1
+    return arguments
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Measures, prints and writes what the arguments ask for."""
+    settings = changed(Settings(), arguments.set)
+    folders = sorted(arguments.data.glob("maze_*"))[:: 4 if arguments.quick else 1]
+    if not folders:
+        raise InputError(
+            "expected folders maze_01, maze_02, …; give the right folder with --data", source=arguments.data
+        )
+    mazes = [read_maze(folder, arguments.animal, settings) for folder in folders]
+    records = measure(mazes, arguments.walks, arguments.seeds, settings)
+    rows = summarise(records, arguments.walks)
+    print_summary(rows, f"{arguments.animal}, {len(mazes)} mazes, {_described(settings)}")
+    if not all(row["converged"] for row in rows):
+        Console(stderr=True).print("warning: some fits have not converged; see the records")
+    if arguments.json:
+        write_json(arguments.json, {"settings": asdict(settings), "means": rows, "records": records})
+
+
+def main() -> int:
+    """Runs the script; the exit code is 1 for data or settings that cannot be used."""
+    jax.config.update("jax_enable_x64", True)
+    try:
+        run(_arguments())
+    except SidestepError as error:
+        Console(stderr=True).print(f"error: {error}", markup=False, soft_wrap=True)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

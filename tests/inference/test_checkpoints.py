@@ -1,0 +1,82 @@
+"""Checkpoints keep every bit, and know what they belong to."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sidestep.errors import InputError
+from sidestep.inference.checkpoints import fingerprint, load_checkpoint, save_checkpoint
+
+CARRIED = (np.array([0.1, -1e-300, np.pi]), jnp.arange(4), jnp.asarray(2.5, jnp.float32))
+LIKE = (np.zeros(3), jnp.zeros(4, int), jnp.zeros((), jnp.float32))
+HISTORY = [[0, -1.1, 0.1], [1, -1 / 3, 2e-9]]
+
+
+def test_round_trip(tmp_path):
+    path = tmp_path / "fit.checkpoint"
+    save_checkpoint(path, "key", CARRIED, HISTORY)
+    carried, history = load_checkpoint(path, "key", LIKE)
+    assert history == HISTORY
+    for found, expected in zip(carried, CARRIED, strict=True):
+        assert found.dtype == expected.dtype
+        np.testing.assert_array_equal(found, expected)
+    assert [file.name for file in tmp_path.iterdir()] == ["fit.checkpoint"]
+
+
+def whole(path: Path) -> bytes:
+    save_checkpoint(path, "key", CARRIED, HISTORY)
+    return path.read_bytes()
+
+
+GARBAGE = {
+    "empty": lambda good: b"",
+    "text": lambda good: b"walk,step\n0,1\n",
+    "binary": lambda good: bytes(range(128, 256)),
+    "a number": lambda good: b"123\n",
+    "a list": lambda good: b"[]\n",
+    "no key": lambda good: b"{}\n",
+    "no history": lambda good: b'{"fit": "key"}\n' + good.split(b"\n", 1)[1],
+    "no arrays": lambda good: good.split(b"\n", 1)[0] + b"\n",
+    "cut short": lambda good: good[:-5],
+    "other arrays": lambda good: good.split(b"\n", 1)[0] + b"\nwhat is this",
+}
+
+
+@pytest.mark.parametrize("name", GARBAGE)
+def test_what_is_no_checkpoint_is_refused(tmp_path, name):
+    path = tmp_path / "fit.checkpoint"
+    path.write_bytes(GARBAGE[name](whole(path)))
+    with pytest.raises(InputError, match=r"fit\.checkpoint: (not a checkpoint|the file is empty)"):
+        load_checkpoint(path, "key", LIKE)
+
+
+def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
+    path = tmp_path / "fit.checkpoint"
+    save_checkpoint(path, "key", CARRIED, HISTORY)
+    with pytest.raises(InputError, match=r"fit\.checkpoint: belongs to a fit of other data"):
+        load_checkpoint(path, "another key", LIKE)
+
+
+class Pair(NamedTuple):
+    first: object
+    second: object
+
+
+PROBLEM = Pair(np.array([1.0, 2.0]), 3)
+
+
+@pytest.mark.parametrize(("other", "same"), [
+    (Pair(np.array([1.0, 2.0]), 3), True),
+    (Pair(jnp.array([1.0, 2.0]), 3), True),
+    (Pair(np.array([1.0, np.nextafter(2, 3)]), 3), False),
+    (Pair(np.array([1.0, 2.0], dtype=np.float32), 3), False),
+    (Pair(np.array([[1.0, 2.0]]), 3), False),
+    (Pair(np.array([1.0, 2.0]), 4), False),
+    (Pair(np.array([1.0, 2.0]), None), False),
+    ((np.array([1.0, 2.0]), 3), False),
+])  # fmt: skip
+def test_the_fingerprint_tells_problems_apart(other, same):
+    assert (fingerprint(PROBLEM) == fingerprint(other)) == same
