@@ -18,10 +18,11 @@ On office maps with walls at random and one task, five things are timed:
 Each map is given twice, as an obstacle grid (a parameter a cell) and as a table (a parameter for every outcome of every
 state and action) with the same probabilities, to show what the number of parameters does.
 
-Times are medians of warm calls after compilation; the methods take turns, so that noise on the machine hits all alike,
-and slow ones take fewer turns; the best time is shown too. The ratio is the median over turns of adjoint to values. Memory is what XLA sets aside
-for a call besides its inputs (`memory_analysis`: temporaries and outputs): exact, and the same on every run, where the
-resident set also holds the compiler. A method that needs more than `--memory` is not run; its memory is still shown.
+Times are medians of warm calls after compilation, and the best; the methods take turns, so that noise on the machine
+hits all alike, and slow ones take fewer turns. The ratio is the median over turns of adjoint to values. Memory is what
+XLA sets aside for a call besides its inputs (`memory_analysis`: temporaries and outputs): exact, and the same on every
+run, where the resident set also holds the compiler. A method that needs more than `--memory` is not run; its memory is
+still shown.
 """
 
 import argparse
@@ -353,7 +354,7 @@ def print_records(records: Sequence[Mapping[str, Any]], title: str) -> None:
     differences = [
         method["difference"] for record in records for method in record["methods"].values() if method["difference"]
     ]
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 100)
     console.print(table)
     console.print(f"A gradient by the adjoint took at most {max(r['ratio'] for r in records):.2f} times a value solve.")
     if differences:

@@ -54,7 +54,7 @@ def test_walks_are_legal_and_optimal_walkers_take_shortest_ways(connectivity, be
     graph = walkable_graph(grid)
     found = walked(grid, goals, starts, behavior)
     assert [walk.task for walk in found] == [0] * 4 + [1] * 4
-    assert [int(walk.states[0]) for walk in found] == sum(starts, [])
+    assert [int(walk.states[0]) for walk in found] == [*starts[0], *starts[1]]
     longer = 0.0
     for walk in found:
         goal = goals[walk.task]

@@ -84,7 +84,8 @@ def draw_walks(axes: Axes, paths: Sequence[Integer[np.ndarray, " _"]], grid: Gri
     shift = _shifts(len(paths)) * grid.resolution
     lines = [grid.centres(path) + own for path, own in zip(paths, shift, strict=True)]
     opacity = float(np.clip(12 / len(paths), 0.2, 0.7))
-    width = _width(grid, 0.6, 0.9)
+    few = len(paths) <= 6
+    width = _width(grid, 1.2, 1.8) if few else _width(grid, 0.6, 0.9)
     walks = LineCollection(lines, colors=_WALK, linewidths=width, alpha=opacity, zorder=3, label=label)
     axes.add_collection(walks, autolim=False)
 

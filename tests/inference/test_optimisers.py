@@ -1,5 +1,7 @@
 """The optimisers on functions whose lowest point is known."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -48,7 +50,7 @@ def run(optimiser, function, start, steps):
 def test_lbfgs_goes_downhill_to_the_lowest_point(function, start, lowest, steps):
     way = run(LBFGS(), function, start, steps)
     values = [value for _, value in way]
-    assert all(after < before for before, after in zip(values, values[1:], strict=False))
+    assert all(after < before for before, after in pairwise(values))
     np.testing.assert_allclose(way[-1][0], lowest, atol=1e-5)
 
 
@@ -61,7 +63,7 @@ def test_lbfgs_says_where_nothing_can_be_gained():
 def test_ascent_reaches_the_lowest_point_and_slows_down():
     way = run(Ascent(iterations=300, learning_rate=0.1), bowl, [2.0, 0.0, 0.0], 300)
     np.testing.assert_allclose(way[-1][0], LOWEST, atol=1e-3)
-    moves = [float(np.abs(after - before).max()) for (before, _), (after, _) in zip(way, way[1:], strict=False)]
+    moves = [float(np.abs(after - before).max()) for (before, _), (after, _) in pairwise(way)]
     assert moves[0] == pytest.approx(0.1, rel=1e-3)  # the first step of Adam is one learning rate long
     assert moves[-1] < 1e-5
 

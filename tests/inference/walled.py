@@ -40,10 +40,10 @@ def follow(start: int, moves: str, grid: Grid = BLANK) -> tuple[np.ndarray, np.n
     return start + np.append(0, np.cumsum(changes)), actions
 
 
-def walks(grid: Grid = BLANK, **reward) -> Demonstrations:
+def walks(grid: Grid = BLANK, discount: float = 0.95, step_cost: float | None = None) -> Demonstrations:
     """The demonstrations, with the reward that `reach` takes."""
     trajectories = [Trajectory(*follow(start, moves), task) for task, start, moves in PATHS for _ in range(REPEATS)]
-    return gather(trajectories, [reach(grid, goal, **reward) for goal in GOALS])
+    return gather(trajectories, [reach(grid, goal, discount=discount, step_cost=step_cost) for goal in GOALS])
 
 
 def objective(model, demonstrations, behavior, parameters, mean=-2.0, variance=4.0, **settings):

@@ -31,6 +31,7 @@ from sidestep.tabular.likelihood import ALL_TERMS, LogLikelihood, Term, log_like
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import Solution, check_proper, solve
 from sidestep.tabular.sweeps import Jacobi, reachable
+from sidestep.tasks import Task
 
 Model = TypeVar("Model", bound=TransitionModel)
 
@@ -94,8 +95,13 @@ class _Problem(eqx.Module):
 
     def solution(self, parameters: PyTree) -> Solution:
         model = self.model.with_parameters(parameters)
-        tasks = self.demonstrations.tasks
-        return solve(model, tasks, self.behavior, horizon=self.horizon, solver=self.solver)
+        return _solution(model, self.demonstrations.tasks, self.behavior, self.horizon, self.solver)
+
+
+@eqx.filter_jit
+def _solution(model: TransitionModel, tasks: Task, behavior: Behavior, horizon: int | None, solver: Jacobi) -> Solution:
+    """`solve`, compiled apart from the objective: fits of other terms or gradients need not compile it again."""
+    return solve(model, tasks, behavior, horizon=horizon, solver=solver)
 
 
 def fit(
@@ -135,7 +141,7 @@ def fit(
     if "actions" in terms:
         _check_start(problem)
     parameters, history, message = _climb(problem, optimiser, report, _Saver.of(checkpoint, problem, optimiser), resume)
-    solution = eqx.filter_jit(_Problem.solution)(problem, parameters)
+    solution = problem.solution(parameters)
     settled = history[-1].gradient <= optimiser.tolerance
     return Fit(
         model=model.with_parameters(parameters),
@@ -230,7 +236,7 @@ def _check_settings(terms: tuple[Term, ...], gradient: Gradient, behavior: Behav
 
 def _check_start(problem: _Problem) -> None:
     """Values must exist at the start, and every walker must be able to arrive."""
-    solution = eqx.filter_jit(_Problem.solution)(problem, problem.model.parameters)
+    solution = problem.solution(problem.model.parameters)
     if not bool(solution.converged.all()):
         tasks = np.flatnonzero(~np.asarray(solution.converged)).tolist()
         raise NotConverged(
