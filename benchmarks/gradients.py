@@ -101,9 +101,9 @@ class Method:
 
 
 def values(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
-    """One value solve, and its number of sweeps."""
-    found = solve(problem.model.with_parameters(parameters), problem.task, problem.behavior)
-    return found.values, jnp.where(found.converged, found.sweeps, -1)
+    """One value solve (of a stack of one task, as in the likelihood), and its number of sweeps; −1 if it failed."""
+    found = solve(problem.model.with_parameters(parameters), problem.demonstrations.tasks, problem.behavior)
+    return found.values[0], jnp.where(found.converged, found.sweeps, -1)[0]
 
 
 def likelihood_gradient(problem: Problem, parameters: Parameters, horizon: int | None = None) -> tuple[Array, Array]:

@@ -116,6 +116,13 @@ def test_nothing_is_done_after_arriving():
     assert walked.arrived.all()
 
 
+def test_walkers_stay_where_they_arrive_even_if_their_policy_would_lead_on():
+    always_right = jnp.zeros((9, 4)).at[:, RIGHT].set(1.0)
+    walked = roll_out(jax.random.key(0), true_model(OPEN), always_right, jnp.arange(9) == 1, jnp.array([0, 3]), moves=3)
+    assert walked.states.tolist() == [[0, 1, 1, 1], [3, 4, 5, 5]]
+    assert walked.arrived.tolist() == [True, False]
+
+
 WALKERS = 4000
 POLICY = np.array([[0.25, 0.75], [0.5, 0.5], [0.5, 0.5]])
 CHANCES = np.array([[[0.2, 0.3, 0.5], [0.7, 0.3, 0.0]]])

@@ -82,6 +82,11 @@ def test_equal_keys_give_equal_walks():
     assert one == same != other
 
 
+def test_walkers_of_different_tasks_choose_on_their_own():
+    found = walked(Grid(OPEN), [8, 8], [[0] * 20, [0] * 20])
+    assert [walk.states.tolist() for walk in found[:20]] != [walk.states.tolist() for walk in found[20:]]
+
+
 @pytest.mark.parametrize(("cells", "start", "moves"), [
     (np.array([[0, 1, 0, 0, 0, 0]]), 0, None),  # walled in
     (CORRIDOR, 0, 4),  # five moves are needed

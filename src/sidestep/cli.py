@@ -35,7 +35,7 @@ errors = Console(stderr=True, highlight=False)
 
 BackupName = Literal["boltzmann", "max", "logsumexp", "mellowmax"]
 Folder = Annotated[Path, typer.Option("--out", help="The folder to write to.", metavar="DIR")]
-Seed = Annotated[int, typer.Option(help="Draws everything that is random.")]
+Seed = Annotated[int, typer.Option(help="Draws everything that is random.", min=0)]
 Connected = Annotated[Literal["4", "8"], typer.Option(help="Moves: 4 directions, or 8 with diagonals.")]
 Backup = Annotated[BackupName, typer.Option(help="How walkers value a state by its actions.")]
 Discount = Annotated[float, typer.Option(help="γ, above 0 and at most 1.")]
@@ -192,17 +192,21 @@ def simulate_command(
     console.print(f"{walks} walks, {summary['moves']} moves, in {out}")
 
 
+_INTERRUPTED = 130
+"""What typer makes of a keyboard interrupt."""
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command line and returns its exit code: 0, 1 for an error, 2 for wrong usage."""
     jax.config.update("jax_enable_x64", True)
     try:
         app(args=arguments, prog_name="sidestep", standalone_mode=True)
     except SystemExit as stop:
-        return stop.code if isinstance(stop.code, int) else 1
+        if stop.code != _INTERRUPTED:
+            return stop.code if isinstance(stop.code, int) else 1
+        errors.print("interrupted; `sidestep learn … --resume` goes on from the last checkpoint")
     except SidestepError as error:
         errors.print(f"error: {error}", markup=False, soft_wrap=True)
-    except KeyboardInterrupt:
-        errors.print("interrupted; `sidestep learn … --resume` goes on from the last checkpoint")
     except Exception as error:
         # a defect of ours: say so in a line, with the details for those who ask
         if os.environ.get("SIDESTEP_DEBUG"):

@@ -47,7 +47,7 @@ class Demonstrations(eqx.Module):
         """The number of trajectories."""
         return int(self.trajectory[-1]) + 1
 
-    def paths(self) -> list[Int[np.ndarray, " steps"]]:
+    def paths(self) -> list[Int[np.ndarray, " _"]]:
         """The states along each trajectory, the last one included."""
         starts = np.flatnonzero(np.diff(np.asarray(self.trajectory))) + 1
         states, ends = np.asarray(self.states), np.asarray(self.next_states)

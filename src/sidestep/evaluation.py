@@ -127,7 +127,7 @@ def plan_paths(
     starts: Int[np.ndarray, " starts"],
     goals: Int[np.ndarray, " goals"],
     reward: Reward,
-) -> tuple[Sequence[Int[np.ndarray, " steps"]], Int[np.ndarray, " paths"]]:
+) -> tuple[Sequence[Int[np.ndarray, " _"]], Int[np.ndarray, " paths"]]:
     """The optimal paths under a model from every start to every other goal, and the goal of each.
 
     A path that never arrives ends where the plan leads nowhere new or after as many moves as there are states. Raises
@@ -145,7 +145,7 @@ def plan_paths(
 
 def _followed(
     intended: Int[np.ndarray, " states"], starts: Int[np.ndarray, " starts"], goal: int
-) -> list[Int[np.ndarray, " steps"]]:
+) -> list[Int[np.ndarray, " _"]]:
     """The paths from all starts, moved on together until all are at the goal or stand still."""
     visited = [starts]
     while len(visited) <= len(intended):

@@ -22,7 +22,7 @@ def simulate(
     key: PRNGKeyArray,
     world: TransitionModel,
     tasks: Sequence[Task],
-    starts: Sequence[Int[np.ndarray, " walkers"]],
+    starts: Sequence[Int[np.ndarray, " _"]],
     behavior: Behavior | None = None,
     moves: int | None = None,
 ) -> list[Trajectory]:

@@ -1,10 +1,10 @@
 """A small office for the tests of the commands: files on disk, and the command line called in-process.
 
-    . . # . .
-    . . # . .
-    . . # . .      one wall with a way around it, and an outer cell known beforehand
-    . . # . .
-    . . . . .
+. . # . .
+. . # . .
+. . # . .      one wall with a way around it, and an outer cell known beforehand
+. . # . .
+. . . . .
 """
 
 import json

@@ -204,7 +204,7 @@ def test_an_interrupted_run_goes_on(office, tmp_path, monkeypatch, capsys):
 
     iterations = []
 
-    def watched(walks, map_file, folder, settings, report, resume):
+    def watched(walks, map_file, folder, settings, _, resume):
         return whole(walks, map_file, folder, settings, lambda now: iterations.append(now.iteration), resume)
 
     monkeypatch.setattr(cli, "learn", watched)

@@ -24,8 +24,8 @@ from sidestep.tabular.solve import solve
 from sidestep.tabular.sweeps import Jacobi
 from sidestep.tasks import reach
 
-PAYING = {"discount": 0.95}
-COSTLY = {"discount": 1.0, "step_cost": 1.0}
+PAYING, COSTLY = (0.95, None), (1.0, 1.0)
+"""Rewards: discount and step cost."""
 ASCENT = Ascent(iterations=500)
 
 # name: (reward, backup, β, settings of the likelihood, settings of the fit)
@@ -50,7 +50,7 @@ MODEL = ObstacleGrid(BLANK, -2.0)
 @cache
 def fitted(name: str) -> Fit[ObstacleGrid]:
     reward, backup, beta, of_likelihood, of_fit = CASES[name]
-    return fit(MODEL, walks(**reward), Behavior(backup, beta), **of_likelihood, **of_fit)
+    return fit(MODEL, walks(BLANK, *reward), Behavior(backup, beta), **of_likelihood, **of_fit)
 
 
 SAME = {"ascent": "Boltzmann", "fixed policy": "Boltzmann", "log-sum-exp, fixed policy": "log-sum-exp"}
@@ -64,7 +64,7 @@ def objective_of(name: str):
 @cache
 def _objective_of(name: str):
     reward, backup, beta, of_likelihood, _ = CASES[name]
-    demonstrations, people = walks(**reward), Behavior(backup, beta)
+    demonstrations, people = walks(BLANK, *reward), Behavior(backup, beta)
     return jax.jit(lambda theta: objective(MODEL, demonstrations, people, theta, **of_likelihood))
 
 
@@ -180,7 +180,7 @@ def test_known_cells_stay_what_they_are():
     known = np.full((5, 5), Cell.UNKNOWN, dtype=int)
     known[0, 2], known[4, :] = Cell.OCCUPIED, Cell.FREE
     grid = Grid(known)
-    found = fit(ObstacleGrid(grid, -2.0), walks(grid, **PAYING), Behavior(BoltzmannAverage()))
+    found = fit(ObstacleGrid(grid, -2.0), walks(grid, *PAYING), Behavior(BoltzmannAverage()))
     blocked = np.asarray(found.model.blocked)
     assert blocked[0, 2] == 1
     assert (blocked[4] == 0).all()
@@ -192,7 +192,7 @@ def test_known_cells_stay_what_they_are():
 def test_a_sensor_that_is_sure_of_a_cell_outweighs_the_walks():
     sure = jnp.full(25, 4.0).at[7].set(1e-6).at[13].set(1e-6)
     prior = Normal(jnp.full(25, -2.0).at[13].set(1.5), sure)
-    found = fit(MODEL, walks(**PAYING), Behavior(BoltzmannAverage()), prior=prior)
+    found = fit(MODEL, walks(BLANK, *PAYING), Behavior(BoltzmannAverage()), prior=prior)
     np.testing.assert_allclose(found.model.parameters[jnp.array([7, 13])], [-2.0, 1.5], atol=1e-3)
     assert float(fitted("Boltzmann").model.parameters[7]) > 1
 
@@ -225,17 +225,17 @@ def test_a_model_that_knows_nothing_of_grids_learns_a_forbidden_transition():
 ])  # fmt: skip
 def test_settings_that_do_not_go_together(settings, message):
     with pytest.raises(InputError, match=message):
-        fit(MODEL, walks(**PAYING), Behavior(BoltzmannAverage()), **settings)
+        fit(MODEL, walks(BLANK, *PAYING), Behavior(BoltzmannAverage()), **settings)
 
 
 def test_tasks_without_values_are_refused():
     """Each of four actions is worth log(4)/β = 1.39 to a log-sum-exp walker, more than it costs."""
     with pytest.raises(ImproperTask, match="never wants to arrive"):
-        fit(MODEL, walks(**COSTLY), Behavior(LogSumExp(), 1.0))
+        fit(MODEL, walks(BLANK, *COSTLY), Behavior(LogSumExp(), 1.0))
 
 
 def test_solves_that_stop_early_are_never_used():
-    people, demonstrations = Behavior(BoltzmannAverage()), walks(**PAYING)
+    people, demonstrations = Behavior(BoltzmannAverage()), walks(BLANK, *PAYING)
     with pytest.raises(NotConverged, match=r"task\(s\) \[0, 1, 2\]"):
         fit(MODEL, demonstrations, people, solver=Jacobi(max_sweeps=2))
     enough = int(eqx.filter_jit(solve)(MODEL, demonstrations.tasks, people).sweeps.max())
@@ -248,20 +248,23 @@ def test_solves_that_stop_early_are_never_used():
 def test_visited_states_must_be_able_to_reach_their_goal():
     known = np.full((5, 5), Cell.UNKNOWN, dtype=int)
     known[:, 2] = Cell.OCCUPIED
-    walled_off = gather([Trajectory(*follow(4, "D"), 0), Trajectory(*follow(0, "D"), 0)], [reach(BLANK, 14, **COSTLY)])
+    walled_off = gather(
+        [Trajectory(*follow(4, "D"), 0), Trajectory(*follow(0, "D"), 0)],
+        [reach(BLANK, 14, discount=1.0, step_cost=1.0)],
+    )
     with pytest.raises(InputError, match="trajectory 1: state 0 is visited, but the goal cannot be reached"):
         fit(ObstacleGrid(Grid(known), -2.0), walled_off, Behavior(BoltzmannAverage()))
 
 
 def test_the_same_fit_twice_is_the_same_to_the_last_bit():
-    again = fit(MODEL, walks(**PAYING), Behavior(BoltzmannAverage()))
+    again = fit(MODEL, walks(BLANK, *PAYING), Behavior(BoltzmannAverage()))
     assert again.history == fitted("Boltzmann").history
     np.testing.assert_array_equal(again.model.parameters, fitted("Boltzmann").model.parameters)
 
 
 def test_32_bit_numbers_stay_so_and_find_the_same_map():
     with jax.enable_x64(False):
-        found = fit(ObstacleGrid(BLANK, -2.0), walks(**PAYING), Behavior(BoltzmannAverage()))
+        found = fit(ObstacleGrid(BLANK, -2.0), walks(BLANK, *PAYING), Behavior(BoltzmannAverage()))
         assert found.model.parameters.dtype == found.residual.dtype == jnp.float32
         blocked = np.asarray(found.model.blocked)
     assert found.task_converged.all()
@@ -275,6 +278,6 @@ def test_the_walks_are_what_the_tests_say():
         assert not WALL.reshape(-1)[states].any()
         assert states[-1] == GOALS[task]
         assert len(moves) == length
-    likelihood = log_likelihood(MODEL, walks(**PAYING), Behavior(HardMax()), terms=("transitions",))
+    likelihood = log_likelihood(MODEL, walks(BLANK, *PAYING), Behavior(HardMax()), terms=("transitions",))
     entered = REPEATS * sum(len(moves) for _, _, moves in PATHS)
     assert float(likelihood.transitions) == pytest.approx(-entered * np.log1p(np.exp(-2)), rel=1e-12)

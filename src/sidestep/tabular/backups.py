@@ -50,16 +50,17 @@ class Backup(eqx.Module):
 
     def fixed_policy_weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
         """The weights of the average under a policy that is held fixed: π for the soft backups (eq. 9)."""
-        return jax.nn.softmax(beta * q, axis=-1)
+        return jax.nn.softmax(beta * _below_best(q), axis=-1)
 
 
 class HardMax(Backup):
     """V = max_a Q(a): people who follow an optimal policy (eq. 2).
 
-    Actions within `tie` of the best, relative to its size, count as ties and share the gradient equally (eq. 10).
+    Actions within the share `tie` of the best value (or within rounding) count as ties and share the gradient equally
+    (eq. 10). It is small, for in a nearly trapped state values are far larger than the differences that matter.
     """
 
-    tie: float = eqx.field(default=1e-9, static=True)
+    tie: float = eqx.field(default=4e-12, static=True)
 
     def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
         """The best action's value."""
@@ -90,11 +91,11 @@ class BoltzmannAverage(Backup):
 
     def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
         """The average of the actions' values under π."""
-        return jnp.sum(jax.nn.softmax(beta * q, axis=-1) * q, axis=-1)
+        return jnp.sum(self.fixed_policy_weights(q, beta) * q, axis=-1)
 
     def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
         """π(1 + β(Q − V)), eq. 8: an action's own value counts, and how its share grows with it."""
-        policy = jax.nn.softmax(beta * q, axis=-1)
+        policy = self.fixed_policy_weights(q, beta)
         value = jnp.sum(policy * q, axis=-1, keepdims=True)
         return policy * (1 + beta * (q - value))
 
@@ -106,7 +107,8 @@ class LogSumExp(Backup):
 
     def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
         """The soft maximum, above the maximum by at most log(actions)/β."""
-        return jax.nn.logsumexp(beta * q, axis=-1) / beta
+        best = jax.lax.stop_gradient(q.max(axis=-1))
+        return best + jax.nn.logsumexp(beta * _below_best(q), axis=-1) / beta
 
     def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
         """π, so that eq. 9 is exact here."""
@@ -118,7 +120,8 @@ class Mellowmax(Backup):
 
     def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
         """A soft maximum between the mean and the maximum."""
-        return (jax.nn.logsumexp(beta * q, axis=-1) - jnp.log(q.shape[-1])) / beta
+        best = jax.lax.stop_gradient(q.max(axis=-1))
+        return best + (jax.nn.logsumexp(beta * _below_best(q), axis=-1) - jnp.log(q.shape[-1])) / beta
 
     def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
         """π, as for the log-sum-exp."""
@@ -151,4 +154,13 @@ class Behavior(eqx.Module):
 
     def log_policy(self, q: ActionValues) -> ActionValues:
         """log π(a | s) from action values."""
-        return jax.nn.log_softmax(self.beta.astype(q.dtype) * q, axis=-1)
+        return jax.nn.log_softmax(self.beta.astype(q.dtype) * _below_best(q), axis=-1)
+
+
+def _below_best(q: ActionValues) -> ActionValues:
+    """q − max q, with the gradient of q.
+
+    Everything here moves with a constant. Multiplied by β before the maximum is taken off, large values may be rounded
+    once with and once without a fused multiply-add, and the exponential of the difference overflows.
+    """
+    return q - jax.lax.stop_gradient(q.max(axis=-1, keepdims=True))

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sidestep.errors import ImproperTask, InputError
 from sidestep.tabular.backups import Backup, Behavior, Gradient, LogSumExp
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.sweeps import DecisionProcess, Jacobi, Sweeps, at_fixed_policy, finite_horizon
+from sidestep.tabular.sweeps import DecisionProcess, Jacobi, Sweeps, at_fixed_policy, finite_horizon, reachable
 from sidestep.tasks import Task
 
 
@@ -145,16 +145,19 @@ def _implicit_forward(solver: Jacobi, backup: Backup, gradient: Gradient, given:
 def _implicit_backward(solver: Jacobi, backup: Backup, gradient: Gradient, saved: tuple, cotangent: Array):
     given, varying, values = saved
     process, beta = _process(given, varying), varying[-1]
-    q = process.action_values(values)
+    # states that cannot reach a terminal state have no values to speak of, and no part in the gradient
+    live = reachable(values) & ~process.terminal
+    q = jnp.where(live[:, None], process.action_values(values), 0)
     policy = backup.fixed_policy_weights(q, beta)
     weights = backup.weights(q, beta) if gradient == "exact" else policy
-    found = solver.adjoint(process, weights, policy, cotangent)
+    found = solver.adjoint(process, weights, policy, live, cotangent)
     adjoint = jnp.where(found.converged, found.values, jnp.nan)
 
     def one_backup(varying: tuple) -> Float[Array, " states"]:
         process, beta = _process(given, varying), varying[-1]
-        q = process.action_values(values)
-        return process.end(backup.value(q, beta) if gradient == "exact" else at_fixed_policy(backup, beta, q))
+        q = jnp.where(live[:, None], process.action_values(values), 0)
+        backed_up = backup.value(q, beta) if gradient == "exact" else at_fixed_policy(backup, beta, q)
+        return process.end(jnp.where(live, backed_up, 0))
 
     return None, jax.vjp(one_backup, varying)[1](adjoint)[0], jnp.zeros_like(values)
 

@@ -14,8 +14,7 @@ c(a) − l(a) v, and since every backup moves with a constant, V = B(Q) reads B(
 The *escape*, max_a c(a)/l(a), is the best that one action tried for ever can give. It bounds the root: from above for
 backups that never exceed the best action, from below for the log-sum-exp. Steps start and end on the root's side of it;
 otherwise a state whose value was too high would seem best off trying an action that never leaves. A state not reached
-yet starts from its escape. 1 − γp is summed as Σ_{elsewhere} P + (1 − γ) p, so that nothing cancels in a trapped
-state.
+yet starts from its escape. 1 − γp is summed as (1 − γ) + γ Σ_{elsewhere} P, so that nothing cancels in a trapped state.
 
 The Boltzmann average may have several fixed points. Dividing by no less than Σ π l keeps the steps short where B(A)
 grows with v, so that the sweeps end in a stable one.
@@ -27,7 +26,8 @@ gradient), so the adjoint converges where the values did.
 
 At discount 1 the values of states that cannot reach a terminal state are −∞; they are held at `lowest(dtype)`, so low
 that an action which may lead there is never taken. Sweeps start from such values everywhere, and reach outwards from
-the terminal states as a shortest-path search does.
+the terminal states as a shortest-path search does; until that is done, an outcome that leads to a state not reached
+yet counts as staying.
 """
 
 from typing import NamedTuple
@@ -53,8 +53,13 @@ class DecisionProcess(eqx.Module):
     discount: Float[Array, ""]
 
     def action_values(self, values: Float[Array, " states"]) -> Float[Array, "states actions"]:
-        """Q(s, a) = R(s, a) + γ Σ T V (eq. 4)."""
-        expected = jnp.sum(self.probabilities * values[self.successors], axis=-1)
+        """Q(s, a) = R(s, a) + γ Σ T V (eq. 4).
+
+        Summed as differences from V(s), so that the rounding of probabilities that are nearly 1 does not meet values
+        that are large: where moves mostly fail it would drown the gradient.
+        """
+        differences = values[self.successors] - values[:, None, None]
+        expected = values[:, None] + jnp.sum(self.probabilities * differences, axis=-1)
         return self.reward + self.discount * expected
 
     def end(self, values: Float[Array, " states"]) -> Float[Array, " states"]:
@@ -92,8 +97,11 @@ class Jacobi(eqx.Module):
         scale = jnp.maximum(jnp.abs(process.reward).max(), jnp.abs(process.final_reward).max())
 
         def sweep(values: Float[Array, " states"]) -> Float[Array, " states"]:
-            elsewhere = reward + jnp.sum(split.elsewhere * values[split.successors], axis=1)
-            return process.end(_own_equation(backup, beta, elsewhere, split, values))
+            after = values[split.successors]
+            moves = _moves_so_far(split, values, after)
+            elsewhere = reward + jnp.sum(moves * after, axis=1)
+            leaving = split.ending + moves.sum(axis=1)
+            return process.end(_own_equation(backup, beta, elsewhere, leaving, values))
 
         return self._iterate(sweep, process.end(_start(process)), scale)
 
@@ -102,17 +110,19 @@ class Jacobi(eqx.Module):
         process: DecisionProcess,
         weights: Float[Array, "states actions"],
         policy: Float[Array, "states actions"],
+        live: Bool[Array, " states"],
         cotangent: Float[Array, " states"],
     ) -> Sweeps:
         """λ = g + Wᵀλ for the gradient g = `cotangent`; `values` of what it returns is λ.
 
-        `weights` are those in W, `policy` those of the policy held fixed.
+        `weights` are those in W, `policy` those of the policy held fixed; `live` are the states whose values pass on
+        to others.
         """
         split = _split(process)
-        moving = ~process.terminal
-        spread = jnp.where(moving, weights.T, 0)[:, None] * split.elsewhere
-        leaving = jnp.where(moving, jnp.sum(weights.T * split.leaving, axis=0), 1)
-        divisor = jnp.where(moving, _divisor(weights, policy, split), 1)
+        chances = split.ending + split.elsewhere.sum(axis=1)
+        spread = jnp.where(live, weights.T, 0)[:, None] * split.elsewhere
+        leaving = jnp.where(live, jnp.sum(weights.T * chances, axis=0), 1)
+        divisor = jnp.where(live, _divisor(weights, policy, chances), 1)
 
         def sweep(adjoint: Float[Array, " states"]) -> Float[Array, " states"]:
             arriving = jnp.zeros_like(adjoint).at[split.successors].add(spread * adjoint)
@@ -170,7 +180,7 @@ class _Split(NamedTuple):
 
     successors: Int[Array, "actions outcomes states"]
     elsewhere: Float[Array, "actions outcomes states"]  # γ P of the outcomes that leave the state, 0 for the others
-    leaving: Float[Array, "actions states"]  # l = 1 − γ p
+    ending: Float[Array, ""]  # 1 − γ
 
 
 def _split(process: DecisionProcess) -> _Split:
@@ -178,9 +188,19 @@ def _split(process: DecisionProcess) -> _Split:
     probabilities = jnp.moveaxis(process.probabilities, 0, -1)
     own = successors == jnp.arange(len(process.successors))
     moves = jnp.where(own, 0, probabilities)
-    stays = jnp.where(own, probabilities, 0).sum(axis=1)
-    gamma = process.discount
-    return _Split(successors, gamma * moves, moves.sum(axis=1) + (1 - gamma) * stays)
+    return _Split(successors, process.discount * moves, 1 - process.discount)
+
+
+def _moves_so_far(
+    split: _Split, values: Float[Array, " states"], after: Float[Array, "actions outcomes states"]
+) -> Float[Array, "actions outcomes states"]:
+    """γ P of the outcomes that leave a state, those that lead to states not reached yet counted as staying.
+
+    Once no state can be reached any more, the states that have not been are hopeless, and whatever leads there too.
+    """
+    known = reachable(after)
+    frontier = ~reachable(values) & jnp.any(known & (split.elsewhere > 0), axis=(0, 1))
+    return jnp.where(known | ~frontier.any(), split.elsewhere, 0)
 
 
 def _start(process: DecisionProcess) -> Float[Array, " states"]:
@@ -198,32 +218,31 @@ def _own_equation(
     backup: Backup,
     beta: Beta,
     elsewhere: Float[Array, "actions states"],
-    split: _Split,
+    leaving: Float[Array, "actions states"],
     old: Float[Array, " states"],
 ) -> Float[Array, " states"]:
     """One Newton step on each state's own equation, from its old value, kept on the right side of the escape."""
     bottom = lowest(old.dtype)
-    can_leave = split.leaving > 0
-    escapes = jnp.where(can_leave, elsewhere / jnp.where(can_leave, split.leaving, 1), bottom)
+    escapes = jnp.where(leaving > 0, elsewhere / jnp.where(leaving > 0, leaving, 1), bottom)
     escape = jnp.maximum(escapes.max(axis=0), bottom)
     toward = jnp.maximum if backup.above_maximum else jnp.minimum
     start = jnp.where(reachable(old), toward(old, escape), escape)
-    advantage = (elsewhere - split.leaving * start).T
-    divisor = _divisor(backup.weights(advantage, beta), backup.fixed_policy_weights(advantage, beta), split)
+    advantage = (elsewhere - leaving * start).T
+    divisor = _divisor(backup.weights(advantage, beta), backup.fixed_policy_weights(advantage, beta), leaving)
     solved = toward(start + backup.value(advantage, beta) / divisor, escape)
     return jnp.where(reachable(escape), jnp.maximum(solved, bottom), bottom)
 
 
 def _divisor(
-    weights: Float[Array, "states actions"], policy: Float[Array, "states actions"], split: _Split
+    weights: Float[Array, "states actions"],
+    policy: Float[Array, "states actions"],
+    leaving: Float[Array, "actions states"],
 ) -> Float[Array, " states"]:
     """What a state's own equation is divided by: Σ w l, and never less than Σ π l, so that no step is too long.
 
     A state that no action leaves is divided by 1: it gives nothing to its neighbours and takes nothing from them.
     """
-    of_weights = jnp.sum(weights.T * split.leaving, axis=0)
-    of_policy = jnp.sum(policy.T * split.leaving, axis=0)
-    divisor = jnp.maximum(of_weights, of_policy)
+    divisor = jnp.maximum(jnp.sum(weights.T * leaving, axis=0), jnp.sum(policy.T * leaving, axis=0))
     return jnp.where(divisor > 0, divisor, 1)
 
 

@@ -1,0 +1,103 @@
+"""The experiments: the paper's ways of learning on one world, and the demonstration in a small office."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sidestep.domains.grids import WORLDS, block
+from sidestep.experiments import demo, reproduce
+from sidestep.experiments.reproduce import VARIANTS
+from sidestep.inference.optimisers import LBFGS, Ascent
+from sidestep.runs import read_learned_map
+from sidestep.scoring import walkable_graph
+
+SCORES = {
+    "auc", "average_precision", "auc_relevant", "mean_obstacle", "mean_free", "max_probability", "legal_share",
+    "excess_length",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def reproduced(tmp_path_factory):
+    """The experiments on the block alone: the folder, and the scores of each variant."""
+    folder = tmp_path_factory.mktemp("figures")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reproduce, "WORLDS", {"block": WORLDS["block"]})
+        told = []
+        summary = reproduce.reproduce(folder, seed=0, report=told.append)
+    assert len(told) == 4
+    return folder, summary
+
+
+def test_the_four_ways_of_learning():
+    assert {name: (variant.terms, variant.gradient) for name, variant in VARIANTS.items()} == {
+        "bam": (("actions", "transitions"), "fixed_policy"),
+        "bam_exact": (("actions", "transitions"), "exact"),
+        "actions_only": (("actions",), "fixed_policy"),
+        "transitions_only": (("transitions",), "exact"),
+    }
+    kinds = {"fixed_policy": Ascent, "exact": LBFGS}
+    assert all(isinstance(variant.optimiser, kinds[variant.gradient]) for variant in VARIANTS.values())
+
+
+def test_the_experiments_write_figures_and_numbers(reproduced):
+    folder, summary = reproduced
+    assert {path.name for path in folder.iterdir()} == {
+        "figure1.png", "figure2.png", "figure3.png", "figure4.png", "summary.json",
+    }  # fmt: skip
+    for path in folder.glob("*.png"):
+        with Image.open(path) as picture:
+            assert min(picture.size) > 100
+    assert json.loads((folder / "summary.json").read_text()) == summary
+    assert set(summary["maps"]) == {"block"}
+    assert set(summary["maps"]["block"]) == set(VARIANTS)
+    for scores in summary["maps"]["block"].values():
+        assert set(scores) >= SCORES
+        assert scores["converged"]
+
+
+def test_the_block_is_found_by_those_who_watch_actions(reproduced):
+    """What issue and paper promise, on the first of the three maps."""
+    bam, exact, actions, transitions = (reproduced[1]["maps"]["block"][name] for name in VARIANTS)
+    for scores in (bam, exact):
+        assert scores["auc"] >= 0.95
+        assert scores["mean_obstacle"] >= 0.4
+        assert scores["mean_free"] <= 0.1
+        assert scores["legal_share"] >= 0.97
+        assert scores["legal_share"] > transitions["legal_share"]
+    assert transitions["max_probability"] < 0.2
+    assert actions["mean_free"] > bam["mean_free"]
+
+
+def test_ten_optimal_walks_for_each_pair_with_ties_at_random():
+    world = block()
+    paths = reproduce._walks(world, seed=0).paths()
+    assert len(paths) == 10 * len(world.starts) * len(world.goals)
+    legal = walkable_graph(world.truth).toarray() > 0
+    assert all(legal[path[:-1], path[1:]].all() for path in paths)
+    from_start_to_corner = {tuple(path) for path in paths if (path[0], path[-1]) == (0, 80)}
+    assert {len(path) for path in from_start_to_corner} == {17}
+    assert len(from_start_to_corner) > 3
+    again = reproduce._walks(world, seed=0).paths()
+    assert [path.tolist() for path in again] == [path.tolist() for path in paths]
+
+
+def test_the_demonstration_in_a_small_office(tmp_path, monkeypatch):
+    monkeypatch.setattr(demo, "ROWS", 10)
+    monkeypatch.setattr(demo, "COLUMNS", 10)
+    monkeypatch.setattr(demo, "WALKERS", demo.Walkers(walks=60, goals=5))
+    told = []
+    summary = demo.demo(tmp_path, seed=1, report=told.append)
+    assert len(told) == 3
+    assert json.loads((tmp_path / "summary.json").read_text()) == summary
+    assert set(summary["scores"]) >= SCORES
+    assert summary["scores"]["auc"] > 0.7
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "demo.png", "learned", "summary.json", "truth.pgm", "truth.yaml", "walks.csv",
+    }  # fmt: skip
+    found = read_learned_map(tmp_path / "learned")
+    assert found.unknown.all()  # nothing of the office was known
+    assert found.blocked.shape == (10, 10)
+    assert np.isfinite(found.blocked).all()
