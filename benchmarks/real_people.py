@@ -27,8 +27,8 @@ from rich.progress import Progress
 from rich.table import Table
 
 from sidestep.commands.learn import Settings, fit_map
-from sidestep.demonstrations import demonstrations
 from sidestep.errors import InputError, SidestepError
+from sidestep.io.demonstrations import demonstrations
 from sidestep.io.files import write_json
 from sidestep.io.maps import read_map
 from sidestep.io.walks import Walks, read_walks

@@ -234,8 +234,11 @@ class TestWithALearnedMap:
 def test_a_fit_that_fails_on_its_way_writes_no_map(here, capsys, monkeypatch):
     """The reporter breaks down, as a defect of ours would: one line, no traceback, no half-written map."""
 
-    def learn(*arguments):
-        return whole(*arguments[:4], lambda progress: 1 / (2 - progress.iteration), *arguments[5:])
+    def broken(progress):
+        print(1 / (2 - progress.iteration))
+
+    def learn(walks, map_file, folder, settings, _, resume):
+        return whole(walks, map_file, folder, settings, broken, resume)
 
     whole = cli.learn
     monkeypatch.setattr(cli, "learn", learn)

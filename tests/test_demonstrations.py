@@ -4,8 +4,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from sidestep.demonstrations import Trajectory, demonstrations, gather
+from sidestep.demonstrations import Trajectory, gather
 from sidestep.errors import InputError
+from sidestep.io.demonstrations import demonstrations
 from sidestep.io.walks import walks_of_table
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tasks import reach

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import dijkstra
 
-from sidestep.demonstrations import demonstrations, gather
+from sidestep.demonstrations import gather
 from sidestep.errors import InputError
+from sidestep.io.demonstrations import demonstrations
 from sidestep.io.trajectories import walks_of_trajectories
 from sidestep.io.walks import read_walks, write_walks
 from sidestep.scoring import walkable_graph

@@ -3,12 +3,13 @@
 The names here are the public ones; `docs/mathematics.md` explains what they compute.
 """
 
-from sidestep.demonstrations import Demonstrations, Trajectory, demonstrations, gather
+from sidestep.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.errors import ImproperTask, InputError, NotConverged, SidestepError
 from sidestep.evaluation import Reward, evaluate, plan_paths
 from sidestep.inference.fit import Fit, Progress, fit
 from sidestep.inference.optimisers import LBFGS, Ascent
 from sidestep.inference.priors import Normal
+from sidestep.io.demonstrations import demonstrations
 from sidestep.io.maps import read_map, write_map
 from sidestep.io.walks import Walks, read_walks, write_walks
 from sidestep.simulation import simulate

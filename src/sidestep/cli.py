@@ -204,7 +204,7 @@ def main(arguments: list[str] | None = None) -> int:
     except SystemExit as stop:
         if stop.code != _INTERRUPTED:
             return stop.code if isinstance(stop.code, int) else 1
-        errors.print("interrupted; `sidestep learn … --resume` goes on from the last checkpoint")
+        errors.print("interrupted (a fit goes on from its last checkpoint with `sidestep learn … --resume`)")
     except SidestepError as error:
         errors.print(f"error: {error}", markup=False, soft_wrap=True)
     except Exception as error:
@@ -259,6 +259,7 @@ def _print_scores(rows: Mapping[str, Mapping[str, Any]]) -> None:
         "auc": "AUC",
         "average_precision": "average\nprecision",
         "auc_relevant": "AUC of those\nthat matter",
+        "recall": "recall",
         "mean_obstacle": "mean on\nobstacles",
         "mean_free": "mean on\nfree cells",
         "max_probability": "highest",

@@ -9,10 +9,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from sidestep.errors import InputError
-from sidestep.io.gridding import Moves, grid_walks
-from sidestep.io.walks import Walks
-from sidestep.tabular.grid import Grid
-from sidestep.tasks import Task, reach, stack_tasks
+from sidestep.tasks import Task, stack_tasks
 
 
 class Trajectory(NamedTuple):
@@ -85,52 +82,15 @@ def gather(trajectories: Sequence[Trajectory], tasks: Sequence[Task]) -> Demonst
     if not lengths:
         raise InputError("expected at least one trajectory", field="trajectories")
     return Demonstrations(
-        states=_flat([trajectory.states[:-1] for trajectory in trajectories]),
-        actions=_flat([trajectory.actions for trajectory in trajectories]),
-        next_states=_flat([trajectory.states[1:] for trajectory in trajectories]),
+        states=flat_moves([trajectory.states[:-1] for trajectory in trajectories]),
+        actions=flat_moves([trajectory.actions for trajectory in trajectories]),
+        next_states=flat_moves([trajectory.states[1:] for trajectory in trajectories]),
         task=jnp.asarray(np.repeat([trajectory.task for trajectory in trajectories], lengths), dtype=jnp.int32),
         trajectory=jnp.asarray(np.repeat(np.arange(len(lengths)), lengths), dtype=jnp.int32),
         tasks=stacked,
     )
 
 
-def demonstrations(
-    walks: Walks, grid: Grid, *, discount: float = 0.95, step_cost: float | None = None
-) -> Demonstrations:
-    """Demonstrations on a grid from walks in metres, one task for every goal.
-
-    The walks are gridded (`sidestep.io.gridding`); `discount` and `step_cost` are those of `reach`. Raises `InputError`
-    as the gridding and `demonstrations_of_moves` do.
-    """
-    return demonstrations_of_moves(grid_walks(walks, grid), grid, discount=discount, step_cost=step_cost)
-
-
-def demonstrations_of_moves(
-    moves: Moves, grid: Grid, *, discount: float = 0.95, step_cost: float | None = None
-) -> Demonstrations:
-    """Demonstrations on a grid from gridded walks, one task for every goal.
-
-    What a walk does after it has reached its goal cell is left out, and so is a walk that starts there. Raises
-    `InputError` if no move is left.
-    """
-    goal = moves.goals[moves.walk]
-    arrivals = np.cumsum(moves.states == goal)
-    before_walk = np.searchsorted(moves.walk, moves.walk)
-    pursuing = arrivals == np.append(0, arrivals)[before_walk]
-    if not pursuing.any():
-        raise InputError("every walk starts at its goal: expected moves towards one", source=moves.source)
-    goals, task = np.unique(goal[pursuing], return_inverse=True)
-    _, trajectory = np.unique(moves.walk[pursuing], return_inverse=True)
-    tasks = [reach(grid, int(state), discount=discount, step_cost=step_cost) for state in goals]
-    return Demonstrations(
-        states=_flat([moves.states[pursuing]]),
-        actions=_flat([moves.actions[pursuing]]),
-        next_states=_flat([moves.next_states[pursuing]]),
-        task=_flat([task]),
-        trajectory=_flat([trajectory]),
-        tasks=stack_tasks(tasks),
-    )
-
-
-def _flat(parts: Sequence[np.ndarray]) -> Int[Array, " moves"]:
+def flat_moves(parts: Sequence[np.ndarray]) -> Int[Array, " moves"]:
+    """Pieces of a flat array, one after another."""
     return jnp.asarray(np.concatenate(parts), dtype=jnp.int32)

@@ -17,6 +17,7 @@ from sidestep.tabular.graph import moves_into
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, TransitionModel
 from sidestep.tabular.planning import plan
+from sidestep.tabular.sweeps import reachable
 from sidestep.tasks import Task, reach
 
 MOST_PLACES = 150
@@ -53,7 +54,8 @@ def evaluate(
 
     The regret is by how much a robot that follows the plans goes farther than the shortest way, on average and in cell
     sides: where it bumps into something it stays, having gone the length of the move, notes the obstacle and plans
-    again. Values are `None` where there is nothing to average.
+    again. Values are `None` where there is nothing to average; the regret also where the map is so wrong about cells
+    that it takes for known that the robot never arrives.
     """
     blocked = np.asarray(model.blocked, dtype=np.float64)
     relevant = relevant_obstacles(truth, visited[:, 0], visited[:, 1])
@@ -106,8 +108,10 @@ def length_with_bumps(model: ObstacleGrid, truth: Grid, start: int, goal: int, r
     change, task = truth.steps, reward.reach(truth.forget(), goal)
     known, here, length = np.array(model.known), start, 0.0
     for _ in range(1 + int(walls.sum())):
-        told = eqx.tree_at(lambda model: model.known, model, jnp.asarray(known))
-        for after in plan(told, task).path_from(here)[1:]:
+        planned = plan(eqx.tree_at(lambda model: model.known, model, jnp.asarray(known)), task)
+        if not bool(reachable(planned.solution.values[here])):
+            return np.inf
+        for after in planned.path_from(here)[1:]:
             step = np.array(np.divmod(after, truth.shape[1])) - np.divmod(here, truth.shape[1])
             action = int(np.flatnonzero((change == step).all(axis=1))[0])
             length += float(np.linalg.norm(step))

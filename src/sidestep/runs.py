@@ -10,7 +10,6 @@
 """
 
 import io
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 
 from sidestep.errors import InputError
 from sidestep.evaluation import Reward
-from sidestep.io.files import read_whole, write_array, write_json
+from sidestep.io.files import read_json, read_whole, write_array, write_json
 from sidestep.io.maps import read_map, write_map
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 from sidestep.tabular.models import ObstacleGrid
@@ -54,11 +53,27 @@ class LearnedMap:
 
 
 def write_learned_map(folder: Path, learned: LearnedMap, summary: dict[str, Any]) -> None:
-    """Writes the numbers of a learned map, each file whole or not at all, `summary.json` last."""
-    write_map(folder / "map.yaml", learned.blocked, learned.grid)
-    write_array(folder / "blocked.npy", learned.blocked)
+    """Writes the numbers of a learned map, each file whole or not at all, `summary.json` last.
+
+    What is learned is never written as exactly 0 or 1, which would say that it had been known.
+    """
+    smallest = np.finfo(np.float64).epsneg
+    blocked = np.where(learned.unknown, np.clip(learned.blocked, smallest, 1 - smallest), learned.blocked)
+    write_map(folder / "map.yaml", blocked, learned.grid)
+    write_array(folder / "blocked.npy", blocked)
     write_array(folder / "visited.npy", learned.visited)
     write_json(folder / "summary.json", summary)
+
+
+def add_to_summary(folder: Path, out: Path, key: str | None, summary: dict[str, Any]) -> None:
+    """Writes the summary of a later step to `out`; into the learned map's own where that is the same folder.
+
+    There it stands under `key`, or at the top level without one.
+    """
+    path = out / "summary.json"
+    if out.resolve() == folder.resolve():
+        summary = {**read_json(path), **(summary if key is None else {key: summary})}
+    write_json(path, summary)
 
 
 def read_learned_map(folder: Path) -> LearnedMap:
@@ -88,7 +103,7 @@ def read_learned_map(folder: Path) -> LearnedMap:
 
 def _settings(path: Path) -> tuple[Connectivity, Reward]:
     """The connectivity and the reward that a map was learned with, from its summary."""
-    summary = _read_json(path)
+    summary = read_json(path)
     settings = summary.get("settings") if isinstance(summary, dict) else None
     if not isinstance(settings, dict) or not {"connectivity", "discount", "step_cost"} <= set(settings):
         raise InputError(
@@ -102,13 +117,6 @@ def _settings(path: Path) -> tuple[Connectivity, Reward]:
     if step_cost is not None and not (isinstance(step_cost, int | float) and 0 < step_cost < np.inf):
         raise InputError(f"expected a number above 0, found {step_cost!r}", source=path, field="step_cost")
     return settings["connectivity"], Reward(float(discount), None if step_cost is None else float(step_cost))
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(read_whole(path))
-    except ValueError as error:
-        raise InputError(f"expected JSON: {error}", source=path) from error
 
 
 def _read_array(path: Path, kinds: str) -> np.ndarray:

@@ -69,7 +69,7 @@ def walkable_graph(truth: Grid) -> csr_array:
     needed = moves_into(truth)
     legal = _clear(truth, needed) & _free(truth)[:, None]
     state, action = np.nonzero(legal)
-    lengths = _action_lengths(truth)[action]
+    lengths = truth.lengths[action]
     return csr_array((lengths, (state, needed[state, action, 0])), shape=(truth.size, truth.size))
 
 
@@ -210,7 +210,7 @@ def _moves_through(truth: Grid) -> _Moves:
     """The moves out of each cell that is not free, were it free; backwards they are the moves into it."""
     needed = moves_into(truth)
     state, action = np.nonzero(_clear(truth, needed) & ~_free(truth)[:, None])
-    return _Moves(state, needed[state, action, 0], _action_lengths(truth)[action], state)
+    return _Moves(state, needed[state, action, 0], truth.lengths[action], state)
 
 
 def _moves_past(truth: Grid) -> _Moves:
@@ -220,7 +220,7 @@ def _moves_past(truth: Grid) -> _Moves:
     ends_free = _clear(truth, needed[..., :1]) & _free(truth)[:, None]
     state, action = np.nonzero(ends_free & (prevented.sum(axis=-1) == 1))
     cell = needed[state, action, 1 + np.argmax(prevented[state, action], axis=-1)]
-    return _Moves(state, needed[state, action, 0], _action_lengths(truth)[action], cell)
+    return _Moves(state, needed[state, action, 0], truth.lengths[action], cell)
 
 
 def _shortest_by_opening(
@@ -324,10 +324,6 @@ def _clear(truth: Grid, needed: Int[np.ndarray, "states actions cells"]) -> Bool
 def _clear_cells(truth: Grid) -> Bool[np.ndarray, " cells"]:
     """Which cells are free, and true one past the last: the entry of `moves_into` for "no such cell"."""
     return np.append(_free(truth), True)
-
-
-def _action_lengths(grid: Grid) -> Float[np.ndarray, " actions"]:
-    return np.linalg.norm(grid.steps, axis=1)
 
 
 def _check_states(states: Integer[np.ndarray, " states"], grid: Grid, field: str) -> None:

@@ -89,8 +89,7 @@ def reach(
     gamma = jnp.asarray(discount, jnp.result_type(float))
     if step_cost is None:
         return Task(jnp.zeros((1, 1)), jnp.ones(1), terminal, gamma)
-    lengths = world.lengths if isinstance(world, Graph) else np.linalg.norm(world.steps, axis=1)[None]
-    return Task(-step_cost * jnp.asarray(lengths), jnp.zeros(1), terminal, gamma)
+    return Task(-step_cost * jnp.atleast_2d(jnp.asarray(world.lengths)), jnp.zeros(1), terminal, gamma)
 
 
 def stack_tasks(tasks: Sequence[Task]) -> Task:

@@ -245,6 +245,17 @@ def test_solves_that_stop_early_are_never_used():
         fit(MODEL, demonstrations, people, solver=Jacobi(max_sweeps=enough), optimiser=ASCENT)
 
 
+def test_lbfgs_never_ends_where_solves_stop_early():
+    """The solves of this fit converge near its start only; the search turns back at that border."""
+    people, demonstrations = Behavior(BoltzmannAverage()), walks(BLANK, *PAYING)
+    enough = 2 + int(eqx.filter_jit(solve)(MODEL, demonstrations.tasks, people).sweeps.max())
+    found = fit(MODEL, demonstrations, people, solver=Jacobi(max_sweeps=enough))
+    assert found.task_converged.all()
+    assert (np.diff([progress.objective for progress in found.history]) > 0).all()
+    assert not found.converged
+    assert found.final.objective < fitted("Boltzmann").final.objective
+
+
 def test_visited_states_must_be_able_to_reach_their_goal():
     known = np.full((5, 5), Cell.UNKNOWN, dtype=int)
     known[:, 2] = Cell.OCCUPIED
@@ -262,9 +273,12 @@ def test_the_same_fit_twice_is_the_same_to_the_last_bit():
     np.testing.assert_array_equal(again.model.parameters, fitted("Boltzmann").model.parameters)
 
 
-def test_32_bit_numbers_stay_so_and_find_the_same_map():
-    with jax.enable_x64(False):
-        found = fit(ObstacleGrid(BLANK, -2.0), walks(BLANK, *PAYING), Behavior(BoltzmannAverage()))
+@pytest.mark.parametrize("everything", [True, False])
+def test_32_bit_numbers_stay_so_and_find_the_same_map(everything):
+    """All numbers of 32 bits, or only those of the model, which the others then follow."""
+    with jax.enable_x64(not everything):
+        model = ObstacleGrid(BLANK, jnp.full(25, -2.0, jnp.float32))
+        found = fit(model, walks(BLANK, *PAYING), Behavior(BoltzmannAverage()))
         assert found.model.parameters.dtype == found.residual.dtype == jnp.float32
         blocked = np.asarray(found.model.blocked)
     assert found.task_converged.all()

@@ -1,6 +1,5 @@
 """`sidestep evaluate`: a learned map against the truth."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,9 +8,8 @@ import numpy as np
 
 from sidestep.errors import InputError
 from sidestep.evaluation import evaluate
-from sidestep.io.files import read_whole, write_json
 from sidestep.io.maps import read_map
-from sidestep.runs import read_learned_map
+from sidestep.runs import add_to_summary, read_learned_map
 
 
 def evaluate_map(folder: Path, truth_file: Path, out: Path | None = None, seed: int = 0) -> Mapping[str, Any]:
@@ -34,7 +32,10 @@ def evaluate_map(folder: Path, truth_file: Path, out: Path | None = None, seed: 
             source=truth_file,
             field="resolution",
         )
+    if not np.allclose(truth.origin, learned.grid.origin):
+        raise InputError(
+            f"expected the learned map's {learned.grid.origin}, found {truth.origin}", source=truth_file, field="origin"
+        )
     scores = evaluate(learned.model(), truth, learned.unknown, learned.visited, learned.reward, seed)
-    before = json.loads(read_whole(folder / "summary.json")) if out is None else {"command": "evaluate"}
-    write_json((out or folder) / "summary.json", {**before, "truth": str(truth_file), **scores})
+    add_to_summary(folder, out or folder, None, {"truth": str(truth_file), **scores})
     return scores

@@ -9,12 +9,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sidestep.demonstrations import Demonstrations, demonstrations_of_moves
+from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError
 from sidestep.evaluation import Reward
 from sidestep.inference.fit import Fit, Progress, fit
 from sidestep.inference.optimisers import LBFGS, Ascent, Optimiser
 from sidestep.inference.priors import Normal
+from sidestep.io.demonstrations import demonstrations_of_moves
 from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map
 from sidestep.io.walks import Walks, read_walks
@@ -47,10 +48,10 @@ class Settings:
     """
 
     backup: str = "boltzmann"
-    beta: float = 10.0
+    beta: float = 7.0
     discount: float = 0.95
     step_cost: float | None = None
-    prior_mean: float = 0.0
+    prior_mean: float = 0.5
     prior_variance: float = 8.0
     connectivity: Connectivity = 4
     terms: Terms = "both"

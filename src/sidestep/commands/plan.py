@@ -7,10 +7,9 @@ import numpy as np
 import pyarrow as pa
 
 from sidestep.errors import InputError
-from sidestep.io.files import write_json
 from sidestep.io.tables import write_table
 from sidestep.plotting import figure_plan, save
-from sidestep.runs import read_learned_map
+from sidestep.runs import add_to_summary, read_learned_map
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.planning import plan
 
@@ -42,7 +41,7 @@ def plan_path(folder: Path, start: Position, goal: Position, out: Path) -> dict[
     }
     write_table(out / "path.csv", pa.table({"step": np.arange(len(path)), "x": x, "y": y, "blocked": chances}))
     save(figure_plan(learned.grid, learned.blocked, path), out / "path.png")
-    write_json(out / "summary.json", summary)
+    add_to_summary(folder, out, "plan", summary)
     return summary
 
 

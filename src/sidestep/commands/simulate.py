@@ -68,10 +68,13 @@ def walk(grid: Grid, walkers: Walkers) -> tuple[list[Trajectory], list[int]]:
             raise InputError(f"expected at least 1, found {getattr(walkers, name)}", field=name)
     if walkers.backup not in BACKUPS:
         raise InputError(f"expected one of {', '.join(BACKUPS)}, found {walkers.backup!r}", field="backup")
-    goals = places(grid, walkers.goals, walkers.seed).tolist()[: walkers.walks]
     candidates = connected_cells(grid)
-    if len(candidates) < 2:
-        raise InputError("expected at least two free cells that can reach each other", field="map")
+    if len(candidates) < max(2, walkers.goals):
+        raise InputError(
+            f"expected at least {max(2, walkers.goals)} free cells that can reach one another, found {len(candidates)}",
+            field="map",
+        )
+    goals = places(grid, walkers.goals, walkers.seed).tolist()[: walkers.walks]
     random = np.random.default_rng(walkers.seed)
     own = np.arange(walkers.walks) % len(goals)
     starts = [random.choice(candidates[candidates != goal], (own == i).sum()) for i, goal in enumerate(goals)]

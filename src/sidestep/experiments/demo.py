@@ -1,7 +1,7 @@
 """A first look: an office nobody mapped, learned from the walks of those who work there.
 
 Walkers who know the office cross it between a few places. The map is forgotten, learned again from their walks alone,
-and used to plan between places that nobody walked between.
+and used to plan to goals that nobody had.
 """
 
 from collections.abc import Callable
@@ -13,9 +13,9 @@ import numpy as np
 
 from sidestep.commands.learn import Settings, fit_map
 from sidestep.commands.simulate import Walkers, walk
-from sidestep.demonstrations import demonstrations
 from sidestep.domains.offices import office, places
 from sidestep.evaluation import Reward, evaluate, plan_paths
+from sidestep.io.demonstrations import demonstrations
 from sidestep.io.files import write_json
 from sidestep.io.maps import write_map
 from sidestep.io.trajectories import walks_of_trajectories
@@ -50,7 +50,8 @@ def demo(folder: Path, seed: int = 0, report: Callable[[str], None] = lambda _: 
 
     report("planning between all pairs of places")
     scores = evaluate(found.model, truth, np.ones(truth.shape, bool), shown.visited(), reward)
-    new = places(truth, NEW_PLACES, seed + 1)
+    elsewhere = places(truth, NEW_PLACES + len(goals), seed + 1)
+    new = elsewhere[~np.isin(elsewhere, goals)][:NEW_PLACES]
     paths, _ = plan_paths(found.model, truth, new[:1], new[1:], reward)
     panels = [
         Panel(f"{len(walks)} walks in an office", truth, paths=shown.paths(), goals=goals),

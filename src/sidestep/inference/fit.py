@@ -27,7 +27,7 @@ from sidestep.inference.checkpoints import fingerprint, load_checkpoint, save_ch
 from sidestep.inference.optimisers import LBFGS, Optimiser
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, Gradient
-from sidestep.tabular.likelihood import ALL_TERMS, LogLikelihood, Term, log_likelihood
+from sidestep.tabular.likelihood import ALL_TERMS, LogLikelihood, Term, log_likelihood, transition_probabilities
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import Solution, check_proper, solve
 from sidestep.tabular.sweeps import Jacobi, reachable
@@ -138,6 +138,7 @@ def fit(
     _check_settings(terms, gradient, behavior, optimiser)
     check_proper(demonstrations.tasks, behavior, model.graph.actions, horizon)
     problem = _Problem(model, demonstrations, behavior, prior or Normal(), terms, horizon, gradient, solver or Jacobi())
+    _check_moves(problem)
     if "actions" in terms:
         _check_start(problem)
     parameters, history, message = _climb(problem, optimiser, report, _Saver.of(checkpoint, problem, optimiser), resume)
@@ -234,6 +235,27 @@ def _check_settings(terms: tuple[Term, ...], gradient: Gradient, behavior: Behav
         )
 
 
+def _check_moves(problem: _Problem) -> None:
+    """Every move must be one that the model has, and, if transitions count, one that it thinks possible."""
+    model, demos = problem.model, problem.demonstrations
+    if demos.tasks.terminal.shape[-1] != model.graph.states or int(demos.actions.max()) >= model.graph.actions:
+        raise InputError(
+            f"expected demonstrations in the model's {model.graph.states} states with its {model.graph.actions} actions"
+            f", found {demos.tasks.terminal.shape[-1]} states and actions up to {int(demos.actions.max())}",
+            field="demonstrations",
+        )
+    if "transitions" not in problem.terms:
+        return
+    impossible = np.flatnonzero(np.asarray(transition_probabilities(model, demos)) == 0)
+    if len(impossible):
+        move = impossible[0]
+        raise InputError(
+            f"action {int(demos.actions[move])} in state {int(demos.states[move])} led to state "
+            f"{int(demos.next_states[move])}, which the model (what the map knows, say) holds to be impossible",
+            source=f"trajectory {int(demos.trajectory[move]) + 1}",
+        )
+
+
 def _check_start(problem: _Problem) -> None:
     """Values must exist at the start, and every walker must be able to arrive."""
     solution = problem.solution(problem.model.parameters)
@@ -248,7 +270,7 @@ def _check_start(problem: _Problem) -> None:
     if len(stuck):
         raise InputError(
             f"state {int(demos.states[stuck[0]])} is visited, but the goal cannot be reached from it",
-            source=f"trajectory {int(demos.trajectory[stuck[0]])}",
+            source=f"trajectory {int(demos.trajectory[stuck[0]]) + 1}",
         )
 
 

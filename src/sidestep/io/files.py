@@ -65,6 +65,14 @@ def write_json(path: str | Path, data: Any) -> None:
     write_whole(path, lambda file: file.write(text.encode() + b"\n"))
 
 
+def read_json(path: str | Path) -> Any:
+    """What a JSON file holds; raises `InputError` for a file that is missing or not JSON."""
+    try:
+        return json.loads(read_whole(path))
+    except ValueError as error:
+        raise InputError(f"expected JSON: {error}", source=path) from error
+
+
 def write_array(path: str | Path, array: np.ndarray) -> None:
     """Write an array of numbers as a `.npy` file, whole or not at all."""
     write_whole(path, lambda file: np.save(file, array, allow_pickle=False))

@@ -121,7 +121,9 @@ class Mellowmax(Backup):
     def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
         """A soft maximum between the mean and the maximum."""
         best = jax.lax.stop_gradient(q.max(axis=-1))
-        return best + (jax.nn.logsumexp(beta * _below_best(q), axis=-1) - jnp.log(q.shape[-1])) / beta
+        # log mean exp, without adding 1 to what may be far smaller
+        mean = jnp.mean(jnp.expm1(beta * _below_best(q)), axis=-1)
+        return best + jnp.log1p(mean) / beta
 
     def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
         """π, as for the log-sum-exp."""

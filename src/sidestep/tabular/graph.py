@@ -58,8 +58,7 @@ def grid_graph(grid: Grid) -> Graph:
     entered = moves_into(grid)[:, :, 0]
     staying = np.broadcast_to(np.arange(grid.size)[:, None], entered.shape)
     target = np.where(entered == grid.size, staying, entered)
-    lengths = np.linalg.norm(grid.steps, axis=1)[None]
-    return Graph(jnp.asarray(np.stack([target, staying], -1), dtype=jnp.int32), jnp.asarray(lengths))
+    return Graph(jnp.asarray(np.stack([target, staying], -1), dtype=jnp.int32), jnp.asarray(grid.lengths[None]))
 
 
 def moves_into(grid: Grid) -> Int[np.ndarray, "states actions 3"]:

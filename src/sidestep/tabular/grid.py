@@ -81,6 +81,11 @@ class Grid:
         """Row and column change of each action: up, down, left, right, then (8-connected) the diagonals."""
         return _STEPS[: self.connectivity]
 
+    @property
+    def lengths(self) -> Float[np.ndarray, " actions"]:
+        """How long each action is, in cell sides: 1, and √2 for diagonals."""
+        return np.linalg.norm(self.steps, axis=1)
+
     def forget(self) -> "Grid":
         """The same grid with nothing known."""
         return replace(self, known=np.full_like(self.known, Cell.UNKNOWN))
@@ -123,7 +128,8 @@ class Grid:
     def states_of_cell_units(self, cell_units: Float[np.ndarray, "points 2"]) -> Int[np.ndarray, " points"]:
         """The state of each point given in cell units; points on the outer edge belong to the cell inside it."""
         rows, columns = self.shape
-        column, row_up = np.floor(cell_units).astype(np.int64).T
+        # a position on a border, but for rounding, belongs to the cell above or to the right of it
+        column, row_up = np.floor(cell_units + 1e-9).astype(np.int64).T
         row = rows - 1 - np.clip(row_up, 0, rows - 1)
         return row * columns + np.clip(column, 0, columns - 1)
 

@@ -78,7 +78,11 @@ def action_log_likelihood(
 
 def transition_log_likelihood(model: TransitionModel, demonstrations: Demonstrations) -> Float[Array, ""]:
     """Σ ln T_θ(s, a, s′) over all moves."""
+    return jnp.sum(jnp.log(transition_probabilities(model, demonstrations)))
+
+
+def transition_probabilities(model: TransitionModel, demonstrations: Demonstrations) -> Float[Array, " moves"]:
+    """T_θ(s, a, s′) of every move."""
     states, actions = demonstrations.states, demonstrations.actions
     leads_there = model.graph.successors[states, actions] == demonstrations.next_states[:, None]
-    probability = jnp.sum(jnp.where(leads_there, model.probabilities()[states, actions], 0), axis=-1)
-    return jnp.sum(jnp.log(probability))
+    return jnp.sum(jnp.where(leads_there, model.probabilities()[states, actions], 0), axis=-1)

@@ -42,7 +42,7 @@ class Plan(eqx.Module):
         Raises `InputError` for a start that is not a state or, at discount 1, from which no terminal state can be
         reached.
         """
-        if not 0 <= start < len(self.terminal):
+        if not isinstance(start, (int, np.integer)) or not 0 <= start < len(self.terminal):
             raise InputError(f"expected a state in 0…{len(self.terminal) - 1}, found {start}", field="start")
         if not bool(reachable(self.solution.values[start])):
             raise InputError(f"the goal cannot be reached from state {start}", field="start")

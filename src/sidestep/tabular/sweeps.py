@@ -30,6 +30,7 @@ the terminal states as a shortest-path search does; until that is done, an outco
 yet counts as staying.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -70,8 +71,10 @@ class DecisionProcess(eqx.Module):
 class Sweeps(NamedTuple):
     """What a solver found, and how it went.
 
-    `residual` is the largest change in the last sweep, relative to the value (or to the largest reward, where that is
-    larger); `converged` says that it is within the tolerance.
+    `residual` is the largest change in the last sweep relative to the value itself (or to what its actions are worth
+    without staying, where that is larger), so that small values far from a goal count as much as large ones;
+    `converged` says that it is within the tolerance. The error is larger than the residual by up to 1/(1 − rate of
+    convergence).
     """
 
     values: Float[Array, " states"]
@@ -94,16 +97,16 @@ class Jacobi(eqx.Module):
         """V of the fixed point."""
         split = _split(process)
         reward = jnp.broadcast_to(process.reward, process.successors.shape[:2]).T
-        scale = jnp.maximum(jnp.abs(process.reward).max(), jnp.abs(process.final_reward).max())
 
-        def sweep(values: Float[Array, " states"]) -> Float[Array, " states"]:
+        def sweep(values: Float[Array, " states"]) -> tuple[Float[Array, " states"], Float[Array, " states"]]:
             after = values[split.successors]
             moves = _moves_so_far(split, values, after)
             elsewhere = reward + jnp.sum(moves * after, axis=1)
             leaving = split.ending + moves.sum(axis=1)
-            return process.end(_own_equation(backup, beta, elsewhere, leaving, values))
+            solved = process.end(_own_equation(backup, beta, elsewhere, leaving, values))
+            return solved, jnp.maximum(jnp.abs(solved), jnp.abs(elsewhere).max(axis=0))
 
-        return self._iterate(sweep, process.end(_start(process)), scale)
+        return self._iterate(sweep, process.end(_start(process)))
 
     def adjoint(
         self,
@@ -124,22 +127,25 @@ class Jacobi(eqx.Module):
         leaving = jnp.where(live, jnp.sum(weights.T * chances, axis=0), 1)
         divisor = jnp.where(live, _divisor(weights, policy, chances), 1)
 
-        def sweep(adjoint: Float[Array, " states"]) -> Float[Array, " states"]:
+        largest = jnp.abs(cotangent).max()
+
+        def sweep(adjoint: Float[Array, " states"]) -> tuple[Float[Array, " states"], Float[Array, " states"]]:
             arriving = jnp.zeros_like(adjoint).at[split.successors].add(spread * adjoint)
-            return (cotangent + arriving + (divisor - leaving) * adjoint) / divisor
+            solved = (cotangent + arriving + (divisor - leaving) * adjoint) / divisor
+            return solved, jnp.maximum(jnp.abs(solved), largest)
 
-        return self._iterate(sweep, jnp.zeros_like(cotangent), jnp.abs(cotangent).max())
+        return self._iterate(sweep, jnp.zeros_like(cotangent))
 
-    def _iterate(self, sweep, start: Float[Array, " states"], scale: Float[Array, ""]) -> Sweeps:
+    def _iterate(self, sweep: Callable[[Array], tuple[Array, Array]], start: Float[Array, " states"]) -> Sweeps:
+        """Sweeps until no change is large beside the sizes that `sweep` gives with its values."""
         tolerance = self.tolerance or (1e-10 if start.dtype == jnp.float64 else 1e-5)
 
         def unfinished(state: Sweeps) -> Bool[Array, ""]:
             return ~state.converged & (state.sweeps < self.max_sweeps) & ~jnp.isnan(state.residual)
 
         def step(state: Sweeps) -> Sweeps:
-            values = sweep(state.values)
-            size = jnp.maximum(jnp.abs(values), scale)
-            change = jnp.abs(values - state.values) / jnp.where(size > 0, size, 1)
+            values, size = sweep(state.values)
+            change = jnp.abs(values - state.values) / jnp.maximum(size, jnp.finfo(values.dtype).tiny / tolerance)
             residual = jnp.max(change)
             return Sweeps(values, state.sweeps + 1, residual, residual <= tolerance)
 

@@ -1,0 +1,65 @@
+"""From walks in metres to demonstrations on a grid."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
+from sidestep.demonstrations import Demonstrations, flat_moves
+from sidestep.errors import InputError
+from sidestep.io.gridding import Moves, grid_walks
+from sidestep.io.walks import Walks
+from sidestep.scoring import walkable_graph
+from sidestep.tabular.grid import Cell, Grid
+from sidestep.tasks import reach, stack_tasks
+
+
+def demonstrations(
+    walks: Walks, grid: Grid, *, discount: float = 0.95, step_cost: float | None = None
+) -> Demonstrations:
+    """Demonstrations on a grid from walks in metres, one task for every goal.
+
+    The walks are gridded (`sidestep.io.gridding`); `discount` and `step_cost` are those of `reach`. Raises `InputError`
+    as the gridding and `demonstrations_of_moves` do.
+    """
+    return demonstrations_of_moves(grid_walks(walks, grid), grid, discount=discount, step_cost=step_cost)
+
+
+def demonstrations_of_moves(
+    moves: Moves, grid: Grid, *, discount: float = 0.95, step_cost: float | None = None
+) -> Demonstrations:
+    """Demonstrations on a grid from gridded walks, one task for every goal.
+
+    What a walk does after it has reached its goal cell is left out, and so is a walk that starts there. Raises
+    `InputError` if no move is left, or for a goal that known obstacles wall off.
+    """
+    _refuse_walled_off(moves, grid)
+    goal = moves.goals[moves.walk]
+    arrivals = np.cumsum(moves.states == goal)
+    before_walk = np.searchsorted(moves.walk, moves.walk)
+    pursuing = arrivals == np.append(0, arrivals)[before_walk]
+    if not pursuing.any():
+        raise InputError("every walk starts at its goal: expected moves towards one", source=moves.source)
+    goals, task = np.unique(goal[pursuing], return_inverse=True)
+    _, trajectory = np.unique(moves.walk[pursuing], return_inverse=True)
+    tasks = [reach(grid, int(state), discount=discount, step_cost=step_cost) for state in goals]
+    return Demonstrations(
+        states=flat_moves([moves.states[pursuing]]),
+        actions=flat_moves([moves.actions[pursuing]]),
+        next_states=flat_moves([moves.next_states[pursuing]]),
+        task=flat_moves([task]),
+        trajectory=flat_moves([trajectory]),
+        tasks=stack_tasks(tasks),
+    )
+
+
+def _refuse_walled_off(moves: Moves, grid: Grid) -> None:
+    """Nobody can be on the way to a goal that known obstacles wall off."""
+    passable = replace(grid, known=np.where(grid.known == Cell.OCCUPIED, Cell.OCCUPIED, Cell.FREE))
+    part = connected_components(walkable_graph(passable), directed=False)[1]
+    stranded = part[moves.states] != part[moves.goals[moves.walk]]
+    if stranded.any():
+        row = int(moves.rows[np.argmax(stranded)])
+        raise InputError(
+            "the goal cannot be reached from here: known obstacles wall it off", source=moves.source, row=row
+        )
