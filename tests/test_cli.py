@@ -170,7 +170,7 @@ def test_walks_whose_goal_is_walled_off(here, capsys):
     write_map("map.yaml", np.array([[0.5, 1.0, 0.5], [0.5, 1.0, 0.0]]), Grid.unknown(2, 3))
     Path("walks.csv").write_text("walk,step,x,y,goal_x,goal_y\na,0,0.5,0.5,2.5,1.5\na,1,0.5,1.5,2.5,1.5\n")
     walled_off = "learn walks.csv --map map.yaml --out out --discount 1 --step-cost 1"
-    refused(here, capsys, walled_off, "trajectory 0", "cannot be reached")
+    refused(here, capsys, walled_off, "walks.csv, row 2", "cannot be reached")
 
 
 @pytest.mark.parametrize(("arguments", "expected"), [

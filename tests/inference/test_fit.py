@@ -263,7 +263,7 @@ def test_visited_states_must_be_able_to_reach_their_goal():
         [Trajectory(*follow(4, "D"), 0), Trajectory(*follow(0, "D"), 0)],
         [reach(BLANK, 14, discount=1.0, step_cost=1.0)],
     )
-    with pytest.raises(InputError, match="trajectory 1: state 0 is visited, but the goal cannot be reached"):
+    with pytest.raises(InputError, match="trajectory 2: state 0 is visited, but the goal cannot be reached"):
         fit(ObstacleGrid(Grid(known), -2.0), walled_off, Behavior(BoltzmannAverage()))
 
 

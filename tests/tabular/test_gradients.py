@@ -36,7 +36,6 @@ CLOSE = 1e-6
 ENOUGH = 900  # plain sweeps to a fixed point: .95^900 < 1e-20
 STEP = {"hard max": 2e-6}  # of differences; small where there may be kinks nearby, else 1e-4
 each_backup = pytest.mark.parametrize("name", BACKUPS)
-each_problem = pytest.mark.parametrize("graph", PROBLEMS)
 on_two_graphs = pytest.mark.parametrize("graph", ["8-connected", "tabular"])
 each_discount = pytest.mark.parametrize("discount", DISCOUNTS)
 each_horizon = pytest.mark.parametrize("horizon", HORIZONS)
@@ -99,7 +98,7 @@ def central_difference(function, inputs, direction, step) -> float:
 @each_horizon
 @each_discount
 @each_backup
-@each_problem
+@on_two_graphs
 def test_solve_three_ways(graph, name, discount, horizon):
     inputs = varied(graph, discount)
     plain = partial(unrolled(graph), NAMES.index(name), horizon or ENOUGH)
