@@ -80,6 +80,7 @@ def learn(
     moves = grid_walks(_sampled(read_walks(walks), settings), grid)
     demonstrations = demonstrations_of_moves(moves, grid, discount=settings.discount, step_cost=settings.step_cost)
     checkpoint = folder / "fit.checkpoint"
+    resumed = resume and checkpoint.exists()
     found = fit_map(ObstacleGrid(grid, settings.prior_mean), demonstrations, settings, report, checkpoint, resume)
     blocked = np.asarray(found.model.blocked, dtype=np.float64)
     reward = Reward(settings.discount, settings.step_cost)
@@ -97,13 +98,14 @@ def learn(
         "files": {"walks": str(walks), "map": str(map_file)},
         "settings": asdict(settings),
         "data": counts,
-        "notes": _notes(demonstrations, settings),
+        "resumed": resumed,
+        "notes": _notes(demonstrations, settings, resume and not resumed),
         **_outcome(found),
         "seconds": round(time.monotonic() - started, 3),
         "peak_memory_bytes": peak_memory(),
     }
-    write_learned_map(folder, LearnedMap(grid, blocked, demonstrations.visited(), reward), summary)
     save(figure_fit(grid, demonstrations.paths(), blocked, objective), folder / "learned.png")
+    write_learned_map(folder, LearnedMap(grid, blocked, demonstrations.visited(), reward), summary)
     checkpoint.unlink(missing_ok=True)
     return summary
 
@@ -163,17 +165,18 @@ def _sampled(walks: Walks, settings: Settings) -> Walks:
     return walks.select(np.sort(drawn))
 
 
-def _notes(demonstrations: Demonstrations, settings: Settings) -> list[str]:
+def _notes(demonstrations: Demonstrations, settings: Settings, nothing_to_resume: bool) -> list[str]:
     """What a person should know before trusting the numbers."""
+    notes = ["there was no checkpoint to resume from, so the fit began anew"] if nothing_to_resume else []
     moves = int(np.median(np.bincount(demonstrations.trajectory)))
     difference = settings.beta * (1 - settings.discount**2) * settings.discount**moves
     if settings.step_cost is None and difference < 0.05:
-        return [
+        notes.append(
             f"half of the walks have {moves} moves or more; so far from the goal a step towards it and one away "
             f"differ by {difference:.1g} in log-probability, and walks say next to nothing: "
             "consider --step-cost 1 --discount 1"
-        ]
-    return []
+        )
+    return notes
 
 
 def _outcome(found: Fit[ObstacleGrid]) -> dict[str, Any]:

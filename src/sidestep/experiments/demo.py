@@ -24,8 +24,8 @@ from sidestep.plotting import Panel, figure_learned, save
 from sidestep.runs import LearnedMap, write_learned_map
 from sidestep.tabular.models import ObstacleGrid
 
-ROWS, COLUMNS = 16, 26
-WALKERS = Walkers(walks=400, goals=14)
+ROWS, COLUMNS = 14, 24
+WALKERS = Walkers(walks=400, goals=12)
 SETTINGS = Settings(beta=20.0, discount=0.97)
 NEW_PLACES = 4
 
