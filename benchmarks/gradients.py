@@ -54,7 +54,7 @@ from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.likelihood import action_log_likelihood
 from sidestep.tabular.models import ObstacleGrid, TabularModel, TransitionModel, true_model
 from sidestep.tabular.solve import solve
-from sidestep.tabular.sweeps import DecisionProcess
+from sidestep.tabular.solvers.process import DecisionProcess
 from sidestep.tasks import Task, reach
 
 WALKERS = 20

@@ -11,7 +11,7 @@ from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid, TabularModel, true_model
 from sidestep.tabular.planning import plan, roll_out
-from sidestep.tabular.sweeps import Jacobi
+from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tasks import reach
 
 OPEN = Grid(np.zeros((3, 3), dtype=int))

@@ -20,7 +20,8 @@ from sidestep.tabular.likelihood import LogLikelihood, log_likelihood
 from sidestep.tabular.models import ObstacleGrid, TabularModel, TransitionModel, true_model
 from sidestep.tabular.planning import Plan, RollOuts, plan, roll_out
 from sidestep.tabular.solve import Solution, check_proper, solve
-from sidestep.tabular.sweeps import Jacobi
+from sidestep.tabular.solvers.jacobi import Jacobi
+from sidestep.tabular.solvers.ordered import Ordered
 from sidestep.tasks import Task, reach, stack_tasks, task
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "Normal",
     "NotConverged",
     "ObstacleGrid",
+    "Ordered",
     "Plan",
     "Progress",
     "Reward",

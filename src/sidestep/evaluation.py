@@ -17,7 +17,7 @@ from sidestep.tabular.graph import moves_into
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, TransitionModel
 from sidestep.tabular.planning import plan
-from sidestep.tabular.sweeps import reachable
+from sidestep.tabular.solvers.process import reachable
 from sidestep.tasks import Task, reach
 
 MOST_PLACES = 150

@@ -21,7 +21,7 @@ from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import ObstacleGrid, TabularModel
 from sidestep.tabular.solve import solve
-from sidestep.tabular.sweeps import Jacobi
+from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tasks import reach
 
 PAYING, COSTLY = (0.95, None), (1.0, 1.0)

@@ -21,7 +21,8 @@ from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import ObstacleGrid, TabularModel, true_model
 from sidestep.tabular.solve import check_proper, solve
-from sidestep.tabular.sweeps import Jacobi, lowest
+from sidestep.tabular.solvers.jacobi import Jacobi
+from sidestep.tabular.solvers.process import lowest
 from sidestep.tasks import Task, reach, stack_tasks, task
 
 each_backup = pytest.mark.parametrize("name", BACKUPS)

@@ -30,7 +30,7 @@ from sidestep.tabular.backups import Behavior, BoltzmannAverage, Gradient
 from sidestep.tabular.likelihood import ALL_TERMS, LogLikelihood, Term, log_likelihood, transition_probabilities
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import Solution, check_proper, solve
-from sidestep.tabular.sweeps import Jacobi, reachable
+from sidestep.tabular.solvers.process import Solver, reachable
 from sidestep.tasks import Task
 
 Model = TypeVar("Model", bound=TransitionModel)
@@ -80,7 +80,7 @@ class _Problem(eqx.Module):
     terms: tuple[Term, ...] = eqx.field(static=True)
     horizon: int | None = eqx.field(static=True)
     gradient: Gradient = eqx.field(static=True)
-    solver: Jacobi
+    solver: Solver | None
 
     def likelihood(self, parameters: PyTree) -> LogLikelihood:
         return log_likelihood(
@@ -99,7 +99,9 @@ class _Problem(eqx.Module):
 
 
 @eqx.filter_jit
-def _solution(model: TransitionModel, tasks: Task, behavior: Behavior, horizon: int | None, solver: Jacobi) -> Solution:
+def _solution(
+    model: TransitionModel, tasks: Task, behavior: Behavior, horizon: int | None, solver: Solver | None
+) -> Solution:
     """`solve`, compiled apart from the objective: fits of other terms or gradients need not compile it again."""
     return solve(model, tasks, behavior, horizon=horizon, solver=solver)
 
@@ -114,7 +116,7 @@ def fit(
     gradient: Gradient = "exact",
     horizon: int | None = None,
     optimiser: Optimiser | None = None,
-    solver: Jacobi | None = None,
+    solver: Solver | None = None,
     report: Callable[[Progress], None] | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
@@ -137,7 +139,7 @@ def fit(
     optimiser = optimiser or LBFGS()
     _check_settings(terms, gradient, behavior, optimiser)
     check_proper(demonstrations.tasks, behavior, model.graph.actions, horizon)
-    problem = _Problem(model, demonstrations, behavior, prior or Normal(), terms, horizon, gradient, solver or Jacobi())
+    problem = _Problem(model, demonstrations, behavior, prior or Normal(), terms, horizon, gradient, solver)
     _check_moves(problem)
     if "actions" in terms:
         _check_start(problem)

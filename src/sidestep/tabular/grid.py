@@ -17,7 +17,7 @@ from sidestep.errors import InputError
 
 Connectivity = Literal[4, 8]
 
-_STEPS = np.array([[-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [-1, 1], [1, -1], [1, 1]])
+STEPS = np.array([[-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [-1, 1], [1, -1], [1, 1]])
 """Row and column change of each action: up, down, left, right, then the four diagonals."""
 
 
@@ -79,7 +79,7 @@ class Grid:
     @property
     def steps(self) -> Int[np.ndarray, "actions 2"]:
         """Row and column change of each action: up, down, left, right, then (8-connected) the diagonals."""
-        return _STEPS[: self.connectivity]
+        return STEPS[: self.connectivity]
 
     @property
     def lengths(self) -> Float[np.ndarray, " actions"]:

@@ -15,7 +15,7 @@ from sidestep.demonstrations import Demonstrations
 from sidestep.tabular.backups import Behavior, Gradient
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import solve
-from sidestep.tabular.sweeps import Jacobi
+from sidestep.tabular.solvers.process import Solver
 
 Term = Literal["actions", "transitions"]
 ALL_TERMS: tuple[Term, ...] = ("actions", "transitions")
@@ -41,7 +41,7 @@ def log_likelihood(
     terms: tuple[Term, ...] = ALL_TERMS,
     horizon: int | None = None,
     gradient: Gradient = "exact",
-    solver: Jacobi | None = None,
+    solver: Solver | None = None,
 ) -> LogLikelihood:
     """log L(θ) of `demonstrations` by people who behave as `behavior` says and know `model`.
 
@@ -65,15 +65,30 @@ def action_log_likelihood(
     *,
     horizon: int | None = None,
     gradient: Gradient = "exact",
-    solver: Jacobi | None = None,
+    solver: Solver | None = None,
 ) -> Float[Array, ""]:
     """Σ log π_θ(a | s) over all moves; NaN if a task's values did not converge."""
     solution = solve(model, demonstrations.tasks, behavior, horizon=horizon, gradient=gradient, solver=solver)
-    q = solution.action_values[demonstrations.task, demonstrations.states]
+    # not `solution.action_values`: those of the visited states are few
+    q = visited_action_values(model, demonstrations, solution.values)
     log_policy = behavior.log_policy(q)
     chosen = jnp.take_along_axis(log_policy, demonstrations.actions[:, None], axis=-1)
     # a factor, so that the gradient is NaN too
     return jnp.sum(chosen) * jnp.where(solution.converged.all(), 1.0, jnp.nan)
+
+
+def visited_action_values(
+    model: TransitionModel, demonstrations: Demonstrations, values: Float[Array, "tasks states"]
+) -> Float[Array, "moves actions"]:
+    """Q(s, a) of the state of every move, from the values of all tasks; as `DecisionProcess.action_values`."""
+    tasks, task, states = demonstrations.tasks, demonstrations.task, demonstrations.states
+    probabilities = model.probabilities()
+    value = values[task, states]
+    differences = values[task[:, None, None], model.graph.successors[states]] - value[:, None, None]
+    expected = value[:, None] + jnp.sum(probabilities[states] * differences, axis=-1)
+    per_state = tasks.reward.shape[1] > 1
+    reward = tasks.reward[task, states if per_state else 0].astype(values.dtype)
+    return reward + tasks.discount[task, None].astype(values.dtype) * expected
 
 
 def transition_log_likelihood(model: TransitionModel, demonstrations: Demonstrations) -> Float[Array, ""]:

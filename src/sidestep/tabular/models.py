@@ -20,8 +20,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from sidestep.errors import InputError
-from sidestep.tabular.graph import Graph, grid_graph, moves_into
-from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.graph import Graph, grid_graph
+from sidestep.tabular.grid import STEPS, Cell, Grid
 
 _Model = TypeVar("_Model", bound="TransitionModel")
 
@@ -90,13 +90,11 @@ class ObstacleGrid(TransitionModel):
     graph: Graph
     parameters: Float[Array, " cells"]
     known: Int[Array, "rows columns"]
-    _needed: Int[Array, "cells actions 3"]
 
     def __init__(self, grid: Grid, logits: Float[Array | np.ndarray, " cells"] | float = -2.0):
         """A model of a grid at the given logits (one number for all, or one a cell)."""
         self.graph = grid_graph(grid)
         self.known = jnp.asarray(grid.known)
-        self._needed = jnp.asarray(moves_into(grid), dtype=jnp.int32)
         dtype = logits.dtype if isinstance(logits, (jax.Array, np.ndarray)) else jnp.result_type(float)
         self.parameters = jnp.broadcast_to(jnp.asarray(logits, dtype), (grid.size,))
 
@@ -108,16 +106,31 @@ class ObstacleGrid(TransitionModel):
 
     def probabilities(self) -> Float[Array, "states actions outcomes"]:
         """(success, failure) of every move."""
-        known = self.known.reshape(-1)
-        logits = jnp.where(known == Cell.OCCUPIED, jnp.inf, jnp.where(known == Cell.FREE, -jnp.inf, self.parameters))
-        # one past the last cell: nothing there to be blocked
-        free = jnp.append(jax.nn.sigmoid(-logits), 1.0)[self._needed]
-        blocked = jnp.append(jax.nn.sigmoid(logits), 0.0)[self._needed]
-        success = free.prod(axis=-1)
+        unknown = self.parameters.reshape(self.known.shape)
+        known = jnp.where(self.known == Cell.OCCUPIED, jnp.inf, -jnp.inf)
+        logits = jnp.where(self.known == Cell.UNKNOWN, unknown, known)
+        moves = [_success(logits, *step) for step in STEPS[: self.graph.actions].tolist()]
+        outcomes = [jnp.stack(outcome, axis=-1).reshape(-1, self.graph.actions) for outcome in zip(*moves, strict=True)]
+        return jnp.stack(outcomes, axis=-1)
+
+
+def _success(
+    logits: Float[Array, "rows columns"], down: int, right: int
+) -> tuple[Float[Array, "rows columns"], Float[Array, "rows columns"]]:
+    """The probabilities that a move from each cell succeeds, and that it fails; off the map nothing is blocked.
+
+    Slices of the map rather than look-ups: their derivatives are slices too.
+    """
+    rows, columns = logits.shape
+    around = jnp.pad(logits, 1, constant_values=-jnp.inf)
+    needed = [(down, right)] if down == 0 or right == 0 else [(down, right), (down, 0), (0, right)]
+    success, failure = 1.0, 0.0
+    for i, j in needed:
+        cell = around[1 + i : 1 + i + rows, 1 + j : 1 + j + columns]
         # 1 − Π free, summed without cancellation where obstacles are improbable
-        first, second, third = jnp.moveaxis(blocked, -1, 0)
-        failure = first + free[..., 0] * (second + free[..., 1] * third)
-        return jnp.stack([success, failure], axis=-1)
+        failure = failure + success * jax.nn.sigmoid(cell)
+        success = success * jax.nn.sigmoid(-cell)
+    return jnp.asarray(success), jnp.asarray(failure)
 
 
 def true_model(grid: Grid) -> ObstacleGrid:

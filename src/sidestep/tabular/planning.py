@@ -16,7 +16,7 @@ from sidestep.errors import InputError, NotConverged
 from sidestep.tabular.backups import Behavior, HardMax
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import Solution, check_proper, solve
-from sidestep.tabular.sweeps import Jacobi, reachable
+from sidestep.tabular.solvers.process import Solver, reachable
 from sidestep.tasks import Task
 
 
@@ -54,7 +54,7 @@ class Plan(eqx.Module):
         return np.asarray(path)
 
 
-def plan(model: TransitionModel, task: Task, behavior: Behavior | None = None, solver: Jacobi | None = None) -> Plan:
+def plan(model: TransitionModel, task: Task, behavior: Behavior | None = None, solver: Solver | None = None) -> Plan:
     """The optimal plan for a task under a model; with `behavior`, how such people would act (∝ exp βQ).
 
     Raises `ImproperTask` for a task without values and `NotConverged` if they are not found.
@@ -68,7 +68,7 @@ def plan(model: TransitionModel, task: Task, behavior: Behavior | None = None, s
     """
     people = behavior or Behavior(HardMax())
     check_proper(task, people, model.graph.actions)
-    made = _plan(model, task, people, behavior is None, solver or Jacobi())
+    made = _plan(model, task, people, behavior is None, solver)
     if not bool(made.solution.converged):
         raise NotConverged(
             f"values still changed by {float(made.solution.residual):.2g} in sweep {int(made.solution.sweeps)}: "
@@ -78,7 +78,7 @@ def plan(model: TransitionModel, task: Task, behavior: Behavior | None = None, s
 
 
 @eqx.filter_jit
-def _plan(model: TransitionModel, task: Task, behavior: Behavior, optimal: bool, solver: Jacobi) -> Plan:
+def _plan(model: TransitionModel, task: Task, behavior: Behavior, optimal: bool, solver: Solver | None) -> Plan:
     solution = solve(model, task, behavior, solver=solver)
     q = solution.action_values
     policy = behavior.backup.fixed_policy_weights(q, behavior.beta) if optimal else jnp.exp(behavior.log_policy(q))

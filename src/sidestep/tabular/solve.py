@@ -20,16 +20,24 @@ from jaxtyping import Array, Bool, Float, Int
 from sidestep.errors import ImproperTask, InputError
 from sidestep.tabular.backups import Backup, Behavior, Gradient, LogSumExp
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.sweeps import DecisionProcess, Jacobi, Sweeps, at_fixed_policy, finite_horizon, reachable
+from sidestep.tabular.solvers.choice import solver_for
+from sidestep.tabular.solvers.process import (
+    DecisionProcess,
+    Solver,
+    Start,
+    Sweeps,
+    finite_horizon,
+)
 from sidestep.tasks import Task
 
 
 class Solution(eqx.Module):
     """The values of a task under a model, and how the solve went (with a leading `tasks` axis for several tasks).
 
-    - `values`: V(s); at discount 1, states that cannot reach a terminal state are near `sweeps.lowest` (for −∞).
+    - `values`: V(s); at discount 1, states that cannot reach a terminal state are near `process.lowest` (for −∞).
     - `action_values`: Q(s, a).
-    - `sweeps`, `residual`, `converged`: see `sweeps.Sweeps`; a finite horizon takes one exact sweep an action.
+    - `sweeps`, `residual`, `converged`: see `process.Sweeps`; a finite horizon takes one exact sweep an action.
+    - `start`: what a solve of the same task under a model nearby may start from.
     """
 
     values: Float[Array, "*tasks states"]
@@ -37,6 +45,7 @@ class Solution(eqx.Module):
     sweeps: Int[Array, "*tasks"]
     residual: Float[Array, "*tasks"]
     converged: Bool[Array, "*tasks"]
+    start: Start
 
 
 def solve(
@@ -46,13 +55,17 @@ def solve(
     *,
     horizon: int | None = None,
     gradient: Gradient = "exact",
-    solver: Jacobi | None = None,
+    solver: Solver | None = None,
+    start: Start | None = None,
 ) -> Solution:
     """The values of one task, or of a stack of tasks, for people who behave as `behavior` says under `model`.
 
     - `horizon`: how many actions people look ahead; None for the fixed point of the Bellman equation.
     - `gradient`: what derivatives of the solution mean, "exact" or "fixed_policy" (eqs. 9, 10).
-    - `solver`: how the fixed point is found.
+    - `solver`: how the fixed point is found; by default as `solver_for` chooses.
+    - `start`: what an earlier solution of the same task or tasks left; without it, the solve starts from nothing. The
+      solution does not depend on it beyond the tolerance. Differentiating with respect to `start.adjoint` yields the
+      new adjoint λ, for the next solve to start from.
 
     The numbers have the dtype of the model's probabilities. May be used under `jit`, `vmap` and `grad`. Look at
     `converged` before you use the numbers; `check_proper` tells beforehand whether values exist.
@@ -63,7 +76,13 @@ def solve(
     dtype = probabilities.dtype
     behavior = eqx.tree_at(lambda people: people.beta, behavior, behavior.beta.astype(dtype))
 
-    def one(task: Task) -> Solution:
+    solver = solver or solver_for(behavior.backup, model.graph.states)
+    if start is None:
+        start = solver.cold_start(model.graph.states, dtype)
+        if task.terminal.ndim == 2:
+            start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(task.terminal), *leaf.shape)), start)
+
+    def one(task: Task, start: Start) -> Solution:
         process = DecisionProcess(
             model.graph.successors,
             probabilities,
@@ -73,15 +92,16 @@ def solve(
             task.discount.astype(dtype),
         )
         if horizon is None:
-            found = _solve_fixed_point(process, behavior, gradient, solver or Jacobi())
+            found = _solve_fixed_point(process, behavior, gradient, solver, start)
         else:
             values = finite_horizon(process, behavior.backup, behavior.beta, horizon, gradient)
             residual = jnp.asarray(0, values.dtype)
-            found = Sweeps(values, jnp.asarray(horizon), residual, jnp.isfinite(values).all())
+            found = Sweeps(values, start.order, jnp.asarray(horizon), residual, jnp.isfinite(values).all())
         q = process.action_values(found.values)
-        return Solution(found.values, q, found.sweeps, found.residual, found.converged)
+        left = Start(jax.lax.stop_gradient(found.values), start.adjoint, found.order)
+        return Solution(found.values, q, found.sweeps, found.residual, found.converged, left)
 
-    return jax.vmap(one)(task) if task.terminal.ndim == 2 else one(task)
+    return jax.vmap(one)(task, start) if task.terminal.ndim == 2 else one(task, start)
 
 
 def check_proper(task: Task, behavior: Behavior, actions: int, horizon: int | None = None) -> None:
@@ -110,56 +130,54 @@ def check_proper(task: Task, behavior: Behavior, actions: int, horizon: int | No
         )
 
 
-def _solve_fixed_point(process: DecisionProcess, behavior: Behavior, gradient: Gradient, solver: Jacobi) -> Sweeps:
-    given = (process.successors, process.terminal)
+def _solve_fixed_point(
+    process: DecisionProcess, behavior: Behavior, gradient: Gradient, solver: Solver, start: Start
+) -> Sweeps:
     varying = (process.probabilities, process.reward, process.final_reward, process.discount, behavior.beta)
     held = jax.lax.stop_gradient(varying)
-    found = solver.values(_process(given, held), behavior.backup, held[-1])
-    return found._replace(values=_implicit(solver, behavior.backup, gradient, given, varying, found.values))
+    given = (process.successors, process.terminal)
+    found = solver.values(_process(given, held), behavior.backup, held[-1], jax.lax.stop_gradient(start))
+    given = (*given, solver, found.order)
+    return found._replace(values=_implicit(behavior.backup, gradient, given, varying, found.values, start.adjoint))
 
 
 def _process(given: tuple, varying: tuple) -> DecisionProcess:
-    (successors, terminal), (probabilities, reward, final_reward, discount, _) = given, varying
+    (successors, terminal), (probabilities, reward, final_reward, discount, _) = given[:2], varying
     return DecisionProcess(successors, probabilities, reward, final_reward, terminal, discount)
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def _implicit(
-    solver: Jacobi,
     backup: Backup,
     gradient: Gradient,
     given: tuple,
     varying: tuple,
     values: Float[Array, " states"],
+    adjoint: Float[Array, " states"],
 ) -> Float[Array, " states"]:
-    """`values`, the solution V of V = F(V, φ) with φ = `varying`, with their gradient by the adjoint equation."""
-    del solver, backup, gradient, given, varying
+    """`values`, the solution V of V = F(V, φ) with φ = `varying`, with their gradient by the adjoint equation.
+
+    `adjoint` is where the solve of that starts. It has no influence, so its gradient is free to carry the new adjoint
+    out of the backward pass.
+    """
+    del backup, gradient, given, varying, adjoint
     return values
 
 
-def _implicit_forward(solver: Jacobi, backup: Backup, gradient: Gradient, given: tuple, varying: tuple, values: Array):
-    del solver, backup, gradient
-    return values, (given, varying, values)
+def _implicit_forward(backup: Backup, gradient: Gradient, given: tuple, varying: tuple, values: Array, adjoint: Array):
+    del backup, gradient
+    return values, (given, varying, values, adjoint)
 
 
-def _implicit_backward(solver: Jacobi, backup: Backup, gradient: Gradient, saved: tuple, cotangent: Array):
-    given, varying, values = saved
+def _implicit_backward(backup: Backup, gradient: Gradient, saved: tuple, cotangent: Array):
+    given, varying, values, adjoint = saved
+    solver, order = given[2:]
     process, beta = _process(given, varying), varying[-1]
-    # states that cannot reach a terminal state have no values to speak of, and no part in the gradient
-    live = reachable(values) & ~process.terminal
-    q = jnp.where(live[:, None], process.action_values(values), 0)
-    policy = backup.fixed_policy_weights(q, beta)
-    weights = backup.weights(q, beta) if gradient == "exact" else policy
-    found = solver.adjoint(process, weights, policy, live, cotangent)
-    adjoint = jnp.where(found.converged, found.values, jnp.nan)
-
-    def one_backup(varying: tuple) -> Float[Array, " states"]:
-        process, beta = _process(given, varying), varying[-1]
-        q = jnp.where(live[:, None], process.action_values(values), 0)
-        backed_up = backup.value(q, beta) if gradient == "exact" else at_fixed_policy(backup, beta, q)
-        return process.end(jnp.where(live, backed_up, 0))
-
-    return None, jax.vjp(one_backup, varying)[1](adjoint)[0], jnp.zeros_like(values)
+    start = Start(values, adjoint, order)
+    by, found = solver.pull_back(process, backup, beta, gradient, values, cotangent, start)
+    failed = jnp.where(found.converged, 0.0, jnp.nan).astype(values.dtype)
+    by = jax.tree.map(lambda leaf: leaf + failed, by)
+    return None, tuple(by), jnp.zeros_like(values), found.values + failed
 
 
 _implicit.defvjp(_implicit_forward, _implicit_backward)

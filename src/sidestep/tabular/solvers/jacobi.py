@@ -1,0 +1,198 @@
+"""Sweeps over all states at once, in JAX, on any device; the equations are those of `process`.
+
+At discount 1 sweeps start from values of −∞ and reach outwards from the terminal states as a shortest-path search does;
+until that is done, an outcome that leads to a state not reached yet counts as staying.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from sidestep.tabular.backups import Backup, Gradient
+from sidestep.tabular.solvers.process import (
+    Beta,
+    DecisionProcess,
+    Gradients,
+    Solver,
+    Start,
+    Sweeps,
+    Tolerance,
+    at_fixed_policy,
+    lower_bound,
+    lowest,
+    reachable,
+)
+
+
+class Jacobi(Solver):
+    """Sweeps over all states at once, on any device.
+
+    - `tolerance`: relative change at which to stop; by default 1e-10 in 64-bit and 1e-5 in 32-bit numbers.
+    - `max_sweeps`: when to give up (and say so).
+    """
+
+    tolerance: Tolerance = None
+    max_sweeps: int = eqx.field(default=20_000, static=True)
+
+    def cold_start(self, states: int, dtype: jnp.dtype) -> Start:
+        """No values, no adjoint; an order is not used."""
+        return Start(jnp.full(states, lowest(dtype), dtype), jnp.zeros(states, dtype), jnp.zeros(0, jnp.int32))
+
+    def values(self, process: DecisionProcess, backup: Backup, beta: Beta, start: Start) -> Sweeps:
+        """V of the fixed point."""
+        split = _split(process)
+        reward = jnp.broadcast_to(process.reward, process.successors.shape[:2]).T
+
+        def sweep(values: Float[Array, " states"]) -> tuple[Float[Array, " states"], Float[Array, " states"]]:
+            after = values[split.successors]
+            moves = _moves_so_far(split, values, after)
+            elsewhere = reward + jnp.sum(moves * after, axis=1)
+            leaving = split.ending + moves.sum(axis=1)
+            solved = process.end(_own_equation(backup, beta, elsewhere, leaving, values))
+            return solved, jnp.maximum(jnp.abs(solved), jnp.abs(elsewhere).max(axis=0))
+
+        known = jnp.where(reachable(start.values), start.values, lower_bound(process))
+        return self._iterate(sweep, process.end(known), start.order)
+
+    def pull_back(
+        self,
+        process: DecisionProcess,
+        backup: Backup,
+        beta: Beta,
+        gradient: Gradient,
+        values: Float[Array, " states"],
+        cotangent: Float[Array, " states"],
+        start: Start,
+    ) -> tuple[Gradients, Sweeps]:
+        """The gradient by all that the values depend on: the adjoint, and one backup pulled back by JAX."""
+        # states that cannot reach a terminal state have no values to speak of, and no part in the gradient
+        live = reachable(values) & ~process.terminal
+
+        def action_values(process: DecisionProcess) -> Float[Array, "states actions"]:
+            return jnp.where(live[:, None], process.action_values(values), 0)
+
+        def one_backup(by: Gradients) -> Float[Array, " states"]:
+            varied = DecisionProcess(process.successors, *by[:3], process.terminal, by.discount)
+            q = action_values(varied)
+            backed_up = backup.value(q, by.beta) if gradient == "exact" else at_fixed_policy(backup, by.beta, q)
+            return varied.end(jnp.where(live, backed_up, 0))
+
+        q = action_values(process)
+        policy = backup.fixed_policy_weights(q, beta)
+        weights = backup.weights(q, beta) if gradient == "exact" else policy
+        found = self._adjoint(process, weights, policy, live, cotangent, start)
+        at = Gradients(process.probabilities, process.reward, process.final_reward, process.discount, beta)
+        return jax.vjp(one_backup, at)[1](found.values)[0], found
+
+    def _adjoint(
+        self,
+        process: DecisionProcess,
+        weights: Float[Array, "states actions"],
+        policy: Float[Array, "states actions"],
+        live: Bool[Array, " states"],
+        cotangent: Float[Array, " states"],
+        start: Start,
+    ) -> Sweeps:
+        """λ = g + Wᵀλ for the gradient g = `cotangent`.
+
+        `weights` are those in W, `policy` those of the policy held fixed; `live` are the states whose values pass on
+        to others.
+        """
+        split = _split(process)
+        chances = split.ending + split.elsewhere.sum(axis=1)
+        spread = jnp.where(live, weights.T, 0)[:, None] * split.elsewhere
+        leaving = jnp.where(live, jnp.sum(weights.T * chances, axis=0), 1)
+        divisor = jnp.where(live, _divisor(weights, policy, chances), 1)
+        largest = jnp.abs(cotangent).max()
+
+        def sweep(adjoint: Float[Array, " states"]) -> tuple[Float[Array, " states"], Float[Array, " states"]]:
+            arriving = jnp.zeros_like(adjoint).at[split.successors].add(spread * adjoint)
+            solved = (cotangent + arriving + (divisor - leaving) * adjoint) / divisor
+            return solved, jnp.maximum(jnp.abs(solved), largest)
+
+        return self._iterate(sweep, jnp.nan_to_num(start.adjoint, nan=0), start.order)
+
+    def _iterate(
+        self,
+        sweep: Callable[[Array], tuple[Array, Array]],
+        start: Float[Array, " states"],
+        order: Int[Array, " ordered"],
+    ) -> Sweeps:
+        """Sweeps until no change is large beside the sizes that `sweep` gives with its values."""
+        tolerance = self.tolerance_for(start.dtype)
+
+        def unfinished(state: Sweeps) -> Bool[Array, ""]:
+            return ~state.converged & (state.sweeps < self.max_sweeps) & ~jnp.isnan(state.residual)
+
+        def step(state: Sweeps) -> Sweeps:
+            values, size = sweep(state.values)
+            change = jnp.abs(values - state.values) / jnp.maximum(size, jnp.finfo(values.dtype).tiny / tolerance)
+            residual = jnp.max(change)
+            return Sweeps(values, order, state.sweeps + 1, residual, residual <= tolerance)
+
+        none = Sweeps(start, order, jnp.asarray(0), jnp.asarray(jnp.inf, start.dtype), jnp.asarray(False))
+        return jax.lax.while_loop(unfinished, step, none)
+
+
+class _Split(NamedTuple):
+    """The outcomes of a process, self-loops apart; states come last, so that they are contiguous in memory."""
+
+    successors: Int[Array, "actions outcomes states"]
+    elsewhere: Float[Array, "actions outcomes states"]  # γ P of the outcomes that leave the state, 0 for the others
+    ending: Float[Array, ""]  # 1 − γ
+
+
+def _split(process: DecisionProcess) -> _Split:
+    successors = jnp.moveaxis(process.successors, 0, -1)
+    probabilities = jnp.moveaxis(process.probabilities, 0, -1)
+    own = successors == jnp.arange(len(process.successors))
+    moves = jnp.where(own, 0, probabilities)
+    return _Split(successors, process.discount * moves, 1 - process.discount)
+
+
+def _moves_so_far(
+    split: _Split, values: Float[Array, " states"], after: Float[Array, "actions outcomes states"]
+) -> Float[Array, "actions outcomes states"]:
+    """γ P of the outcomes that leave a state, those that lead to states not reached yet counted as staying.
+
+    Once no state can be reached any more, the states that have not been are hopeless, and whatever leads there too.
+    """
+    known = reachable(after)
+    frontier = ~reachable(values) & jnp.any(known & (split.elsewhere > 0), axis=(0, 1))
+    return jnp.where(known | ~frontier.any(), split.elsewhere, 0)
+
+
+def _own_equation(
+    backup: Backup,
+    beta: Beta,
+    elsewhere: Float[Array, "actions states"],
+    leaving: Float[Array, "actions states"],
+    old: Float[Array, " states"],
+) -> Float[Array, " states"]:
+    """One Newton step on each state's own equation, from its old value, kept on the right side of the escape."""
+    bottom = lowest(old.dtype)
+    escapes = jnp.where(leaving > 0, elsewhere / jnp.where(leaving > 0, leaving, 1), bottom)
+    escape = jnp.maximum(escapes.max(axis=0), bottom)
+    toward = jnp.maximum if backup.above_maximum else jnp.minimum
+    start = jnp.where(reachable(old), toward(old, escape), escape)
+    advantage = (elsewhere - leaving * start).T
+    divisor = _divisor(backup.weights(advantage, beta), backup.fixed_policy_weights(advantage, beta), leaving)
+    solved = toward(start + backup.value(advantage, beta) / divisor, escape)
+    return jnp.where(reachable(escape), jnp.maximum(solved, bottom), bottom)
+
+
+def _divisor(
+    weights: Float[Array, "states actions"],
+    policy: Float[Array, "states actions"],
+    leaving: Float[Array, "actions states"],
+) -> Float[Array, " states"]:
+    """What a state's own equation is divided by: Σ w l, and never less than Σ π l, so that no step is too long.
+
+    A state that no action leaves is divided by 1: it gives nothing to its neighbours and takes nothing from them.
+    """
+    divisor = jnp.maximum(jnp.sum(weights.T * leaving, axis=0), jnp.sum(policy.T * leaving, axis=0))
+    return jnp.where(divisor > 0, divisor, 1)

@@ -1,0 +1,190 @@
+"""The adjoint in the order of distance, farthest states first, as machine code (numba).
+
+λ = g + Wᵀλ (see `process`) is solved by passing on what is missing: from the farthest state inwards, a state with
+residual r adds r to its λ (self-loops divided out) and r's shares to the residuals of the states it leads to. States
+that nobody who is looked at can influence are never touched. Small residuals wait, so that they add up before they are
+passed on: the threshold falls from sweep to sweep.
+
+A state's shares are worked out when it is first needed. With λ known, the gradient by everything that the values depend
+on is summed state by state.
+"""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from sidestep.tabular.solvers.sweeping import BOLTZMANN, HARD_MAX, MELLOWMAX
+
+
+class Shares(NamedTuple):
+    """How the value of a state depends on those of others, and λ so far; states by position, filled in when needed.
+
+    - `known`: whether the state's entries have been filled in.
+    - `weights`: w(a), the gradient of the value by the action values; `beta`: its gradient by β.
+    - `successors`, `shares`: the states that it leads to, and the entries of W for them.
+    - `leaving`, `divisor`: Σ w l, and what the state's own adjoint equation is divided by.
+    - `adjoint`, `residual`: λ, and g + Wᵀλ − λ.
+    """
+
+    known: np.ndarray
+    weights: np.ndarray
+    beta: np.ndarray
+    successors: np.ndarray
+    shares: np.ndarray
+    leaving: np.ndarray
+    divisor: np.ndarray
+    adjoint: np.ndarray
+    residual: np.ndarray
+
+
+class Passing(NamedTuple):
+    """The machine code for one number of actions, of outcomes, and of outcomes that leave a state."""
+
+    pass_on: Any
+    pull_back: Any
+
+
+class Given(NamedTuple):
+    """A task under a model with its states as they are, as in `DecisionProcess`; and its values."""
+
+    successors: np.ndarray
+    probabilities: np.ndarray
+    reward: np.ndarray
+    terminal: np.ndarray
+    discount: float
+    values: np.ndarray
+
+
+@njit(nogil=True, error_model="numpy", inline="always")
+def _weights(kind, beta, tie, exact, q, weights, policy):  # pragma: no cover
+    """Fills in the weights of the gradient and the policy at action values q; returns the gradient by β."""
+    best = q[0]
+    for a in range(1, len(q)):
+        best = max(best, q[a])
+    total = 0.0 * best
+    for a in range(len(q)):
+        behind = q[a] - best
+        policy[a] = (behind >= -tie * abs(best)) * 1.0 if kind == HARD_MAX else np.exp(beta * behind)
+        total += policy[a]
+    average = 0.0 * best
+    for a in range(len(q)):
+        policy[a] /= total
+        average += policy[a] * (q[a] - best)
+    variance = 0.0 * best
+    for a in range(len(q)):
+        behind = q[a] - best - average
+        variance += policy[a] * behind**2
+        weights[a] = policy[a] * (1 + beta * behind) if kind == BOLTZMANN and exact else policy[a]
+    if not exact or kind == HARD_MAX:
+        return 0.0 * best
+    if kind == BOLTZMANN:
+        return variance
+    actions = len(q) if kind == MELLOWMAX else 1
+    return (average - np.log(total / actions) / beta) / beta
+
+
+@cache
+def passing_for(actions: int, outcomes: int, width: int) -> Passing:
+    """The machine code for that many; as constants they make it twice as fast."""
+
+    @njit(nogil=True, error_model="numpy", inline="always")
+    def _expected(given, state, a):  # pragma: no cover
+        """The expected value after an action, summed as in `DecisionProcess.action_values`."""
+        here = given.values[state]
+        expected = here
+        for k in range(outcomes):
+            after = given.successors[state, a, k]
+            if after != state:
+                expected += given.probabilities[state, a, k] * (given.values[after] - here)
+        return expected
+
+    @njit(nogil=True, error_model="numpy", inline="always")
+    def _reward(given, state, a):  # pragma: no cover
+        """R(s, a), whichever of its axes has length 1."""
+        return given.reward[state if given.reward.shape[0] > 1 else 0, a if given.reward.shape[1] > 1 else 0]
+
+    @njit(nogil=True, error_model="numpy", inline="always")
+    def _fill_in(i, state, kind, beta, tie, exact, given, position, reached, shares, q, policy):  # pragma: no cover
+        """The entries of the state at position i. Of a state without values to speak of, nothing is passed on."""
+        shares.known[i] = True
+        shares.leaving[i] = shares.divisor[i] = 1
+        shares.shares[i] = 0
+        shares.successors[i] = i
+        shares.weights[i] = 0
+        shares.beta[i] = 0
+        if given.terminal[state] or not given.values[state] > reached:
+            return
+        for a in range(actions):
+            q[a] = _reward(given, state, a) + given.discount * _expected(given, state, a)
+        shares.beta[i] = _weights(kind, beta, tie, exact, q, shares.weights[i], policy)
+        leaving, policy_leaving = 0.0 * beta, 0.0 * beta
+        for a in range(actions):
+            left, m = 1 - given.discount, 0
+            for k in range(outcomes):
+                after = given.successors[state, a, k]
+                if after != state:
+                    move = given.discount * given.probabilities[state, a, k]
+                    shares.successors[i, a, m] = position[after]
+                    shares.shares[i, a, m] = shares.weights[i, a] * move
+                    left += move
+                    m += 1
+            leaving += shares.weights[i, a] * left
+            policy_leaving += policy[a] * left
+        divisor = max(leaving, policy_leaving)
+        shares.leaving[i] = leaving
+        shares.divisor[i] = divisor if divisor > 0 else 1.0
+
+    @njit(nogil=True, cache=True, error_model="numpy")
+    def pass_on(threshold, warm, kind, beta, tie, exact, given, order, position, reached, shares):  # pragma: no cover
+        """Passes on the residuals above a threshold, the farthest state first; or (`warm`) what a first λ amounts to.
+
+        Returns how many states had something to pass on, and the sum of all residuals' sizes that were left alone.
+        """
+        q, policy = np.empty(actions, given.values.dtype), np.empty(actions, given.values.dtype)
+        at_work, left_alone = 0, 0.0 * beta
+        for i in range(len(order) - 1, -1, -1):
+            missing = shares.adjoint[i] if warm else shares.residual[i]
+            if not abs(missing) > threshold:
+                if warm:
+                    shares.adjoint[i] = 0
+                left_alone += abs(missing)
+                continue
+            at_work += 1
+            if not shares.known[i]:
+                _fill_in(i, order[i], kind, beta, tie, exact, given, position, reached, shares, q, policy)
+            amount = missing
+            if not warm:
+                amount = missing / shares.divisor[i]
+                shares.adjoint[i] += amount
+            shares.residual[i] -= amount * shares.leaving[i]
+            for a in range(actions):
+                for m in range(width):
+                    shares.residual[shares.successors[i, a, m]] += amount * shares.shares[i, a, m]
+        return at_work, left_alone
+
+    @njit(nogil=True, cache=True, error_model="numpy")
+    def pull_back(given, order, shares, adjoint, probabilities, reward, final_reward, scalars):  # pragma: no cover
+        """Adds λᵀ ∂F/∂φ to the gradients φ̄ by the probabilities, rewards, final rewards, and the scalars γ and β."""
+        for i in range(len(order)):
+            weight = shares.adjoint[i]
+            state = order[i]
+            adjoint[state] = weight
+            if weight == 0:
+                continue
+            if given.terminal[state]:
+                final_reward[state if len(final_reward) > 1 else 0] += weight
+                continue
+            scalars[1] += weight * shares.beta[i]
+            for a in range(actions):
+                share = weight * shares.weights[i, a]
+                reward[state if reward.shape[0] > 1 else 0, a if reward.shape[1] > 1 else 0] += share
+                scalars[0] += share * _expected(given, state, a)
+                for k in range(outcomes):
+                    after = given.successors[state, a, k]
+                    if after != state:
+                        gained = given.values[after] - given.values[state]
+                        probabilities[state, a, k] += share * given.discount * gained
+
+    return Passing(pass_on, pull_back)

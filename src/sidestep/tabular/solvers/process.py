@@ -1,0 +1,189 @@
+"""What a solver solves: the Bellman equation and its adjoint, and how a state's own equation is solved.
+
+**Values.** With P the outcomes' probabilities and B a backup,
+
+    Q(s, a) = R(s, a) + γ Σ_k P(s, a, k) V(succ(s, a, k)),      V(s) = B(Q(s, ·)),      V(terminal) = final reward.
+
+A move that mostly fails leads mostly back to its own state, and plain sweeps then crawl. So every sweep solves each
+state's own equation with its neighbours' values held. With p(a) the probability of staying,
+c(a) = R + γ Σ_{elsewhere} P V and l(a) = 1 − γ p(a), the advantage of an action over the state's value v is A(a) =
+c(a) − l(a) v, and since every backup moves with a constant, V = B(Q) reads B(A) = 0. A Newton step on it is
+
+    v ← v + B(A) / Σ_a w(a) l(a),          w = the backup's weights at A.
+
+The *escape*, max_a c(a)/l(a), is the best that one action tried for ever can give. It bounds the root: from above for
+backups that never exceed the best action, from below for the log-sum-exp. Steps start and end on the root's side of it;
+otherwise a state whose value was too high would seem best off trying an action that never leaves. A state not reached
+yet starts from its escape. 1 − γp is summed as (1 − γ) + γ Σ_{elsewhere} P, so that nothing cancels in a trapped state.
+
+The Boltzmann average may have several fixed points. Dividing by no less than Σ π l keeps the steps short where B(A)
+grows with v, so that the sweeps end in a stable one.
+
+**Adjoint.** For a scalar function with gradient g with respect to V, λ solves λ = g + Wᵀλ, where
+W(s, s′) = γ Σ_a w(a) Σ_{k → s′} P(s, a, k) and w are the weights of the gradient that is asked for (exact or fixed
+policy). Self-loops are divided out as above. Both iterations have the same spectrum at the fixed point (for the exact
+gradient), so the adjoint converges where the values did.
+
+At discount 1 the values of states that cannot reach a terminal state are −∞; they are held at `lowest(dtype)`, so low
+that an action which may lead there is never taken.
+"""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Scalar
+
+from sidestep.tabular.backups import Backup, Gradient
+
+Beta = Float[Scalar, ""]
+Tolerance = float | Float[Array, ""] | None
+
+
+class DecisionProcess(eqx.Module):
+    """A task under a model: all that a solver needs to know (fields as in `Graph`, `TransitionModel` and `Task`)."""
+
+    successors: Int[Array, "states actions outcomes"]
+    probabilities: Float[Array, "states actions outcomes"]
+    reward: Float[Array, "#states #actions"]
+    final_reward: Float[Array, "#states"]
+    terminal: Bool[Array, " states"]
+    discount: Float[Array, ""]
+
+    def action_values(self, values: Float[Array, " states"]) -> Float[Array, "states actions"]:
+        """Q(s, a) = R(s, a) + γ Σ T V (eq. 4).
+
+        Summed as differences from V(s), so that the rounding of probabilities that are nearly 1 does not meet values
+        that are large: where moves mostly fail it would drown the gradient.
+        """
+        differences = values[self.successors] - values[:, None, None]
+        expected = values[:, None] + jnp.sum(self.probabilities * differences, axis=-1)
+        return self.reward + self.discount * expected
+
+    def end(self, values: Float[Array, " states"]) -> Float[Array, " states"]:
+        """The values with those of terminal states put in."""
+        return jnp.where(self.terminal, self.final_reward, values)
+
+
+class Start(NamedTuple):
+    """What a solve may start from: what an earlier one of the same task left, under a model nearby.
+
+    - `values`: V; `lowest(dtype)` where nothing is known.
+    - `adjoint`: λ; 0 where nothing is known. The gradient of a solution with respect to it is the new λ (see `solve`).
+    - `order`: the states by their distance from where the task ends, for solvers that use one; −1 for none yet.
+    """
+
+    values: Float[Array, "*tasks states"]
+    adjoint: Float[Array, "*tasks states"]
+    order: Int[Array, "*tasks ordered"]
+
+
+class Gradients(NamedTuple):
+    """The gradient of a scalar by all that values depend on; shapes as in `DecisionProcess`."""
+
+    probabilities: Float[Array, "states actions outcomes"]
+    reward: Float[Array, "#states #actions"]
+    final_reward: Float[Array, "#states"]
+    discount: Float[Array, ""]
+    beta: Float[Array, ""]
+
+
+class Sweeps(NamedTuple):
+    """What a solver found, and how it went.
+
+    `residual` is the largest change in the last sweep relative to the value itself (or to what its actions are worth
+    without staying, where that is larger), so that small values far from a goal count as much as large ones;
+    `converged` says that it is within the tolerance. The error is larger than the residual by up to 1/(1 − rate of
+    convergence).
+    """
+
+    values: Float[Array, " states"]
+    order: Int[Array, " ordered"]
+    sweeps: Int[Array, ""]
+    residual: Float[Array, ""]
+    converged: Bool[Array, ""]
+
+
+class Solver(eqx.Module):
+    """How values and adjoints are found: by sweeps over the states.
+
+    - `tolerance`: relative change at which to stop; by default 1e-10 in 64-bit and 1e-5 in 32-bit numbers.
+    - `max_sweeps`: when to give up (and say so).
+    """
+
+    tolerance: eqx.AbstractVar[Tolerance]
+    max_sweeps: eqx.AbstractVar[int]
+
+    @abc.abstractmethod
+    def cold_start(self, states: int, dtype: jnp.dtype) -> Start:
+        """The start when nothing is known."""
+
+    @abc.abstractmethod
+    def values(self, process: DecisionProcess, backup: Backup, beta: Beta, start: Start) -> Sweeps:
+        """V of the fixed point."""
+
+    @abc.abstractmethod
+    def pull_back(
+        self,
+        process: DecisionProcess,
+        backup: Backup,
+        beta: Beta,
+        gradient: Gradient,
+        values: Float[Array, " states"],
+        cotangent: Float[Array, " states"],
+        start: Start,
+    ) -> tuple[Gradients, Sweeps]:
+        """λᵀ ∂F/∂φ for the adjoint λ of g = `cotangent` at the fixed point `values`; `values` of the sweeps is λ."""
+
+    def tolerance_for(self, dtype: jnp.dtype) -> float | Float[Array, ""]:
+        """The tolerance, or the default one for numbers of that kind."""
+        if self.tolerance is not None:
+            return self.tolerance
+        return 1e-10 if dtype == jnp.float64 else 1e-5
+
+
+def finite_horizon(
+    process: DecisionProcess, backup: Backup, beta: Beta, horizon: int, gradient: Gradient
+) -> Float[Array, " states"]:
+    """V after `horizon` backups from nothing: what is worth having within that many actions.
+
+    Differentiable by JAX itself; `gradient` chooses the exact one or that of the policies held fixed.
+    """
+
+    def step(values: Float[Array, " states"], _: None) -> tuple[Float[Array, " states"], None]:
+        q = process.action_values(values)
+        if gradient == "exact":
+            return process.end(backup.value(q, beta)), None
+        return process.end(at_fixed_policy(backup, beta, q)), None
+
+    start = process.end(jnp.zeros(process.terminal.shape, process.probabilities.dtype))
+    return jax.lax.scan(step, start, length=horizon)[0]
+
+
+def lowest(dtype: jnp.dtype) -> float:
+    """The stand-in for −∞: so low that a step cost more makes no difference to it."""
+    return -1e200 if dtype == jnp.float64 else -1e25
+
+
+def reachable(values: Float[Array, "*states"]) -> Bool[Array, "*states"]:
+    """Whether a terminal state can be reached, by values at discount 1: whether they are not a share of `lowest`."""
+    return values > -((-lowest(values.dtype)) ** 0.5)
+
+
+def at_fixed_policy(backup: Backup, beta: Beta, q: Float[Array, "states actions"]) -> Float[Array, " states"]:
+    """The backup's value with the gradient of the average under its policy, held fixed (eqs. 9 and 10)."""
+    weights, value = jax.lax.stop_gradient((backup.fixed_policy_weights(q, beta), backup.value(q, beta)))
+    return value + jnp.sum(weights * (q - jax.lax.stop_gradient(q)), axis=-1)
+
+
+def lower_bound(process: DecisionProcess) -> Float[Array, ""]:
+    """A lower bound of the values: below discount 1, the best action of the worst state for ever."""
+    dtype = process.probabilities.dtype
+    best = jnp.broadcast_to(process.reward.max(axis=-1), process.terminal.shape)
+    worst = jnp.where(process.terminal, jnp.inf, best).min()
+    worst = jnp.where(jnp.isfinite(worst), worst, 0)
+    remaining = 1 - process.discount
+    bound = jnp.where(remaining > 0, worst / jnp.where(remaining > 0, remaining, 1), lowest(dtype))
+    return bound.astype(dtype)
