@@ -19,15 +19,15 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-import jax
 import numpy as np
 import yaml
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+import measuring
 from sidestep.commands.learn import Settings, fit_map
-from sidestep.errors import InputError, SidestepError
+from sidestep.errors import InputError
 from sidestep.io.demonstrations import demonstrations
 from sidestep.io.files import write_json
 from sidestep.io.maps import read_map
@@ -212,16 +212,5 @@ def run(arguments: argparse.Namespace) -> None:
         write_json(arguments.json, {"settings": asdict(settings), "means": rows, "records": records})
 
 
-def main() -> int:
-    """Runs the script; the exit code is 1 for data or settings that cannot be used."""
-    jax.config.update("jax_enable_x64", True)
-    try:
-        run(_arguments())
-    except SidestepError as error:
-        Console(stderr=True).print(f"error: {error}", markup=False, soft_wrap=True)
-        return 1
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(measuring.main(run, _arguments()))

@@ -6,7 +6,9 @@ The names here are the public ones; `docs/mathematics.md` explains what they com
 from sidestep.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.errors import ImproperTask, InputError, NotConverged, SidestepError
 from sidestep.evaluation import Reward, evaluate, plan_paths
-from sidestep.inference.fit import Fit, Progress, fit
+from sidestep.inference.climb import Progress
+from sidestep.inference.fit import Fit, fit
+from sidestep.inference.objective import tasks_mesh
 from sidestep.inference.optimisers import LBFGS, Ascent
 from sidestep.inference.priors import Normal
 from sidestep.io.demonstrations import demonstrations
@@ -74,6 +76,7 @@ __all__ = [
     "solve",
     "stack_tasks",
     "task",
+    "tasks_mesh",
     "true_model",
     "write_map",
     "write_walks",

@@ -21,7 +21,7 @@ from sidestep.commands.simulate import Walkers, simulate_walks
 from sidestep.errors import SidestepError
 from sidestep.experiments.demo import demo
 from sidestep.experiments.reproduce import reproduce
-from sidestep.inference.fit import Progress as FitProgress
+from sidestep.inference.climb import Progress as FitProgress
 
 app = typer.Typer(
     help="Learn the obstacles that nobody touched from the walks of people who knew them.",
@@ -95,6 +95,9 @@ def learn_command(
         int | None, typer.Option(help="How many moves walkers look ahead; all of them by default.")
     ] = None,
     iterations: Annotated[int | None, typer.Option(help="At most this many.")] = None,
+    memory: Annotated[
+        float, typer.Option(help="About how much the fit's arrays may take; goals are solved in batches.", metavar="GIB")
+    ] = Settings.memory,
     sample: Annotated[int | None, typer.Option(help="Learn from this many walks only, drawn by the seed.")] = None,
     seed: Seed = Settings.seed,
     resume: Annotated[bool, typer.Option("--resume", help="Go on where an interrupted run stopped.")] = False,
@@ -112,6 +115,7 @@ def learn_command(
         gradient="exact" if gradient == "exact" else "fixed_policy",
         horizon=horizon,
         iterations=iterations,
+        memory=memory,
         sample=sample,
         seed=seed,
     )

@@ -5,7 +5,8 @@ import pytest
 from walled import BLANK, walks
 
 from sidestep.errors import InputError
-from sidestep.inference.fit import _Saver, fit
+from sidestep.inference.checkpoints import Saver
+from sidestep.inference.fit import fit
 from sidestep.inference.optimisers import LBFGS, Ascent
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
@@ -23,7 +24,7 @@ def fitted(name, report=None, **settings):
 
 @pytest.fixture(autouse=True)
 def _save_at_every_iteration(monkeypatch):
-    monkeypatch.setattr(_Saver, "interval", -1.0)
+    monkeypatch.setattr(Saver, "pause", lambda *_: 0.0)
 
 
 def interrupted_at(iteration):

@@ -12,7 +12,9 @@ import numpy as np
 from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError
 from sidestep.evaluation import Reward
-from sidestep.inference.fit import Fit, Progress, fit
+from sidestep.inference.climb import Progress
+from sidestep.inference.fit import Fit, fit
+from sidestep.inference.objective import MEMORY
 from sidestep.inference.optimisers import LBFGS, Ascent, Optimiser
 from sidestep.inference.priors import Normal
 from sidestep.io.demonstrations import demonstrations_of_moves
@@ -43,7 +45,8 @@ class Settings:
     - `prior_mean`, `prior_variance`: of every unknown cell's logit.
     - `connectivity`: 4 or 8. `terms`: which parts of the likelihood count. `gradient`: "exact" climbs by L-BFGS,
       "fixed_policy" by first-order ascent. `horizon`: how many moves walkers look ahead (None: all).
-    - `iterations`: at most this many (None: the optimiser's own limit).
+    - `iterations`: at most this many (None: the optimiser's own limit). `memory`: about how many GiB the fit's arrays
+      may take.
     - `sample`: learn from that many walks only, drawn by `seed` (None: from all).
     """
 
@@ -58,6 +61,7 @@ class Settings:
     gradient: Gradient = "exact"
     horizon: int | None = None
     iterations: int | None = None
+    memory: float = MEMORY / 2**30
     sample: int | None = None
     seed: int = 0
 
@@ -121,15 +125,23 @@ def fit_map(
     """The fit that `settings` describe."""
     if settings.backup not in BACKUPS:
         raise InputError(f"expected one of {', '.join(BACKUPS)}, found {settings.backup!r}", field="backup")
+    if not (np.isfinite(settings.memory) and settings.memory > 0):
+        raise InputError(f"expected GiB above 0, found {settings.memory}", field="memory")
+    people = Behavior(BACKUPS[settings.backup](), settings.beta)
+    prior = Normal(settings.prior_mean, settings.prior_variance)
+    if settings.terms == "both":
+        # where people walked is known without a solve: begin there
+        model = fit(model, demonstrations, people, prior=prior, terms=("transitions",)).model
     return fit(
         model,
         demonstrations,
-        Behavior(BACKUPS[settings.backup](), settings.beta),
-        prior=Normal(settings.prior_mean, settings.prior_variance),
+        people,
+        prior=prior,
         terms=TERMS[settings.terms],
         gradient=settings.gradient,
         horizon=settings.horizon,
         optimiser=optimiser_of(settings),
+        memory=settings.memory * 2**30,
         report=report,
         checkpoint=checkpoint,
         resume=resume,

@@ -6,6 +6,7 @@ The first line is JSON (what was being fitted, and the history so far), the rest
 import hashlib
 import io
 import json
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
@@ -60,3 +61,35 @@ def load_checkpoint(path: Path, key: str, like: PyTree) -> tuple[PyTree, list[li
         return eqx.tree_deserialise_leaves(file, like), history
     except Exception as error:  # what is not an array raises errors of many kinds
         raise InputError("not a checkpoint: the arrays cannot be read", source=path) from error
+
+
+class Saver:
+    """Keeps a checkpoint file up to date while something runs; without a path it keeps nothing.
+
+    Saving takes no more than a tenth of the time, and happens every few seconds at most.
+    """
+
+    def __init__(self, path: str | Path | None, key: str):
+        self.path, self.key = None if path is None else Path(path), key
+        self.next = 0.0
+
+    def load(self, like: PyTree) -> tuple[PyTree, list[list[int | float]]]:
+        """What was carried, in the structure of `like`, and the history; `like` itself if there is no file yet.
+
+        Raises `InputError` without a path, and for a file that `load_checkpoint` refuses.
+        """
+        if self.path is None:
+            raise InputError("expected a checkpoint to resume from", field="resume")
+        return load_checkpoint(self.path, self.key, like) if self.path.exists() else (like, [])
+
+    def save(self, carried: PyTree, history: Sequence[Sequence[int | float]]) -> None:
+        """Saves, if it is time to."""
+        if self.path is not None and time.monotonic() >= self.next:
+            started = time.monotonic()
+            save_checkpoint(self.path, self.key, carried, history)
+            took = time.monotonic() - started
+            self.next = started + took + self.pause(took)
+
+    def pause(self, took: float) -> float:
+        """How many seconds to wait after a save that took so many."""
+        return max(5.0, 9 * took)

@@ -8,14 +8,17 @@ People plan with the dynamics that they know, so both terms depend on θ: the *a
 
 from typing import Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from sidestep.demonstrations import Demonstrations
 from sidestep.tabular.backups import Behavior, Gradient
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.solve import solve
-from sidestep.tabular.solvers.process import Solver
+from sidestep.tabular.solve import Solution, solve
+from sidestep.tabular.solvers.process import Solver, Start
+from sidestep.tasks import Task
 
 Term = Literal["actions", "transitions"]
 ALL_TERMS: tuple[Term, ...] = ("actions", "transitions")
@@ -68,27 +71,83 @@ def action_log_likelihood(
     solver: Solver | None = None,
 ) -> Float[Array, ""]:
     """Σ log π_θ(a | s) over all moves; NaN if a task's values did not converge."""
-    solution = solve(model, demonstrations.tasks, behavior, horizon=horizon, gradient=gradient, solver=solver)
-    # not `solution.action_values`: those of the visited states are few
-    q = visited_action_values(model, demonstrations, solution.values)
-    log_policy = behavior.log_policy(q)
-    chosen = jnp.take_along_axis(log_policy, demonstrations.actions[:, None], axis=-1)
-    # a factor, so that the gradient is NaN too
-    return jnp.sum(chosen) * jnp.where(solution.converged.all(), 1.0, jnp.nan)
-
-
-def visited_action_values(
-    model: TransitionModel, demonstrations: Demonstrations, values: Float[Array, "tasks states"]
-) -> Float[Array, "moves actions"]:
-    """Q(s, a) of the state of every move, from the values of all tasks; as `DecisionProcess.action_values`."""
     tasks, task, states = demonstrations.tasks, demonstrations.task, demonstrations.states
-    probabilities = model.probabilities()
+    solution = solve(model, tasks, behavior, horizon=horizon, gradient=gradient, solver=solver)
+    q = _visited_action_values(model, tasks, solution.values, task, states)
+    # a factor, so that the gradient is NaN too
+    return _log_policy(behavior, q, demonstrations.actions).sum() * _nan_unless(solution.converged.all())
+
+
+class Choices(NamedTuple):
+    """What was done in pursuit of a task: action `actions` in state `states`, `counts` times.
+
+    With a leading `tasks` axis, for several tasks; shorter lists are filled up with counts of 0.
+    """
+
+    states: Int[Array, "*tasks choices"]
+    actions: Int[Array, "*tasks choices"]
+    counts: Int[Array, "*tasks choices"]
+
+
+def choice_log_likelihood(
+    model: TransitionModel,
+    task: Task,
+    choices: Choices,
+    behavior: Behavior,
+    start: Start,
+    *,
+    horizon: int | None = None,
+    gradient: Gradient = "exact",
+    solver: Solver | None = None,
+) -> tuple[Float[Array, ""], Solution]:
+    """Σ log π_θ(a | s) over the choices made in pursuit of one task, and the task's solution (from `start`).
+
+    NaN if its values did not converge. Over the tasks of `choices_of(demonstrations)` it adds up to
+    `action_log_likelihood`.
+    """
+    solution = solve(model, task, behavior, horizon=horizon, gradient=gradient, solver=solver, start=start)
+    alone = jax.tree.map(lambda leaf: leaf[None], task)
+    first = jnp.zeros_like(choices.states)
+    q = _visited_action_values(model, alone, solution.values[None], first, choices.states)
+    total = jnp.sum(choices.counts.astype(q.dtype) * _log_policy(behavior, q, choices.actions))
+    return total * _nan_unless(solution.converged), solution
+
+
+def choices_of(demonstrations: Demonstrations) -> Choices:
+    """The moves of each task as choices, equal ones counted."""
+    task, states, actions = (np.asarray(getattr(demonstrations, name)) for name in ("task", "states", "actions"))
+    different, counts = np.unique(np.stack([task, states, actions]), axis=1, return_counts=True)
+    sizes = np.bincount(different[0], minlength=len(demonstrations.tasks.terminal))
+    # rounded up to a power of two, so that fits of other data need not be compiled again
+    filled = np.arange(2 ** int(np.ceil(np.log2(max(sizes.max(), 16))))) < sizes[:, None]
+    padded = np.zeros((3, *filled.shape), dtype=np.int32)
+    padded[:, filled] = np.stack([*different[1:], counts])
+    return Choices(*(jnp.asarray(part) for part in padded))
+
+
+def _visited_action_values(
+    model: TransitionModel,
+    tasks: Task,
+    values: Float[Array, "tasks states"],
+    task: Int[Array, " visits"],
+    states: Int[Array, " visits"],
+) -> Float[Array, "visits actions"]:
+    """Q(s, a) of visited states, from the values of all tasks: `DecisionProcess.action_values` for these alone."""
     value = values[task, states]
     differences = values[task[:, None, None], model.graph.successors[states]] - value[:, None, None]
-    expected = value[:, None] + jnp.sum(probabilities[states] * differences, axis=-1)
-    per_state = tasks.reward.shape[1] > 1
-    reward = tasks.reward[task, states if per_state else 0].astype(values.dtype)
+    expected = value[:, None] + jnp.sum(model.probabilities()[states] * differences, axis=-1)
+    reward = tasks.reward[task, states if tasks.reward.shape[1] > 1 else 0].astype(values.dtype)
     return reward + tasks.discount[task, None].astype(values.dtype) * expected
+
+
+def _log_policy(
+    behavior: Behavior, q: Float[Array, "visits actions"], actions: Int[Array, " visits"]
+) -> Float[Array, " visits"]:
+    return jnp.take_along_axis(behavior.log_policy(q), actions[:, None], axis=-1)[:, 0]
+
+
+def _nan_unless(condition: Bool[Array, ""]) -> Float[Array, ""]:
+    return jnp.where(condition, 1.0, jnp.nan)
 
 
 def transition_log_likelihood(model: TransitionModel, demonstrations: Demonstrations) -> Float[Array, ""]:

@@ -11,9 +11,10 @@ one gives them sooner.
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
+
+from sidestep.tabular.solvers.compiled import compiled
 
 
 def order_by_distance(
@@ -36,9 +37,9 @@ def order_by_distance(
     return np.argsort(distance, kind="stable").astype(np.int32)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled()
 def _moves_backwards(successors, probabilities, reward, discount):  # pragma: no cover
-    """The moves that can lead into each state, as the rows of a sparse matrix: where they start, from where, their cost."""
+    """The moves into each state, as rows of a sparse matrix: where a row starts, where moves begin, their costs."""
     states, actions, outcomes = successors.shape
     first = np.zeros(states + 2, np.int32)
     for state in range(states):

@@ -3,7 +3,7 @@
 λ = g + Wᵀλ (see `process`) is solved by passing on what is missing: from the farthest state inwards, a state with
 residual r adds r to its λ (self-loops divided out) and r's shares to the residuals of the states it leads to. States
 that nobody who is looked at can influence are never touched. Small residuals wait, so that they add up before they are
-passed on: the threshold falls from sweep to sweep.
+passed on: the threshold falls from sweep to sweep (see `inwards`).
 
 A state's shares are worked out when it is first needed. With λ known, the gradient by everything that the values depend
 on is summed state by state.
@@ -13,9 +13,27 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
-from sidestep.tabular.solvers.sweeping import BOLTZMANN, HARD_MAX, MELLOWMAX
+from sidestep.tabular.solvers.compiled import compiled, inlined
+from sidestep.tabular.solvers.given import Given
+from sidestep.tabular.solvers.sweeping import BOLTZMANN, HARD_MAX, MELLOWMAX, Valuing
+
+
+class Setting(NamedTuple):
+    """What the adjoint is of; the states have their own numbers.
+
+    - `exact`: whether the gradient is the backup's own, or that of the policy held fixed.
+    - `values`: V; below `reached` they mean that no terminal state can be reached.
+    - `order`, `position`: which state comes when, and when a state comes.
+    """
+
+    given: Given
+    valuing: Valuing
+    exact: bool
+    values: np.ndarray
+    reached: np.floating
+    order: np.ndarray
+    position: np.ndarray
 
 
 class Shares(NamedTuple):
@@ -39,6 +57,16 @@ class Shares(NamedTuple):
     residual: np.ndarray
 
 
+class HostGradients(NamedTuple):
+    """The gradients to write into; fields as in `Gradients`."""
+
+    probabilities: np.ndarray
+    reward: np.ndarray
+    final_reward: np.ndarray
+    discount: np.ndarray
+    beta: np.ndarray
+
+
 class Passing(NamedTuple):
     """The machine code for one number of actions, of outcomes, and of outcomes that leave a state."""
 
@@ -46,20 +74,10 @@ class Passing(NamedTuple):
     pull_back: Any
 
 
-class Given(NamedTuple):
-    """A task under a model with its states as they are, as in `DecisionProcess`; and its values."""
-
-    successors: np.ndarray
-    probabilities: np.ndarray
-    reward: np.ndarray
-    terminal: np.ndarray
-    discount: float
-    values: np.ndarray
-
-
-@njit(nogil=True, error_model="numpy", inline="always")
-def _weights(kind, beta, tie, exact, q, weights, policy):  # pragma: no cover
+@inlined()
+def weigh(valuing, exact, q, weights, policy):  # pragma: no cover
     """Fills in the weights of the gradient and the policy at action values q; returns the gradient by β."""
+    kind, beta, tie = valuing.kind, valuing.beta, valuing.tie
     best = q[0]
     for a in range(1, len(q)):
         best = max(best, q[a])
@@ -85,66 +103,66 @@ def _weights(kind, beta, tie, exact, q, weights, policy):  # pragma: no cover
     return (average - np.log(total / actions) / beta) / beta
 
 
+@inlined()
+def _expected(setting, state, a, outcomes):  # pragma: no cover
+    """The expected value after an action, summed as in `DecisionProcess.action_values`."""
+    given, values = setting.given, setting.values
+    here = values[state]
+    expected = here
+    for k in range(outcomes):
+        after = given.successors[state, a, k]
+        if after != state:
+            expected += given.probabilities[state, a, k] * (values[after] - here)
+    return expected
+
+
+@inlined()
+def _fill_in(i, actions, outcomes, setting, shares, q, policy):  # pragma: no cover
+    """The entries of the state at position i. Of a state without values to speak of, nothing is passed on."""
+    given, state = setting.given, setting.order[i]
+    shares.known[i] = True
+    shares.leaving[i] = shares.divisor[i] = 1
+    shares.shares[i] = 0
+    shares.successors[i] = i
+    shares.weights[i] = 0
+    shares.beta[i] = 0
+    if given.terminal[state] or not setting.values[state] > setting.reached:
+        return
+    for a in range(actions):
+        reward = given.reward[state if given.reward.shape[0] > 1 else 0, a if given.reward.shape[1] > 1 else 0]
+        q[a] = reward + given.discount * _expected(setting, state, a, outcomes)
+    shares.beta[i] = weigh(setting.valuing, setting.exact, q, shares.weights[i], policy)
+    leaving, policy_leaving = 0.0 * given.discount, 0.0 * given.discount
+    for a in range(actions):
+        left, m = 1 - given.discount, 0
+        for k in range(outcomes):
+            after = given.successors[state, a, k]
+            if after != state:
+                move = given.discount * given.probabilities[state, a, k]
+                shares.successors[i, a, m] = setting.position[after]
+                shares.shares[i, a, m] = shares.weights[i, a] * move
+                left += move
+                m += 1
+        leaving += shares.weights[i, a] * left
+        policy_leaving += policy[a] * left
+    divisor = max(leaving, policy_leaving)
+    shares.leaving[i] = leaving
+    shares.divisor[i] = divisor if divisor > 0 else 1.0
+
+
 @cache
 def passing_for(actions: int, outcomes: int, width: int) -> Passing:
     """The machine code for that many; as constants they make it twice as fast."""
 
-    @njit(nogil=True, error_model="numpy", inline="always")
-    def _expected(given, state, a):  # pragma: no cover
-        """The expected value after an action, summed as in `DecisionProcess.action_values`."""
-        here = given.values[state]
-        expected = here
-        for k in range(outcomes):
-            after = given.successors[state, a, k]
-            if after != state:
-                expected += given.probabilities[state, a, k] * (given.values[after] - here)
-        return expected
-
-    @njit(nogil=True, error_model="numpy", inline="always")
-    def _reward(given, state, a):  # pragma: no cover
-        """R(s, a), whichever of its axes has length 1."""
-        return given.reward[state if given.reward.shape[0] > 1 else 0, a if given.reward.shape[1] > 1 else 0]
-
-    @njit(nogil=True, error_model="numpy", inline="always")
-    def _fill_in(i, state, kind, beta, tie, exact, given, position, reached, shares, q, policy):  # pragma: no cover
-        """The entries of the state at position i. Of a state without values to speak of, nothing is passed on."""
-        shares.known[i] = True
-        shares.leaving[i] = shares.divisor[i] = 1
-        shares.shares[i] = 0
-        shares.successors[i] = i
-        shares.weights[i] = 0
-        shares.beta[i] = 0
-        if given.terminal[state] or not given.values[state] > reached:
-            return
-        for a in range(actions):
-            q[a] = _reward(given, state, a) + given.discount * _expected(given, state, a)
-        shares.beta[i] = _weights(kind, beta, tie, exact, q, shares.weights[i], policy)
-        leaving, policy_leaving = 0.0 * beta, 0.0 * beta
-        for a in range(actions):
-            left, m = 1 - given.discount, 0
-            for k in range(outcomes):
-                after = given.successors[state, a, k]
-                if after != state:
-                    move = given.discount * given.probabilities[state, a, k]
-                    shares.successors[i, a, m] = position[after]
-                    shares.shares[i, a, m] = shares.weights[i, a] * move
-                    left += move
-                    m += 1
-            leaving += shares.weights[i, a] * left
-            policy_leaving += policy[a] * left
-        divisor = max(leaving, policy_leaving)
-        shares.leaving[i] = leaving
-        shares.divisor[i] = divisor if divisor > 0 else 1.0
-
-    @njit(nogil=True, cache=True, error_model="numpy")
-    def pass_on(threshold, warm, kind, beta, tie, exact, given, order, position, reached, shares):  # pragma: no cover
+    @compiled()
+    def pass_on(threshold, warm, setting, shares):  # pragma: no cover
         """Passes on the residuals above a threshold, the farthest state first; or (`warm`) what a first λ amounts to.
 
         Returns how many states had something to pass on, and the sum of all residuals' sizes that were left alone.
         """
-        q, policy = np.empty(actions, given.values.dtype), np.empty(actions, given.values.dtype)
-        at_work, left_alone = 0, 0.0 * beta
-        for i in range(len(order) - 1, -1, -1):
+        q, policy = np.empty(actions, setting.values.dtype), np.empty(actions, setting.values.dtype)
+        at_work, left_alone = 0, 0.0 * threshold
+        for i in range(len(shares.residual) - 1, -1, -1):
             missing = shares.adjoint[i] if warm else shares.residual[i]
             if not abs(missing) > threshold:
                 if warm:
@@ -153,7 +171,7 @@ def passing_for(actions: int, outcomes: int, width: int) -> Passing:
                 continue
             at_work += 1
             if not shares.known[i]:
-                _fill_in(i, order[i], kind, beta, tie, exact, given, position, reached, shares, q, policy)
+                _fill_in(i, actions, outcomes, setting, shares, q, policy)
             amount = missing
             if not warm:
                 amount = missing / shares.divisor[i]
@@ -164,27 +182,28 @@ def passing_for(actions: int, outcomes: int, width: int) -> Passing:
                     shares.residual[shares.successors[i, a, m]] += amount * shares.shares[i, a, m]
         return at_work, left_alone
 
-    @njit(nogil=True, cache=True, error_model="numpy")
-    def pull_back(given, order, shares, adjoint, probabilities, reward, final_reward, scalars):  # pragma: no cover
-        """Adds λᵀ ∂F/∂φ to the gradients φ̄ by the probabilities, rewards, final rewards, and the scalars γ and β."""
-        for i in range(len(order)):
+    @compiled()
+    def pull_back(setting, shares, adjoint, by):  # pragma: no cover
+        """Adds λᵀ ∂F/∂φ to the gradients `by` φ; fills in λ with the states' own numbers."""
+        given, values = setting.given, setting.values
+        for i in range(len(adjoint)):
             weight = shares.adjoint[i]
-            state = order[i]
+            state = setting.order[i]
             adjoint[state] = weight
             if weight == 0:
                 continue
             if given.terminal[state]:
-                final_reward[state if len(final_reward) > 1 else 0] += weight
+                by.final_reward[state if len(by.final_reward) > 1 else 0] += weight
                 continue
-            scalars[1] += weight * shares.beta[i]
+            by.beta[()] += weight * shares.beta[i]
             for a in range(actions):
                 share = weight * shares.weights[i, a]
-                reward[state if reward.shape[0] > 1 else 0, a if reward.shape[1] > 1 else 0] += share
-                scalars[0] += share * _expected(given, state, a)
+                by.reward[state if by.reward.shape[0] > 1 else 0, a if by.reward.shape[1] > 1 else 0] += share
+                by.discount[()] += share * _expected(setting, state, a, outcomes)
                 for k in range(outcomes):
                     after = given.successors[state, a, k]
                     if after != state:
-                        gained = given.values[after] - given.values[state]
-                        probabilities[state, a, k] += share * given.discount * gained
+                        gained = values[after] - values[state]
+                        by.probabilities[state, a, k] += share * given.discount * gained
 
     return Passing(pass_on, pull_back)

@@ -93,6 +93,7 @@ class Gradients(NamedTuple):
 class Sweeps(NamedTuple):
     """What a solver found, and how it went.
 
+    `sweeps` says how often a state was solved; on average, where states are not all solved equally often.
     `residual` is the largest change in the last sweep relative to the value itself (or to what its actions are worth
     without staying, where that is larger), so that small values far from a goal count as much as large ones;
     `converged` says that it is within the tolerance. The error is larger than the residual by up to 1/(1 − rate of

@@ -1,0 +1,528 @@
+"""What a gradient costs: the adjoint by either solver, beside other ways to the same gradient.
+
+    python benchmarks/gradient_peers.py
+    python benchmarks/gradient_peers.py --sizes 16 32 --backups logsumexp --gradient fixed_policy
+    python benchmarks/gradient_peers.py --beta 10 --discount 0.95 --goal-pays
+
+On offices whose walls are nearly certain (`worlds.py`) and one task, these compute the gradient of ten walkers' action
+log-likelihood with respect to all parameters, their values included:
+
+- **sidestep ordered**, **sidestep jacobi**: the adjoint, as a fit computes it; cold from nothing, warm after a step of
+  an optimiser from what the solve before left (see `scaling.py`);
+- **unrolled**: JAX's reverse-mode differentiation through plain value iteration, which keeps every sweep in memory;
+- **dense implicit**: the values of `sidestep ordered`, and the adjoint from `jnp.linalg.solve` of the dense Jacobian;
+- **optimistix**: `optimistix.fixed_point` of one plain backup with its default `ImplicitAdjoint`, which builds that
+  Jacobian too; where optimistix is installed (`pip install optimistix`; it is not a dependency);
+- **forward**: the paper's dynamic programme (eq. 7 with eq. 8, or with eq. 9 for `--gradient fixed_policy`), iterated
+  on an array of states × parameters, from values by `sidestep ordered`.
+
+and **values** is the value solve of `sidestep ordered` alone, **plain values** that by plain sweeps.
+
+Each map is given twice, as an obstacle grid (a parameter a cell) and as a table (a parameter for every outcome of every
+state and action) with the same probabilities, to show what the number of parameters does.
+
+All get the same tolerance, the relative change at which their iterations stop. Plain sweeps may stop too early, so they
+go on until the gradient is within `--accuracy` of the exact one (by `sidestep ordered` at a tolerance of 1e-12), or as
+long as they may. All differences are shown. A method that would need more than `--memory` is not run, and the table
+says so.
+
+Records (`--json`): `name`, `model`, `backup`, `cells`, `parameters`, `tasks`, `cold_seconds`, `warm_seconds` (null
+where there is no warm start), `dijkstra_seconds` (medians), `best_seconds`, `ratio` (to `sidestep ordered`, cold, in
+the same turn: above 1 means slower than ours), `difference` (from the exact gradient, relative to its largest
+component), `sweeps` (of the values, or of plain iterations), `compiled_bytes` (what XLA sets aside), `compile_seconds`,
+`turns`, `peak_bytes`, `imports_bytes`, `excess_bytes` (of a process of its own, compiler included), `call_bytes` (the
+peak of one call there beyond what was held when it began), `failed` (null, or why it was not run).
+"""
+
+import argparse
+import importlib
+import importlib.util
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+from scipy.sparse.csgraph import dijkstra
+
+import measuring
+from scaling import SOLVERS, Problem, stepped, take, visited_action_values
+from sidestep.errors import NotConverged
+from sidestep.tabular.backups import BACKUPS, Behavior
+from sidestep.tabular.models import TabularModel, TransitionModel
+from sidestep.tabular.solve import solve
+from sidestep.tabular.solvers.ordered import Ordered
+from sidestep.tabular.solvers.process import DecisionProcess, at_fixed_policy
+from worlds import World, expected_costs, half_learned_office, load
+
+MOST_SWEEPS = 50_000
+EXACT = 1e-12
+Parameters = Float[Array, "..."]
+Found = tuple[Array, Array]  # a gradient, and how many sweeps it took (0 where that says nothing)
+
+
+# ---------------------------------------------------------------------------------------------------- the problem
+
+
+def problem_of(world: World, model: str, backup: str, arguments: argparse.Namespace) -> Problem:
+    """The problem in a world, in one parametrisation."""
+    cost = None if arguments.goal_pays else arguments.step_cost
+    demos = world.demonstrations(arguments.discount, cost)
+    people = Behavior(BACKUPS[backup](), arguments.beta)
+    made = world.model if model == "cells" else table_of(world.model)
+    return Problem(made, demos, people, Ordered(tolerance=arguments.tolerance), arguments.gradient)
+
+
+def table_of(model: TransitionModel) -> TabularModel:
+    """The same probabilities, with a logit for every outcome of every state and action."""
+    probabilities = model.probabilities()
+    possible = probabilities > 0
+    return TabularModel(model.graph, jnp.log(jnp.where(possible, probabilities, 1)), possible)
+
+
+def process_of(problem: Problem, parameters: Parameters) -> DecisionProcess:
+    """The one task under the model at some parameters."""
+    model = problem.model.with_parameters(parameters)
+    task = jax.tree.map(lambda leaf: leaf[0], problem.demonstrations.tasks)
+    probabilities = model.probabilities()
+    return DecisionProcess(
+        model.graph.successors, probabilities, task.reward, task.final_reward, task.terminal, task.discount
+    )
+
+
+def one_backup(problem: Problem, parameters: Parameters, values: Array) -> Array:
+    """F(V, θ): one plain backup, with the gradient that is asked for."""
+    process, people = process_of(problem, parameters), problem.behavior
+    q = process.action_values(values)
+    if problem.gradient == "exact":
+        return process.end(people.backup.value(q, people.beta))
+    return process.end(at_fixed_policy(people.backup, people.beta, q))
+
+
+def chosen(problem: Problem, parameters: Parameters, values: Array) -> Array:
+    """The actions' log-likelihood from the values."""
+    demos = problem.demonstrations
+    q = visited_action_values(problem.model.with_parameters(parameters), demos, values[None])
+    return jnp.sum(jnp.take_along_axis(problem.behavior.log_policy(q), demos.actions[:, None], axis=-1))
+
+
+# ---------------------------------------------------------------------------------------------------- the methods
+
+
+def values(problem: Problem, parameters: Parameters) -> Found:
+    """The values alone."""
+    found = solve(
+        problem.model.with_parameters(parameters),
+        problem.demonstrations.tasks,
+        problem.behavior,
+        solver=problem.solver,
+    )
+    return jnp.where(found.converged[0], found.values[0], jnp.nan), found.sweeps[0]
+
+
+def adjoint(problem: Problem, parameters: Parameters) -> Found:
+    """The gradient by the adjoint, from nothing."""
+    found = take(problem, parameters, problem.cold_start())
+    return jnp.where(found.converged, found.gradient, jnp.nan), found.sweeps[0]
+
+
+def plain_values(problem: Problem, parameters: Parameters, sweeps: int) -> Found:
+    """Values by so many plain sweeps."""
+    start = process_of(problem, parameters).end(jnp.zeros(problem.model.graph.states))
+    done = jax.lax.scan(lambda v, _: (one_backup(problem, parameters, v), None), start, length=sweeps)[0]
+    return done, jnp.asarray(sweeps)
+
+
+def unrolled(problem: Problem, parameters: Parameters, sweeps: int) -> Found:
+    """The gradient through so many plain sweeps."""
+
+    def objective(parameters: Parameters) -> Array:
+        return chosen(problem, parameters, plain_values(problem, parameters, sweeps)[0])
+
+    return jax.grad(objective)(parameters), jnp.asarray(sweeps)
+
+
+def dense(problem: Problem, parameters: Parameters) -> Found:
+    """The gradient by a dense solve of the adjoint equation (I − ∂F/∂V)ᵀ λ = g."""
+    solved, sweeps = values(problem, parameters)
+    by_parameters, by_values = jax.grad(partial(chosen, problem), argnums=(0, 1))(parameters, solved)
+    jacobian = jax.jacobian(partial(one_backup, problem, parameters))(solved)
+    multipliers = jnp.linalg.solve((jnp.eye(len(solved)) - jacobian).T, by_values)
+    pull_back = jax.vjp(lambda x: one_backup(problem, x, solved), parameters)[1]
+    return by_parameters + pull_back(multipliers)[0], sweeps
+
+
+def by_optimistix(problem: Problem, parameters: Parameters) -> Found:
+    """The gradient by optimistix's fixed point with the adjoint that it has by default."""
+    optimistix = importlib.import_module("optimistix")
+    start = process_of(problem, parameters).end(jnp.zeros(problem.model.graph.states))
+    tolerance = problem.solver.tolerance_for(start.dtype)
+    solver = optimistix.FixedPointIteration(rtol=tolerance, atol=tolerance)
+
+    def objective(parameters: Parameters) -> tuple[Array, Array]:
+        found = optimistix.fixed_point(
+            lambda v, x: one_backup(problem, x, v), solver, start, args=parameters, max_steps=MOST_SWEEPS, throw=False
+        )
+        return chosen(problem, parameters, found.value), found.stats["num_steps"]
+
+    return jax.grad(objective, has_aux=True)(parameters)
+
+
+def forward(problem: Problem, parameters: Parameters) -> Found:
+    """The gradient by the paper's dynamic programme, and how many times it was iterated.
+
+    At the values V, iterates dV/dθ = ∂F/∂θ + Σ_a w(a) γ Σ_k P(·, a, k) dV/dθ(succ(·, a, k)), the weights w being
+    π(1 + β(Q − V)) (eq. 8) or π (eq. 9); dQ/dθ (eq. 7) is put in.
+    """
+    solved = values(problem, parameters)[0]
+    process, backup, beta = process_of(problem, parameters), problem.behavior.backup, problem.behavior.beta
+    q = process.action_values(solved)
+    weights = backup.weights(q, beta) if problem.gradient == "exact" else backup.fixed_policy_weights(q, beta)
+    weights = jnp.where(process.terminal[:, None], 0, weights)
+    flat, unravel = ravel_pytree(parameters)
+
+    def direct(direction: Array) -> Array:
+        """The change of one backup with θ, V held."""
+        change = jax.jvp(lambda x: process_of(problem, unravel(x)).action_values(solved), (flat,), (direction,))[1]
+        return jnp.sum(weights * change, axis=-1)
+
+    own = jax.lax.map(lambda index: direct(jnp.zeros_like(flat).at[index].set(1)), jnp.arange(len(flat))).T
+    leads = process.discount * weights[..., None] * process.probabilities
+    tolerance = problem.solver.tolerance_for(flat.dtype)
+
+    def unfinished(state: tuple[Array, Array, Array]) -> Array:
+        return (state[1] > tolerance) & (state[2] < MOST_SWEEPS)
+
+    def sweep(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        old, _, count = state
+        new = own
+        for action, outcome in np.ndindex(*leads.shape[1:]):
+            new = new + leads[:, action, outcome, None] * old[process.successors[:, action, outcome]]
+        return new, jnp.abs(new - old).max() / jnp.abs(new).max(), count + 1
+
+    slopes, _, count = jax.lax.while_loop(unfinished, sweep, (own, jnp.asarray(jnp.inf), jnp.asarray(1)))
+    by_parameters, by_values = jax.grad(lambda x, v: chosen(problem, unravel(x), v), argnums=(0, 1))(flat, solved)
+    return unravel(by_parameters + by_values @ slopes), count
+
+
+def plain_sweeps(problem: Problem, parameters: Parameters) -> Array:
+    """How many plain sweeps it takes until no value changes by more than the tolerance, relative to the largest."""
+    tolerance = problem.solver.tolerance_for(jnp.zeros(0).dtype)
+
+    def unfinished(state: tuple[Array, Array, Array]) -> Array:
+        return (state[1] > tolerance) & (state[2] < MOST_SWEEPS)
+
+    def sweep(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        old, _, count = state
+        new = one_backup(problem, parameters, old)
+        return new, jnp.abs(new - old).max() / jnp.abs(new).max(), count + 1
+
+    start = process_of(problem, parameters).end(jnp.zeros(problem.model.graph.states))
+    return jax.lax.while_loop(unfinished, sweep, (start, jnp.asarray(jnp.inf), jnp.asarray(0)))[2]
+
+
+GRADIENTS: Mapping[str, Callable[..., Found]] = {
+    "sidestep ordered": adjoint,
+    "sidestep jacobi": adjoint,
+    "values": values,
+    "plain values": plain_values,
+    "unrolled": unrolled,
+    "dense implicit": dense,
+    "optimistix": by_optimistix,
+    "forward": forward,
+}
+BY_SWEEPS = ("plain values", "unrolled")
+ONLY_VALUES = ("values", "plain values")
+
+
+def method_function(name: str, problem: Problem, sweeps: int) -> tuple[Callable[..., Found], Problem]:
+    """What a method computes, and the problem with its solver."""
+    function = GRADIENTS[name]
+    if name in BY_SWEEPS:
+        function = partial(function, sweeps=sweeps)
+    if name == "sidestep jacobi":
+        solver = SOLVERS["jacobi"](tolerance=problem.solver.tolerance)
+        problem = Problem(problem.model, problem.demonstrations, problem.behavior, solver, problem.gradient)
+    return function, problem
+
+
+# ---------------------------------------------------------------------------------------------------- measuring
+
+
+@dataclass
+class Method:
+    """A compiled way to compute something, and what it took; `call` is None if it is not to be run."""
+
+    name: str
+    call: Callable[[], Found] | None = None
+    warm: Callable[[], Any] | None = None
+    compile_seconds: float = 0.0
+    bytes: int = 0
+    sweeps: int = 0
+    difference: float | None = None
+    failed: str | None = None
+
+
+def compiled(name: str, problem: Problem, limit: float = np.inf, sweeps: int = 0) -> Method:
+    """A method on a problem, compiled; not to be run above `limit` bytes.
+
+    All arrays are inputs, so that nothing of them is computed while compiling.
+    """
+    function, problem = method_function(name, problem, sweeps)
+    arrays, static = eqx.partition(problem, eqx.is_array)
+    started = time.perf_counter()
+    whole = jax.jit(lambda arrays, parameters: function(eqx.combine(arrays, static), parameters))
+    made = whole.lower(arrays, problem.model.parameters).compile()
+    seconds = time.perf_counter() - started
+    memory = made.memory_analysis()
+    assert memory is not None
+    needed = memory.temp_size_in_bytes + memory.output_size_in_bytes
+    if needed > limit:
+        return Method(name, None, None, seconds, needed, failed=f"needs {needed / 2**30:.1f} GiB")
+    call = partial(lambda given: jax.block_until_ready(made(given, problem.model.parameters)), arrays)
+    return Method(name, call, None, seconds, needed, sweeps)
+
+
+def checked(method: Method, exact: Array) -> Method:
+    """Runs a method once, for its sweeps and how far its gradient is from the exact one."""
+    if method.call is not None:
+        found, sweeps = method.call()
+        method.sweeps = int(sweeps)
+        if method.name not in ONLY_VALUES:
+            method.difference = difference(found, exact)
+    return method
+
+
+def enough_sweeps(problem: Problem, exact: Array, accuracy: float, limit: float) -> tuple[Method, Method]:
+    """Plain values and their unrolled gradient, by as many sweeps as make it accurate."""
+    sweeps = int(eqx.filter_jit(plain_sweeps)(problem, problem.model.parameters))
+    while True:
+        method = checked(compiled("unrolled", problem, limit, sweeps), exact)
+        if method.difference is None or method.difference <= accuracy or sweeps >= MOST_SWEEPS:
+            break
+        sweeps = min(MOST_SWEEPS, int(1.3 * sweeps) + 1)
+    method.sweeps = sweeps
+    return checked(compiled("plain values", problem, limit, sweeps), exact), method
+
+
+def difference(found: Array, expected: Array) -> float | None:
+    """The largest difference, relative to the largest component; None for what is not finite."""
+    value = float(jnp.abs(found - expected).max() / jnp.abs(expected).max())
+    return value if np.isfinite(value) else None
+
+
+def methods_for(problem: Problem, arguments: argparse.Namespace) -> list[Method]:
+    """All methods for a problem, compiled, run once and compared; raises `NotConverged` if values are not found."""
+    limit = arguments.memory * 2**30
+    strict = Problem(
+        problem.model, problem.demonstrations, problem.behavior, Ordered(tolerance=EXACT), problem.gradient
+    )
+    by_adjoint = compiled("sidestep ordered", strict)
+    assert by_adjoint.call is not None
+    exact = by_adjoint.call()[0]
+    if not jnp.isfinite(exact).all():
+        raise NotConverged("the values or the adjoint did not converge: try a smaller β or another backup")
+    names = ["sidestep ordered", "sidestep jacobi", "values"]
+    found = [with_warm(checked(compiled(name, problem), exact), problem, arguments) for name in names]
+    found += enough_sweeps(problem, exact, arguments.accuracy, limit)
+    states, count = problem.model.graph.states, int(np.size(problem.model.parameters))
+    for name in ("dense implicit", "optimistix", "forward"):
+        # a Jacobian of plain backups, or an array of states × parameters
+        least = 8 * states * (count if name == "forward" else states)
+        if name == "optimistix" and importlib.util.find_spec("optimistix") is None:
+            found.append(Method(name, failed="not installed"))
+        elif name == "forward" and states * count > arguments.forward_limit:
+            found.append(Method(name, bytes=least, failed=f"{states * count:.0e} numbers a sweep"))
+        else:
+            found.append(checked(compiled(name, problem, limit), exact))
+    return found
+
+
+def with_warm(method: Method, problem: Problem, arguments: argparse.Namespace) -> Method:
+    """A method of this project with its warm start: after a step, from what the solve before left."""
+    if method.name in ONLY_VALUES:
+        return method
+    problem = method_function(method.name, problem, 0)[1]
+    first = take(problem, problem.model.parameters, problem.cold_start())
+    at = stepped(problem.model.parameters, first.gradient, arguments)
+    at, start = jax.block_until_ready((at, first.start))
+    if bool(take(problem, at, start).converged):
+        method.warm = lambda: jax.block_until_ready(take(problem, at, start))
+    return method
+
+
+def measure(world: World, saved: Path, model: str, backup: str, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """The records of one map in one parametrisation, a record a method."""
+    problem = problem_of(world, model, backup, arguments)
+    methods = methods_for(problem, arguments)
+    moves, goal = expected_costs(world.model), int(world.goals[0])
+    calls: dict[str, Callable[[], float]] = {
+        "dijkstra": lambda: measuring.seconds_of(lambda: dijkstra(moves, indices=goal))
+    }
+    for method in methods:
+        for name, call in ((method.name, method.call), (f"warm {method.name}", method.warm)):
+            if call is not None:
+                calls[name] = partial(measuring.seconds_of, call)
+    taken = measuring.in_turns(calls, arguments.turns, arguments.budget)
+    ours = taken["sidestep ordered"]
+    return [
+        {
+            "name": method.name,
+            "model": model,
+            "backup": backup,
+            "cells": world.size**2,
+            "parameters": int(np.size(problem.model.parameters)),
+            "tasks": 1,
+            "cold_seconds": measuring.median(own := taken.get(method.name)),
+            "warm_seconds": measuring.median(taken.get(f"warm {method.name}")),
+            "dijkstra_seconds": measuring.median(taken["dijkstra"]),
+            "best_seconds": min(own) if own else None,
+            "ratio": measuring.median([mine / our for mine, our in zip(own or [], ours, strict=False)]),
+            "difference": method.difference,
+            "sweeps": method.sweeps,
+            "compiled_bytes": method.bytes,
+            "compile_seconds": method.compile_seconds,
+            "turns": len(own or []),
+            **_memory(method, world.size, saved, model, backup, arguments),
+            "failed": method.failed,
+        }
+        for method in methods
+    ]
+
+
+def _memory(
+    method: Method, size: int, saved: Path, model: str, backup: str, arguments: argparse.Namespace
+) -> dict[str, Any]:
+    """The memory of a process of its own, for the first backup and the sizes that it is asked for."""
+    nothing: dict[str, Any] = dict.fromkeys(("peak_bytes", "imports_bytes", "excess_bytes", "call_bytes"))
+    if method.call is None or backup != arguments.backups[0] or size not in arguments.memory_sizes:
+        return nothing
+    told = {key: value for key, value in vars(arguments).items() if isinstance(value, (int, float, str))}
+    asked = {**told, "world": str(saved), "name": method.name, "model": model, "backup": backup}
+    return (
+        measuring.in_own_process(__file__, "--measure-memory", json.dumps({**asked, "sweeps": method.sweeps}))
+        or nothing
+    )
+
+
+def measure_memory(asked: str, imports: int) -> None:
+    """Takes one gradient in this process and prints what it needed."""
+    given = json.loads(asked)
+    problem = problem_of(load(Path(given["world"])), given["model"], given["backup"], argparse.Namespace(**given))
+    method = compiled(given["name"], problem, sweeps=given["sweeps"])
+    assert method.call is not None
+    before, peak = measuring.held_bytes(), measuring.peak_bytes()
+    known = measuring.reset_peak()
+    method.call()
+    calling = measuring.peak_bytes()
+    peak = max(peak, calling)
+    found = {"peak_bytes": peak, "imports_bytes": imports, "excess_bytes": peak - imports}
+    print(json.dumps({**found, "call_bytes": calling - before if known else None}))
+
+
+# ---------------------------------------------------------------------------------------------------- reporting
+
+
+def print_records(records: Sequence[Mapping[str, Any]], arguments: argparse.Namespace) -> None:
+    """The table, and which of the others are faster or disagree."""
+    columns = ("map", "θ", "backup", "method", "cold ms", "best ms", "ratio to ours", "warm ms")
+    columns += ("sweeps", "difference", "peak MiB", "call MiB")
+    rows = [
+        (
+            f"{round(record['cells'] ** 0.5)}²",
+            f"{record['parameters']} {record['model']}",
+            record["backup"],
+            record["name"],
+            record["failed"] or measuring.milliseconds(record["cold_seconds"]),
+            measuring.milliseconds(record["best_seconds"]),
+            measuring.number(record["ratio"], ".2f"),
+            measuring.milliseconds(record["warm_seconds"]),
+            str(record["sweeps"] or "–"),
+            measuring.number(record["difference"], ".0e"),
+            measuring.mebibytes(record["peak_bytes"]),
+            measuring.mebibytes(record["call_bytes"]),
+        )
+        for record in records
+    ]
+    reward = "goal pays 1" if arguments.goal_pays else f"step cost {arguments.step_cost:g}"
+    title = f"a gradient ({arguments.gradient}), β={arguments.beta:g}, γ={arguments.discount:g}, {reward}, "
+    measuring.print_table(title + f"tolerance {arguments.tolerance:g}", columns, rows, left=("backup", "method"))
+    others = [r for r in records if not r["name"].startswith("sidestep") and r["name"] not in ONLY_VALUES]
+    for record in others:
+        where = f"{round(record['cells'] ** 0.5)}², {record['backup']}, {record['model']}"
+        if record["ratio"] is not None and record["ratio"] < 1:
+            print(f"faster than ours: {record['name']} ({where}), {record['ratio']:.2f} of our time")
+        if record["ratio"] is not None and not (record["difference"] or np.inf) <= arguments.accuracy:
+            print(f"not as accurate: {record['name']} ({where}), {measuring.number(record['difference'], '.1e')}")
+    timed = [record for record in others if record["ratio"] is not None]
+    slower = sum(record["ratio"] >= 1 for record in timed)
+    print(f"{slower} of {len(timed)} other gradients were slower than ours on the same map")
+
+
+def _arguments() -> argparse.Namespace:
+    parser = measuring.argument_parser(
+        "The cost of a gradient, by many ways to it.", "24² only, the Boltzmann average, three turns, no memory"
+    )
+    add = parser.add_argument
+    add("--sizes", type=int, nargs="+", default=[16, 32, 64, 128], metavar="N", help="N × N cells (10 or more)")
+    add("--backups", nargs="+", choices=sorted(BACKUPS), default=["boltzmann", "logsumexp"])
+    add("--models", nargs="+", choices=("cells", "table"), default=["cells", "table"], help="what the parameters are")
+    add("--gradient", choices=("exact", "fixed_policy"), default="exact")
+    add("--beta", type=float, default=5.0, help="how sharply walkers choose")
+    add("--discount", type=float, default=0.99)
+    add("--step-cost", type=float, default=1.0, help="a cost for every move")
+    add("--goal-pays", action="store_true", help="no cost for moves; the goal pays 1")
+    add("--tolerance", type=float, default=1e-8, help="relative change at which iterations stop")
+    add("--accuracy", type=float, default=1e-6, help="how far the unrolled gradient may be from the exact one")
+    add("--step", type=float, default=0.1, help="the optimiser's step before a warm gradient, in logits")
+    add("--step-by-sign", action="store_true", help="the same step for every parameter, as Adam's first")
+    add("--turns", type=int, default=9, help="how often each method is timed")
+    add("--budget", type=float, default=4.0, help="seconds after which a method takes no more than three turns")
+    add("--memory", type=float, default=4.0, help="GiB above which a method is not run")
+    add("--forward-limit", type=int, default=2**21, help="largest states × parameters for the forward programme")
+    add("--memory-sizes", type=int, nargs="*", default=[64, 128], metavar="N", help="maps to measure the memory of")
+    add("--seed", type=int, default=0, help="draws maps, walks and parameters")
+    add("--measure-memory", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.quick:
+        arguments.sizes, arguments.models, arguments.backups = [24], ["cells"], ["boltzmann"]
+        arguments.turns, arguments.budget, arguments.memory_sizes = 3, 1.0, []
+    if arguments.turns < 1:
+        parser.error("--turns: expected a number above 0")
+    return arguments
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Measures, prints and writes what the arguments ask for."""
+    records = []
+    with tempfile.TemporaryDirectory() as folder:
+        saved = Path(folder) / "world.npz"
+        for size in arguments.sizes:
+            world = half_learned_office(size, arguments.seed)
+            world.save(saved)
+            for backup in arguments.backups:
+                for model in arguments.models:
+                    records += measure(world, saved, model, backup, arguments)
+                    measuring.write_records(arguments, records)
+                    measuring.note(f"{size}² {backup} {model} done")
+    print_records(records, arguments)
+
+
+if __name__ == "__main__":
+    imports_bytes = measuring.held_bytes()
+    options = _arguments()
+    if options.measure_memory:
+        jax.config.update("jax_enable_x64", True)
+        measure_memory(options.measure_memory, imports_bytes)
+    else:
+        sys.exit(measuring.main(run, options))

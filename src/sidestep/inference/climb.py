@@ -1,0 +1,190 @@
+"""The climb of a fit: from point to point up the objective, with solves as exact as the optimiser needs.
+
+On large maps the solves of the first points are loose. Where the optimiser has converged, or finds no step that gains
+anything, the same point is looked at again with exact solves and the climb goes on from there; it ends only on exact
+ones.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import PyTree
+
+from sidestep.errors import InputError, NotConverged
+from sidestep.inference.checkpoints import Saver
+from sidestep.inference.objective import Objective, Problem, Solved
+from sidestep.inference.optimisers import Optimiser
+from sidestep.tabular.likelihood import choices_of
+
+
+class Progress(NamedTuple):
+    """Where a fit stands after an iteration: the objective, its parts, and its largest gradient component."""
+
+    iteration: int
+    objective: float
+    actions: float
+    transitions: float
+    prior: float
+    gradient: float
+
+
+class Summit(NamedTuple):
+    """Where a climb ended: θ, the way there, how the last solves went, and why it ended."""
+
+    parameters: PyTree
+    history: list[Progress]
+    solved: list[Solved]
+    message: str
+
+
+class _Point(NamedTuple):
+    """What is known of the objective at one θ; arrays and numbers only, so that a checkpoint can hold it."""
+
+    x: np.ndarray
+    parts: np.ndarray
+    slope: np.ndarray
+
+
+class Climb:
+    """The way of an optimiser up an objective.
+
+    The last point is remembered, for line searches ask twice; its solves are where the next ones start.
+    """
+
+    def __init__(self, objective: Objective, optimiser: Optimiser, saver: Saver):
+        self.objective, self.optimiser, self.saver = objective, optimiser, saver
+        start, self.to_parameters = ravel_pytree(objective.problem.model.parameters)
+        self.start = np.asarray(start)
+        self.starts = objective.cold_starts()
+        self.last = _Point(np.full_like(self.start, np.nan), np.zeros(4), np.zeros_like(self.start))
+        self.solved: list[Solved] = []
+        self.tolerances = _tolerances(objective.problem)
+
+    def run(self, report: Callable[[Progress], None] | None, resume: bool) -> Summit:
+        """Climbs until converged or stopped; raises `NotConverged` where values stop converging on the way."""
+        x, state, history = self.start, self.optimiser.init(self.start), []
+        if resume:
+            x, state, history = self._resumed(x, state)
+        while True:
+            point = self._look(x)
+            objective, actions, transitions, prior = point.parts.tolist()
+            steepest = float(np.abs(point.slope).max())
+            progress = Progress(len(history), objective, actions, transitions, prior, steepest)
+            self._check(progress)
+            history.append(progress)
+            if report:
+                report(progress)
+            message = _reason_to_stop(progress, self.optimiser)
+            after = None if message else self.optimiser.step(self._loss, x, -progress.objective, point.slope, state)
+            if after is not None:
+                x, state = after
+                self._save(x, state, history)
+            elif len(self.tolerances) > 1:
+                history.pop()
+                self._be_more_exact()
+            else:
+                unsaid = f"stopped: no step gains anything; the largest gradient is {progress.gradient:.2g}"
+                return Summit(self.to_parameters(jnp.asarray(x)), history, self._solved_at(x), message or unsaid)
+
+    def _look(self, x: np.ndarray) -> _Point:
+        """The objective at x."""
+        if not np.array_equal(x, self.last.x):
+            parameters = self.to_parameters(jnp.asarray(x))
+            found, self.starts = self.objective.evaluate(parameters, self.starts, self.tolerances[0])
+            parts = np.array([found.objective, found.actions, found.transitions, found.prior])
+            self.last, self.solved = _Point(x, parts, np.asarray(ravel_pytree(found.slope)[0])), found.solved
+        return self.last
+
+    def _loss(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        """Minus the objective, and its slope."""
+        point = self._look(x)
+        # a solve that failed makes them NaN: worse than any other point, so that no search ends there
+        usable = np.isfinite(point.parts[0]) and np.isfinite(point.slope).all()
+        return -float(point.parts[0]) if usable else np.inf, point.slope
+
+    def _be_more_exact(self) -> None:
+        self.tolerances = self.tolerances[1:]
+        self._forget()
+
+    def _forget(self) -> None:
+        """Makes the next look at any point a new one."""
+        self.last = self.last._replace(x=np.full_like(self.start, np.nan))
+
+    def _solved_at(self, x: np.ndarray) -> list[Solved]:
+        """How the solves at x went; looked at once more if the last look was elsewhere or before an interruption."""
+        if not self.solved:
+            self._forget()
+        self._look(x)
+        return self.solved
+
+    def _save(self, x: np.ndarray, state: PyTree, history: list[Progress]) -> None:
+        self.saver.save(self._carried(x, state), history)
+
+    def _resumed(self, x: np.ndarray, state: PyTree) -> tuple[np.ndarray, PyTree, list[Progress]]:
+        carried, records = self.saver.load(self._carried(x, state))
+        x, state, self.last, self.starts, left = carried
+        self.tolerances = self.tolerances[len(self.tolerances) - int(left) :]
+        return x, state, [Progress(int(record[0]), *record[1:]) for record in records]
+
+    def _carried(self, x: np.ndarray, state: PyTree) -> PyTree:
+        """All that the rest of the climb depends on, as arrays."""
+        return x, state, self.last, self.starts, np.asarray(len(self.tolerances))
+
+    def _check(self, progress: Progress) -> None:
+        """Raises if what was found at a point cannot be used."""
+        if progress.iteration == 0:
+            _check_start(self.objective.problem, self.solved)
+        if not np.isfinite(progress).all():
+            raise NotConverged(
+                f"the values or their gradient stopped converging at iteration {progress.iteration}: a smaller β, "
+                "a lower learning rate or more sweeps may help"
+            )
+
+
+_LARGE, _LOOSE = 10_000, 1e-7
+"""From how many states on solves are loose at first, and how loose."""
+
+
+def _tolerances(problem: Problem) -> list[float | None]:
+    """The tolerances of the solves, one after the other; None for the solver's own."""
+    dtype = jax.eval_shape(problem.model.probabilities).dtype
+    if problem.solver.tolerance is not None or dtype != np.float64 or problem.model.graph.states < _LARGE:
+        return [None]
+    return [_LOOSE, float(problem.solver.tolerance_for(dtype))]
+
+
+def _reason_to_stop(now: Progress, optimiser: Optimiser) -> str:
+    if now.gradient <= optimiser.tolerance:
+        return f"converged: the largest gradient is {now.gradient:.2g}"
+    if now.iteration >= optimiser.iterations:
+        return f"stopped after {now.iteration} iterations; the largest gradient is {now.gradient:.2g}"
+    return ""
+
+
+def _check_start(problem: Problem, solved: list[Solved]) -> None:
+    """Values must exist at the start, and every walker must be able to arrive."""
+    if not solved:
+        return
+    converged, residual, stuck = (
+        np.concatenate([np.asarray(getattr(part, name)) for part in solved])
+        for name in ("converged", "residual", "stuck")
+    )
+    if not converged.all():
+        raise NotConverged(
+            f"values did not converge for task(s) {np.flatnonzero(~converged).tolist()} (residual up to "
+            f"{residual.max():.2g}): a smaller β, more sweeps or another backup may help"
+        )
+    if not stuck.any():
+        return
+    demos = problem.demonstrations
+    task, choice = np.argwhere(stuck)[0]
+    state = choices_of(demos).states[task, choice]
+    move = np.flatnonzero((np.asarray(demos.task) == task) & (np.asarray(demos.states) == state))[0]
+    raise InputError(
+        f"state {int(state)} is visited, but the goal cannot be reached from it",
+        source=f"trajectory {int(demos.trajectory[move]) + 1}",
+    )

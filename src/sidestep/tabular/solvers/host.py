@@ -1,0 +1,92 @@
+"""The bridge from JAX to the host: NumPy code called from compiled JAX code, the tasks of a batch side by side."""
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental.buffer_callback import buffer_callback
+
+
+def on_the_host(solve: Callable[..., None], given: tuple, shapes: Any) -> Any:
+    """What `solve` writes into NumPy arrays of the structure and shapes of `shapes`.
+
+    It is called with these arrays and then with what is `given`, as arrays that it must not write into; under `vmap`
+    once for every task, on all cores. Nothing is copied on the way. What it raises reaches the user only as an error of
+    JAX's, so it should raise nothing that users can do something about.
+    """
+    given_leaves, given_structure = jax.tree.flatten(given)
+    result_leaves, result_structure = jax.tree.flatten(shapes)
+    given_axes = [jnp.ndim(leaf) for leaf in given_leaves]
+    result_axes = [len(leaf.shape) for leaf in result_leaves]
+
+    def solve_all(_: Any, results: Sequence[Any], *given: Any) -> None:
+        into = [np.asarray(result) for result in results]
+        batch = into[0].shape[: into[0].ndim - result_axes[0]]
+        arrays = [_for_every_task(np.asarray(leaf), batch, own) for leaf, own in zip(given, given_axes, strict=True)]
+
+        def solve_one(task: tuple[int, ...]) -> None:
+            # the ellipsis keeps numbers arrays that can be written into
+            result = jax.tree.unflatten(result_structure, [array[*task, ...] for array in into])
+            solve(result, *jax.tree.unflatten(given_structure, [array[*task, ...] for array in arrays]))
+
+        _side_by_side(solve_one, list(np.ndindex(batch)))
+
+    found = buffer_callback(solve_all, result_leaves, vmap_method="expand_dims")(*given_leaves)
+    return jax.tree.unflatten(result_structure, found)
+
+
+def shapes_of(arrays: Any) -> Any:
+    """Arrays as their shapes."""
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(jnp.shape(leaf), leaf.dtype), arrays)
+
+
+def _for_every_task(array: np.ndarray, batch: tuple[int, ...], own: int) -> np.ndarray:
+    """A view with all of the batch's axes before the array's own, read-only: numba compiles once for each kind."""
+    return np.broadcast_to(array, batch + array.shape[array.ndim - own :])
+
+
+def _side_by_side(solve_one: Callable[[tuple[int, ...]], None], tasks: Sequence[tuple[int, ...]]) -> None:
+    """Solves all tasks, or raises what one of them raised; then none is still at work in memory that JAX takes back."""
+    if len(tasks) == 1:
+        solve_one(tasks[0])
+        return
+    stop = threading.Event()
+
+    def work(task: tuple[int, ...]) -> None:
+        _here.stop = stop
+        solve_one(task)
+
+    running = [_threads().submit(work, task) for task in tasks]
+    try:
+        for each in running:
+            each.result()
+    except BaseException:
+        stop.set()
+        for each in running:
+            each.cancel()
+        wait(running)
+        raise
+
+
+_here = threading.local()
+"""What the tasks of a batch have in common, as each of their threads sees it."""
+
+
+def heed_interrupts() -> None:
+    """Raises `KeyboardInterrupt` if another task of the same batch has failed or been interrupted; call it often."""
+    stop = getattr(_here, "stop", None)
+    if stop is not None and stop.is_set():
+        raise KeyboardInterrupt
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    """One thread a core; machine code does not hold Python's lock."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return ThreadPoolExecutor(cores, thread_name_prefix="sidestep-sweeps")

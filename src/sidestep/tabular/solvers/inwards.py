@@ -1,0 +1,100 @@
+"""The adjoint, from the farthest state back to where a task ends, and the gradient by it. On the host.
+
+`passing` holds a single sweep. Residuals are passed on from a thousandth of their sum down, the threshold falling
+tenfold from sweep to sweep, until all that is left is less than the tolerance's share of the sum.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sidestep.tabular.solvers.given import Found, Outcome, given_from, positions, sizes, write
+from sidestep.tabular.solvers.host import heed_interrupts
+from sidestep.tabular.solvers.passing import HostGradients, Passing, Setting, Shares, passing_for
+from sidestep.tabular.solvers.process import lowest
+from sidestep.tabular.solvers.sweeping import Valuing
+
+_COARSEST = 1e-3
+"""The first threshold, as a share of the sum of what is to be passed on; so that small residuals add up first."""
+_FINER = 0.1
+"""By how much the threshold shrinks from sweep to sweep."""
+
+
+def pull_back(
+    kind: int,
+    tie: float,
+    exact: bool,
+    max_sweeps: int,
+    into: tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]],
+    process: tuple[np.ndarray, ...],
+    beta: Float[np.ndarray, ""],
+    values: Float[np.ndarray, " states"],
+    cotangent: Float[np.ndarray, " states"],
+    start: Float[np.ndarray, " states"],
+    order: Int[np.ndarray, " states"],
+    tolerance: Float[np.ndarray, ""],
+) -> None:
+    """Writes the gradient `into` the arrays of `HostGradients`, and the adjoint into those of `Found`.
+
+    `kind` and `tie` as in `Valuing`, `process` as in `given_from`; `values` are the solution, `cotangent` is the
+    gradient by them, `start` an adjoint to start from.
+    """
+    number = values.dtype.type
+    by, found = HostGradients(*into[0]), Found(*into[1])
+    for gradient in by:
+        gradient[...] = 0
+    position = positions(order)
+    total = np.abs(cotangent).sum()
+    if position is None or total == 0 or not np.isfinite(total):
+        # nothing to solve, or nothing that it could be solved for
+        found.values[:] = 0
+        write(found, order, Outcome(0, 0.0 if total == 0 else np.nan, bool(total == 0)))
+        return
+    given, valuing = given_from(process), Valuing(kind, number(beta), number(tie))
+    reached = number(-((-lowest(values.dtype)) ** 0.5))
+    setting = Setting(given, valuing, exact, values, reached, order, position)
+    actions, outcomes, width = sizes(given)
+    known = np.where(np.isfinite(start), start, number(0))
+    shares = _no_shares(width, setting, known[order], cotangent[order])
+    run = passing_for(actions, outcomes, width)
+    outcome = _pass_on_until_gone(run, setting, shares, number(total), number(tolerance), max_sweeps)
+    run.pull_back(setting, shares, found.values, by)
+    write(found, order, outcome)
+
+
+def _no_shares(width: int, setting: Setting, adjoint: np.ndarray, residual: np.ndarray) -> Shares:
+    """Nothing filled in; what is not needed takes no memory until it is."""
+    states, actions, _ = setting.given.successors.shape
+    dtype = setting.values.dtype
+    return Shares(
+        known=np.zeros(states, bool),
+        weights=np.empty((states, actions), dtype),
+        beta=np.empty(states, dtype),
+        successors=np.empty((states, actions, width), np.int32),
+        shares=np.empty((states, actions, width), dtype),
+        leaving=np.empty(states, dtype),
+        divisor=np.empty(states, dtype),
+        adjoint=adjoint,
+        residual=residual,
+    )
+
+
+def _pass_on_until_gone(
+    run: Passing, setting: Setting, shares: Shares, total: np.floating, tolerance: np.floating, max_sweeps: int
+) -> Outcome:
+    """Sweeps until the residuals' sum is no more than the share `tolerance` of `total`."""
+    states = len(shares.residual)
+    finest = tolerance * total / states
+    threshold = max(finest, _COARSEST * total)
+    if shares.adjoint.any():
+        run.pass_on(finest, True, setting, shares)
+    passed_on, left = 0, np.inf
+    for _ in range(max_sweeps):
+        heed_interrupts()
+        at_work, left_alone = run.pass_on(threshold, False, setting, shares)
+        passed_on += at_work
+        if at_work == 0:
+            left = float(left_alone / total)
+        if left <= tolerance or np.isnan(left_alone):
+            break
+        threshold = max(finest, _FINER * threshold)
+    return Outcome(-(-passed_on // states), left, bool(left <= tolerance))

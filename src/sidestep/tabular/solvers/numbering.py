@@ -1,0 +1,124 @@
+"""A task with its states numbered in an order, as the sweeps read it, as machine code (numba).
+
+With the states in the order in which they are swept, those that a sweep needs lie close together in memory.
+"""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+from sidestep.tabular.solvers.compiled import compiled
+from sidestep.tabular.solvers.given import Given
+
+
+class Numbered(NamedTuple):
+    """A task under a model with its states numbered in an order; self-loops left out.
+
+    - `successors`: where the outcomes that leave a state lead; padded with the state itself.
+    - `moves`: γP of these outcomes, 0 for the padding.
+    - `patience`: 1/(1 − γp), p the probability of staying: for how long an action is tried; 0 where that is for ever.
+    - `reward`: R(s, a), with one row if it is the same in all states.
+    - `fixed`: the terminal states.
+    - `ending`: 1 − γ.
+    """
+
+    successors: np.ndarray
+    moves: np.ndarray
+    patience: np.ndarray
+    reward: np.ndarray
+    fixed: np.ndarray
+    ending: np.floating
+
+
+class Numbering(NamedTuple):
+    """The machine code for one number of actions, of outcomes, and of outcomes that leave a state: `width`."""
+
+    width: int
+    number_states: Any
+    first_values: Any
+    out_of_order: Any
+
+
+def numbered(
+    run: Numbering, given: Given, order: Int[np.ndarray, " states"], position: Int[np.ndarray, " states"]
+) -> Numbered:
+    """The task with its states numbered in an order; `position` is where each state stands in it."""
+    states, actions, _ = given.successors.shape
+    dtype = given.probabilities.dtype
+    reward = np.broadcast_to(given.reward, (len(given.reward), actions))
+    world = Numbered(
+        successors=np.empty((states, actions, run.width), np.int32),
+        moves=np.empty((states, actions, run.width), dtype),
+        patience=np.empty((states, actions), dtype),
+        reward=np.ascontiguousarray(reward[order] if len(reward) > 1 else reward),
+        fixed=np.empty(states, bool),
+        ending=1 - given.discount,
+    )
+    run.number_states(order, position, given.successors, given.probabilities, given.terminal, given.discount, world)
+    return world
+
+
+@cache
+def numbering_for(actions: int, outcomes: int, width: int) -> Numbering:
+    """The machine code for that many; as constants they make it twice as fast."""
+
+    @compiled()
+    def number_states(order, position, successors, probabilities, terminal, discount, world):  # pragma: no cover
+        """Fills in `world` with the states taken in `order`."""
+        for i in range(len(order)):
+            state = order[i]
+            world.fixed[i] = terminal[state]
+            for a in range(actions):
+                leaving = world.ending
+                m = 0
+                for k in range(outcomes):
+                    after = successors[state, a, k]
+                    if after != state:
+                        move = discount * probabilities[state, a, k]
+                        world.successors[i, a, m] = position[after]
+                        world.moves[i, a, m] = move
+                        leaving += move
+                        m += 1
+                for padding in range(m, width):
+                    world.successors[i, a, padding] = i
+                    world.moves[i, a, padding] = 0
+                world.patience[i, a] = 1 / leaving if leaving > 0 else 0.0
+
+    @compiled()
+    def first_values(world, values, bottom, bound):  # pragma: no cover
+        """Fills in values that are not known (`bottom`): of the best action tried until it leads nearer, by order."""
+        for i in range(len(values)):
+            if world.fixed[i] or values[i] > bottom:
+                continue
+            best = bound
+            for a in range(actions):
+                worth = world.reward[i if len(world.reward) > 1 else 0, a]
+                leaving = world.ending
+                for m in range(width):
+                    j = world.successors[i, a, m]
+                    if j < i and values[j] > bottom:
+                        worth += world.moves[i, a, m] * values[j]
+                        leaving += world.moves[i, a, m]
+                if leaving > world.ending:
+                    best = max(best, worth / leaving)
+            values[i] = best
+
+    @compiled()
+    def out_of_order(world, values, bottom):  # pragma: no cover
+        """How many states want to go to a farther one, by values that are known."""
+        count = 0
+        for i in range(len(values)):
+            best, leads_to = bottom, i
+            for a in range(actions):
+                for m in range(width):
+                    j = world.successors[i, a, m]
+                    move = world.moves[i, a, m]
+                    worth = values[j] + world.reward[i if len(world.reward) > 1 else 0, a] / move
+                    if move > 0 and worth > best:
+                        best, leads_to = worth, j
+            count += leads_to > i and not world.fixed[i]
+        return count
+
+    return Numbering(width, number_states, first_values, out_of_order)

@@ -1,0 +1,110 @@
+"""Values, from where a task ends outwards, on the host: what to start from, and in which order.
+
+An earlier solve's values are taken on trust for 100 sweeps; if they have not converged by then, the solve starts from
+nothing. Its order is kept as long as few states want to go to a farther one.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sidestep.tabular.solvers.given import Found, Given, Outcome, given_from, positions, sizes, write
+from sidestep.tabular.solvers.numbering import Numbered, Numbering, numbered, numbering_for
+from sidestep.tabular.solvers.order import order_by_distance
+from sidestep.tabular.solvers.process import lowest
+from sidestep.tabular.solvers.rounds import Rounds
+from sidestep.tabular.solvers.sweeping import Valuing
+
+_OUT_OF_ORDER = 0.05
+"""The share of states that may want to go to a farther one, before states are put in order anew."""
+_TRUST = 100
+"""How many sweeps a solve may take that starts from an earlier one's values."""
+
+
+class _Asked(NamedTuple):
+    """What is to be solved, and how well; `bound` is no more than any value."""
+
+    given: Given
+    valuing: Valuing
+    bound: np.floating
+    tolerance: np.floating
+
+
+def find_values(
+    kind: int,
+    tie: float,
+    max_sweeps: int,
+    into: tuple[np.ndarray, ...],
+    process: tuple[np.ndarray, ...],
+    bound: Float[np.ndarray, ""],
+    beta: Float[np.ndarray, ""],
+    start: Float[np.ndarray, " states"],
+    order: Int[np.ndarray, " states"],
+    tolerance: Float[np.ndarray, ""],
+) -> None:
+    """Writes values and how they were found `into` the arrays of `Found`.
+
+    `kind` and `tie` as in `Valuing`, `process` as in `given_from`, `bound` as in `_Asked`, `start` and `order` as in
+    `Start`.
+    """
+    number = start.dtype.type
+    valuing = Valuing(kind, number(beta), number(tie))
+    asked = _Asked(given_from(process), valuing, number(bound), number(tolerance))
+    found = Found(*into)
+    if _anything_missing(asked):
+        found.values[:] = np.nan
+        write(found, order, Outcome(0, np.nan, False))
+        return
+    nothing = number(lowest(start.dtype))
+    outcome = Outcome(0, np.inf, False)
+    if (start > nothing).any():
+        outcome = _start_from(start, order, asked, min(_TRUST, max_sweeps), found)
+    if not outcome.converged and outcome.sweeps < max_sweeps:
+        cold = np.full_like(start, nothing), np.full_like(order, -1)
+        again = _start_from(*cold, asked, max_sweeps - outcome.sweeps, found)
+        outcome = again._replace(sweeps=outcome.sweeps + again.sweeps)
+    write(found, found.order, outcome)
+
+
+def _anything_missing(asked: _Asked) -> bool:
+    """Whether anything is not a number."""
+    given = asked.given
+    parts = (given.probabilities, given.reward, given.final_reward, given.discount, asked.valuing.beta, asked.tolerance)
+    return any(np.isnan(np.min(part)) for part in parts)
+
+
+def _start_from(
+    start: Float[np.ndarray, " states"], order: Int[np.ndarray, " states"], asked: _Asked, max_sweeps: int, found: Found
+) -> Outcome:
+    """Solves from values and an order that may serve; writes down the values and the order that did."""
+    given, bottom = asked.given, start.dtype.type(lowest(start.dtype))
+    run = numbering_for(*sizes(given))
+    order, world = _in_order(run, given, start, order, bottom)
+    values = np.where(world.fixed, np.broadcast_to(given.final_reward, start.shape)[order], start[order])
+    run.first_values(world, values, bottom, asked.bound)
+    outcome = Rounds(world, values, asked.valuing, asked.tolerance, max_sweeps).until_still()
+    found.values[order] = values
+    found.order[:] = order
+    return outcome
+
+
+def _in_order(
+    run: Numbering,
+    given: Given,
+    start: Float[np.ndarray, " states"],
+    order: Int[np.ndarray, " states"],
+    bottom: np.floating,
+) -> tuple[Int[np.ndarray, " states"], Numbered]:
+    """The order, the one given if it still serves; and the task with its states numbered by it."""
+    position = positions(order)
+    if position is not None:
+        world = numbered(run, given, order, position)
+        if run.out_of_order(world, start[order], bottom) <= _OUT_OF_ORDER * len(order):
+            return order, world
+    order = order_by_distance(
+        given.successors, given.probabilities, given.reward, given.terminal, float(given.discount)
+    )
+    position = positions(order)
+    assert position is not None
+    return order, numbered(run, given, order, position)

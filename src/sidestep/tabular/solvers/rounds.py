@@ -1,0 +1,140 @@
+"""Rounds of sweeps until values are still: which states are swept when, and when to stop. On the host.
+
+`sweeping` holds a single sweep. A round goes over all states once:
+
+1. Where values lie below the best action's (Boltzmann average, mellowmax), up to 8 rounds sweep all states at once,
+   with everything farther shifted. A round whose changes have grown is taken back, and ends this.
+2. Then rounds go stretch by stretch, some 32 √states states each: a stretch is swept until it is still, at most 30
+   times, before the next one, with only the states beyond the stretch shifted. Its states stay in the processor's
+   cache, and those behind it have settled when it begins.
+3. When no stretch begins with a change beyond the tolerance, a sweep over all states, without exception or shift,
+   decides whether the values have converged.
+
+For the hard max and the log-sum-exp there is no 1., because a shift may send values too high. An average falls at once
+when an action gets worse; but two neighbours whose best action each leads to the other, both too high, come down only
+by what a step costs from sweep to sweep: they "count to infinity".
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from sidestep.tabular.solvers.given import Outcome
+from sidestep.tabular.solvers.host import heed_interrupts
+from sidestep.tabular.solvers.numbering import Numbered
+from sidestep.tabular.solvers.process import lowest
+from sidestep.tabular.solvers.sweeping import BOLTZMANN, MELLOWMAX, Marks, Valuing, sweep_for
+
+_AT_ONCE = 8
+"""How many rounds sweep all states at once, at most."""
+_GROWING = 2.0
+"""By how much changes may grow from one of these rounds to the next."""
+_FEW = 0.01
+"""The share of states still at work below which rounds go stretch by stretch."""
+_STRETCH, _SMALLEST_STRETCH = 32, 256
+"""How many states a stretch has: this many times the root of their number, but no fewer than that."""
+_AGAIN = 30
+"""How often a stretch is swept in a round, at most."""
+_STILL = 0.25
+"""The share of the tolerance that counts as no change, so that what is left alone does not add up beyond it."""
+
+
+class Rounds:
+    """Values on their way to the fixed point, states by position; and how much has been done so far.
+
+    - `values`: are changed where they are.
+    - `number`: of the last sweep over any states; `first`: of the first one of the present round.
+    - `rounds`: how many have been begun; `solved`: how many states have been solved, in all sweeps together.
+    """
+
+    def __init__(
+        self,
+        world: Numbered,
+        values: Float[np.ndarray, " states"],
+        valuing: Valuing,
+        tolerance: np.floating,
+        max_sweeps: int,
+    ):
+        states = len(values)
+        self.world, self.values, self.valuing, self.tolerance = world, values, valuing, tolerance
+        self.max_sweeps = max_sweeps
+        self.marks = Marks(values.copy(), np.zeros(states, np.int32), np.zeros(states, np.int32))
+        self.everywhere = np.arange(states, dtype=np.int32)
+        size = max(_SMALLEST_STRETCH, int(_STRETCH * states**0.5))
+        self.stretches = np.split(self.everywhere, range(size, states, size))
+        self.number = self.first = self.rounds = self.solved = 0
+
+    def until_still(self) -> Outcome:
+        """Sweeps until a sweep over all states changes none by more than the tolerance, or too much has been done."""
+        residual = self._all_at_once() if self.valuing.kind in (BOLTZMANN, MELLOWMAX) else np.inf
+        converged = False
+        while not (converged or self._given_up() or np.isnan(residual)):
+            residual = self._stretch_by_stretch() if residual > self.tolerance else residual
+            if residual <= self.tolerance and not self._given_up():
+                self._begin_round()
+                residual, _ = self._sweep(self.everywhere, shifted=len(self.values), everyone=True)
+                converged = bool(residual <= self.tolerance)
+        return Outcome(-(-self.solved // len(self.values)), float(residual), converged)
+
+    def _all_at_once(self) -> float:
+        """Step 1; the largest change in the last round, infinite if that was taken back."""
+        last = np.inf
+        for _ in range(_AT_ONCE):
+            if self._given_up():
+                break
+            self._begin_round()
+            residual, at_work = self._sweep(self.everywhere, shifted=0)
+            if not residual <= _GROWING * last:
+                self.values[:] = self.marks.before
+                return np.inf
+            last = residual
+            if residual <= self.tolerance or at_work <= _FEW * len(self.values):
+                break
+        return last
+
+    def _stretch_by_stretch(self) -> float:
+        """A round of step 2; the largest change in the first sweeps over the stretches."""
+        self._begin_round()
+        residuals = [self._sweep_stretch(stretch) for stretch in self.stretches]
+        return float(np.max(residuals))
+
+    def _sweep_stretch(self, stretch: np.ndarray) -> float:
+        """Sweeps a stretch until it is still; the largest change in the first sweep."""
+        residual = np.inf
+        for again in range(_AGAIN):
+            if self._given_up():
+                break
+            change, _ = self._sweep(stretch, shifted=int(stretch[-1]) + 1)
+            residual = change if again == 0 else residual
+            if not change > self.tolerance:
+                break
+        return residual
+
+    def _begin_round(self) -> None:
+        self.marks.before[:] = self.values
+        self.first = self.number + 1
+        self.rounds += 1
+
+    def _sweep(self, which: np.ndarray, shifted: int, everyone: bool = False) -> tuple[float, int]:
+        """One sweep; the largest change, and how many states were solved."""
+        heed_interrupts()
+        self.number += 1
+        bottom = self.values.dtype.type(lowest(self.values.dtype))
+        change, solved = sweep_for(*self.world.moves.shape[1:])(
+            which,
+            self.valuing,
+            self.world,
+            self.values,
+            self.marks,
+            self.number,
+            self.first,
+            shifted,
+            everyone,
+            _STILL * self.tolerance,
+            bottom,
+        )
+        self.solved += solved
+        return change, solved
+
+    def _given_up(self) -> bool:
+        # rounds count too: a few states that never settle should not keep all others waiting
+        return self.solved >= self.max_sweeps * len(self.values) or self.rounds >= self.max_sweeps

@@ -1,0 +1,316 @@
+"""Ordered sweeps: orders, starts, batches, limits, and the machine code beside the formulas that it repeats."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numba
+import numpy as np
+import pytest
+from problems import BACKUPS, generic_task, obstacle_problem, random_problem, relative_error
+
+from sidestep.errors import InputError
+from sidestep.tabular.backups import Behavior, BoltzmannAverage
+from sidestep.tabular.grid import Grid
+from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.solve import solve
+from sidestep.tabular.solvers.choice import solver_for
+from sidestep.tabular.solvers.compiled import compiled
+from sidestep.tabular.solvers.jacobi import Jacobi
+from sidestep.tabular.solvers.order import order_by_distance
+from sidestep.tabular.solvers.ordered import KERNELS, Ordered
+from sidestep.tabular.solvers.passing import weigh
+from sidestep.tabular.solvers.process import lowest
+from sidestep.tabular.solvers.sweeping import Valuing, backed_up
+from sidestep.tasks import reach, stack_tasks
+
+each_backup = pytest.mark.parametrize("name", BACKUPS)
+SOLVER = Ordered(tolerance=1e-11)
+
+
+@eqx.filter_jit
+def values_and_slopes(model, wanted, people, start=None, solver=SOLVER):
+    """A solution, and the gradients of a sum over its values by the parameters and by the adjoint to start from."""
+    if start is None:
+        start = solver.cold_start(model.graph.states, model.probabilities().dtype)
+
+    def total(parameters, adjoint):
+        begin = start._replace(adjoint=adjoint)
+        found = solve(model.with_parameters(parameters), wanted, people, solver=solver, start=begin)
+        weights = jnp.cos(jnp.arange(found.values.size)).astype(found.values.dtype)
+        return jnp.sum(weights * found.values), found
+
+    slopes, found = jax.grad(total, (0, 1), has_aux=True)(model.parameters, start.adjoint)
+    return found, *slopes
+
+
+def people(name, beta=5.0):
+    return Behavior(BACKUPS[name], beta)
+
+
+def some_map(rows=20, columns=21, seed=0):
+    """A map of mostly free cells; 420 states."""
+    grid = Grid.unknown(rows, columns)
+    return ObstacleGrid(grid, jnp.asarray(np.random.default_rng(seed).normal(-1.5, 1.5, grid.size)))
+
+
+# Orders
+
+
+def order_of(model, wanted):
+    arrays = (model.graph.successors, model.probabilities(), wanted.reward, wanted.terminal)
+    return order_by_distance(*(np.asarray(array) for array in arrays), float(wanted.discount))
+
+
+def test_order_of_a_corridor_with_a_slow_cell():
+    """From cell 2 of 6: cell 3 takes 10 tries to enter, and what lies behind it is farther than all else."""
+    blocked = np.array([0.0, 0.0, 0.0, 0.9, 0.0, 0.0]) + 1e-9
+    model = ObstacleGrid(Grid.unknown(1, 6), jnp.log(blocked) - jnp.log1p(-blocked))
+    wanted = reach(Grid.unknown(1, 6), 2, discount=1.0, step_cost=1.0)
+    # distances from the goal, by the cells entered on the way to it: 2, 1, 0, 1, 11, 12
+    assert order_of(model, wanted)[:3].tolist() == [2, 1, 3] or order_of(model, wanted)[:3].tolist() == [2, 3, 1]
+    assert order_of(model, wanted)[3:].tolist() == [0, 4, 5]
+
+
+def test_discount_makes_slow_cells_far():
+    """A goal that pays, and no step cost: what counts is how much the tries discount."""
+    model = ObstacleGrid(Grid.unknown(1, 5), jnp.asarray([0.0, 5.0, 0.0, -5.0, -5.0]))
+    order = order_of(model, reach(Grid.unknown(1, 5), 2, discount=0.9)).tolist()
+    assert order[0] == 2
+    assert order.index(4) < order.index(0)
+
+
+def test_states_out_of_reach_come_last():
+    world = Grid(np.array([[-1, -1, 100, -1, -1]]))
+    model = ObstacleGrid(world, 0.0)
+    assert order_of(model, reach(world, 4, discount=1.0, step_cost=1.0)).tolist()[:2] == [4, 3]
+
+
+def test_no_end_no_order():
+    problem = random_problem()
+    wanted = eqx.tree_at(lambda task: task.terminal, generic_task(problem, 0.9), jnp.zeros(7, dtype=bool))
+    assert order_of(problem.model, wanted).tolist() == list(range(7))
+
+
+# Machine code
+
+
+@numba.njit
+def back_up_all(valuing, q, leaving):
+    values, divisors = np.empty(len(q), q.dtype), np.empty(len(q), q.dtype)
+    for i in range(len(q)):
+        values[i], divisors[i] = backed_up(valuing, q[i], leaving[i])
+    return values, divisors
+
+
+@numba.njit
+def weigh_all(valuing, exact, q):
+    weights, policy, by_beta = np.empty_like(q), np.empty_like(q), np.empty(len(q), q.dtype)
+    for i in range(len(q)):
+        by_beta[i] = weigh(valuing, exact, q[i], weights[i], policy[i])
+    return weights, policy, by_beta
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@each_backup
+def test_machine_code_repeats_the_backups(name, dtype):
+    """Value, weights, policy and derivative by β; random, tied, and widely spread action values."""
+    rng = np.random.default_rng(0)
+    q = np.concatenate([rng.normal(size=(20, 4)), rng.normal(-500, 0.1, (20, 4)), rng.choice([-1.0, -2.0], (20, 4))])
+    q = np.concatenate([q, np.where(rng.random((20, 4)) < 0.5, -1e6, rng.normal(size=(20, 4)))]).astype(dtype)
+    leaving = rng.uniform(0.01, 1, q.shape).astype(dtype)
+    backup, beta = BACKUPS[name], dtype(3.0)
+    tie = max(getattr(backup, "tie", 0.0), 64 * float(np.finfo(dtype).eps))
+    valuing = Valuing(KERNELS[type(backup)], beta, dtype(tie))
+    close = {"rtol": 1e-12, "atol": 1e-12} if dtype == np.float64 else {"rtol": 1e-4, "atol": 3e-4}
+
+    value, by_beta = (np.asarray(each) for each in value_and_derivative(backup, jnp.asarray(q), jnp.asarray(beta)))
+    exact, policy = (np.asarray(f(jnp.asarray(q), beta)) for f in (backup.weights, backup.fixed_policy_weights))
+    values, divisors = back_up_all(valuing, q, leaving)
+    np.testing.assert_allclose(values, value, **close)
+    divisor = np.maximum((exact * leaving).sum(axis=1), (policy * leaving).sum(axis=1))
+    np.testing.assert_allclose(divisors, divisor, **close)
+    for which, weights, derivative in ((True, exact, by_beta), (False, policy, 0 * by_beta)):
+        found = weigh_all(valuing, which, q)
+        np.testing.assert_allclose(found[0], weights, **close)
+        np.testing.assert_allclose(found[1], policy, **close)
+        np.testing.assert_allclose(found[2], derivative, **close)
+    assert {each.dtype for each in (values, divisors, *found)} == {np.dtype(dtype)}
+
+
+def value_and_derivative(backup, q, beta):
+    values = partial(backup.value, q)
+    return values(beta), jax.jacfwd(values)(beta)
+
+
+def test_machine_code_where_nothing_can_be_written(monkeypatch):
+    """numba finds no folder to keep its code in; the code is compiled all the same."""
+    monkeypatch.setattr(numba.config, "CACHE_LOCATOR_CLASSES", "ZipCacheLocator")
+    with pytest.raises(RuntimeError, match="locator"):
+        numba.njit(cache=True)(lambda x: x + 1)
+    assert compiled()(lambda x: x + 1)(1) == 2
+
+
+# Starts
+
+
+@each_backup
+def test_any_start_gives_the_same(name):
+    """From a model nearby, from a wrong order, from values of no meaning, from what failed: as from nothing."""
+    model, rng = some_map(), np.random.default_rng(1)
+    wanted = reach(model.grid, 5, discount=1.0, step_cost=1.0)
+    cold, slope, adjoint = values_and_slopes(model, wanted, people(name))
+    moved = model.with_parameters(model.parameters + 0.1 * rng.normal(size=model.parameters.shape))
+    near, _, near_adjoint = values_and_slopes(moved, wanted, people(name))
+    left = near.start._replace(adjoint=near_adjoint)
+    noise = jnp.asarray(rng.normal(-10, 10, 420))
+    starts = {
+        "nearby": left,
+        "reversed": left._replace(order=left.order[::-1]),
+        "no order": left._replace(order=jnp.zeros_like(left.order)),
+        "too high": left._replace(values=jnp.full(420, 1e4), adjoint=noise),
+        "unordered noise": left._replace(values=noise, adjoint=noise, order=left.order * 7),
+        "failed": left._replace(values=jnp.full(420, jnp.nan), adjoint=jnp.full(420, jnp.nan)),
+        "the solution": cold.start._replace(adjoint=adjoint),
+    }
+    for label, start in starts.items():
+        found, its_slope, its_adjoint = values_and_slopes(model, wanted, people(name), start)
+        assert found.converged, label
+        assert relative_error(found.values, cold.values) < 1e-8, label
+        assert relative_error(its_slope, slope) < 1e-7, label
+        assert relative_error(its_adjoint, adjoint) < 1e-7, label
+        assert sorted(found.start.order.tolist()) == list(range(420)), label
+    assert found.sweeps <= 2
+
+
+@each_backup
+@pytest.mark.parametrize("warm", [False, True])
+def test_the_adjoint_solves_its_equation(name, warm):
+    """λ = g + Wᵀλ, with W dense and its weights by differentiating the backup."""
+    problem = obstacle_problem(4)
+    wanted = generic_task(problem, 0.95)
+    start = None
+    if warm:
+        start = SOLVER.cold_start(12, jnp.dtype(jnp.float64))._replace(adjoint=jnp.linspace(-1.0, 1.0, 12))
+    found, _, adjoint = values_and_slopes(problem.model, wanted, people(name), start)
+    weights = np.asarray(jax.vmap(jax.grad(BACKUPS[name].value), (0, None))(found.action_values, 5.0))
+    transitions = np.asarray(problem.dense(problem.model.parameters))
+    matrix = 0.95 * np.einsum("sa,sat->st", weights, transitions) * ~np.asarray(wanted.terminal)[:, None]
+    expected = np.linalg.solve(np.eye(12) - matrix.T, np.cos(np.arange(12)))
+    np.testing.assert_allclose(adjoint, expected, rtol=1e-8, atol=1e-8)
+
+
+def test_a_start_that_another_solver_left():
+    """Jacobi leaves no order."""
+    model = some_map(4, 5)
+    wanted, behavior = reach(model.grid, 5), people("Boltzmann")
+    start = solve(model, wanted, behavior, solver=Jacobi()).start
+    found = solve(model, wanted, behavior, solver=SOLVER, start=start)
+    assert found.converged
+    assert found.start.order.tolist()[0] == 5
+
+
+# Batches
+
+
+def test_nested_batches_and_loops():
+    """Over β and over tasks at once, in a scan, in a map: each as by itself."""
+    model = some_map(4, 5)
+    tasks = stack_tasks([reach(model.grid, goal, discount=0.9) for goal in (0, 7, 19)])
+    betas = jnp.asarray([1.0, 10.0])
+
+    def of(parameters, beta, wanted):
+        def total(parameters, beta):
+            behavior = Behavior(BoltzmannAverage(), beta)
+            return jnp.sum(jnp.sin(solve(model.with_parameters(parameters), wanted, behavior, solver=SOLVER).values))
+
+        return jax.value_and_grad(total, (0, 1))(parameters, beta)
+
+    one = jax.jit(of)
+    single = [
+        [one(model.parameters, beta, jax.tree.map(lambda x, i=i: x[i], tasks)) for i in range(3)] for beta in betas
+    ]
+    expected = [
+        np.array([[np.asarray(leaf[k]) for leaf in map(jax.tree.leaves, row)] for row in single]) for k in range(3)
+    ]
+    over_tasks = jax.vmap(of, (None, None, 0))
+    ways = {
+        "nested": jax.vmap(over_tasks, (None, 0, None)),
+        "map": lambda parameters, betas, tasks: jax.lax.map(lambda beta: over_tasks(parameters, beta, tasks), betas),
+        "scan": lambda parameters, betas, tasks: jax.lax.scan(
+            lambda carried, beta: (carried, over_tasks(carried, beta, tasks)), parameters, betas
+        )[1],
+    }
+    for way, function in ways.items():
+        found = jax.tree.leaves(jax.jit(function)(model.parameters, betas, tasks))
+        for mine, theirs in zip(found, expected, strict=True):
+            np.testing.assert_allclose(mine, theirs, rtol=1e-12, atol=1e-12, err_msg=way)
+
+
+@each_backup
+def test_32_bit_numbers_stay(name):
+    problem = random_problem()
+    given = (problem.model, generic_task(problem, 0.9), people(name))
+    exact, exact_slope, _ = values_and_slopes(*given)
+    narrow = jax.tree.map(lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, given)
+    found, slope, adjoint = values_and_slopes(*narrow, solver=Ordered())
+    arrays = (found.values, found.action_values, found.residual, found.start.values, slope, adjoint)
+    assert {array.dtype for array in arrays} == {jnp.dtype(jnp.float32)}
+    assert found.converged
+    assert relative_error(found.values, exact.values) < 1e-4
+    assert relative_error(slope, exact_slope) < 1e-3
+
+
+# Limits
+
+
+@pytest.mark.parametrize("name", ["hard max", "Boltzmann"])
+@pytest.mark.parametrize("most", [0, 1, 3])
+def test_a_solve_that_was_stopped_says_so(name, most):
+    model = some_map()
+    wanted = reach(model.grid, 5, discount=0.999)
+    found, slope, _ = values_and_slopes(
+        model, wanted, people(name, 0.5), solver=Ordered(max_sweeps=most, tolerance=1e-14)
+    )
+    assert not found.converged
+    assert jnp.isnan(slope).all()
+
+
+@each_backup
+@pytest.mark.parametrize("where", ["parameters", "reward", "beta"])
+def test_what_is_no_number_is_never_a_solution(name, where):
+    model = some_map(4, 5)
+    wanted, behavior = reach(model.grid, 5), people(name)
+    if where == "parameters":
+        model = model.with_parameters(model.parameters.at[3].set(jnp.nan))
+    elif where == "reward":
+        wanted = eqx.tree_at(lambda task: task.reward, wanted, jnp.full((1, 1), jnp.nan))
+    else:
+        behavior = eqx.tree_at(lambda people: people.beta, behavior, jnp.asarray(jnp.nan))
+    found, slope, _ = values_and_slopes(model, wanted, behavior)
+    assert not found.converged
+    assert jnp.isnan(slope).all()
+
+
+class Sharper(BoltzmannAverage):
+    """A backup that nobody has written machine code for, though its parent has it."""
+
+
+def test_backups_without_machine_code_are_refused():
+    model = some_map(4, 5)
+    with pytest.raises(InputError, match="Jacobi"):
+        solve(model, reach(model.grid, 0), Behavior(Sharper(), 5.0), solver=Ordered())
+
+
+def test_the_choice_of_a_solver():
+    assert isinstance(solver_for(BoltzmannAverage(), 400), Ordered)
+    assert isinstance(solver_for(BoltzmannAverage(), 399), Jacobi)
+    assert isinstance(solver_for(Sharper(), 400), Jacobi)
+
+
+def test_cold_starts_know_nothing():
+    start = Ordered().cold_start(3, jnp.dtype(jnp.float32))
+    assert (start.values == lowest(jnp.dtype(jnp.float32))).all()
+    assert start.order.tolist() == [-1, -1, -1]
+    assert not start.adjoint.any()

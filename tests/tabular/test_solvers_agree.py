@@ -1,0 +1,155 @@
+"""Ordered and Jacobi, two programs for the same equations, find the same values and gradients."""
+
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from problems import BACKUPS, DISCOUNTS, PROBLEMS, generic_task, plain_backup
+
+from sidestep.domains.offices import office
+from sidestep.tabular.backups import Behavior
+from sidestep.tabular.graph import graph
+from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.models import ObstacleGrid, TabularModel
+from sidestep.tabular.solve import solve
+from sidestep.tabular.solvers.jacobi import Jacobi
+from sidestep.tabular.solvers.ordered import Ordered
+from sidestep.tasks import Task, reach, stack_tasks
+
+SOLVERS = (Jacobi(), Ordered())
+each_backup = pytest.mark.parametrize("name", BACKUPS)
+
+
+@eqx.filter_jit
+def solved(model, tasks, people, solver, gradient="exact"):
+    """A stack of tasks solved, and each task's gradient of a weighted sum of its values, by everything."""
+
+    def total(inputs, terminal):
+        parameters, reward, final, discount, beta = inputs
+        wanted = Task(reward, final, terminal, discount)
+        behavior = Behavior(people.backup, beta)
+        found = solve(model.with_parameters(parameters), wanted, behavior, solver=solver, gradient=gradient)
+        weights = jnp.asarray(np.random.default_rng(1).normal(size=found.values.shape))
+        return jnp.sum(weights * jnp.where(found.values > -1e100, found.values, 0)), found
+
+    def one(task):
+        inputs = (model.parameters, task.reward, task.final_reward, task.discount, people.beta)
+        slopes, found = jax.grad(total, has_aux=True)(inputs, task.terminal)
+        return found, dict(zip(("parameters", "reward", "final", "discount", "beta"), slopes, strict=True))
+
+    return jax.vmap(one)(tasks)
+
+
+def agree(model, tasks, people, close, gradient="exact"):
+    """Checks that both converge to the same values and gradients; returns the solution in the order of distance."""
+    (expected, slopes), (found, ours) = (solved(model, tasks, people, solver, gradient) for solver in SOLVERS)
+    assert expected.converged.all()
+    assert found.converged.all()
+    lost = np.asarray(expected.values) < -1e100
+    np.testing.assert_array_equal(np.asarray(found.values) < -1e100, lost)
+    for values, reference, out in zip(found.values, expected.values, lost, strict=True):
+        largest = np.abs(reference[~out]).max()
+        np.testing.assert_allclose(values[~out], reference[~out], rtol=0, atol=1e-8 * largest)
+    for key, slope in slopes.items():
+        for mine, reference in zip(np.asarray(ours[key]), np.asarray(slope), strict=True):
+            assert np.isfinite(reference).all()
+            assert np.linalg.norm(mine - reference) <= close * np.linalg.norm(reference), key
+    return found
+
+
+@pytest.mark.parametrize(
+    ("problem", "gradient"), [*((problem, "exact") for problem in PROBLEMS), ("tabular", "fixed_policy")]
+)
+@each_backup
+def test_small_problems(problem, name, gradient):
+    tasks = stack_tasks([generic_task(PROBLEMS[problem], discount, seed) for seed, discount in enumerate(DISCOUNTS)])
+    agree(PROBLEMS[problem].model, tasks, Behavior(BACKUPS[name], 4.0), 1e-7, gradient)
+
+
+@cache
+def office_and_tasks(connectivity):
+    """An office that nobody mapped, learned well: cells blocked with a probability of about .98 or .02."""
+    plan = office(25, 40, 0, connectivity)
+    rng = np.random.default_rng(0)
+    walls = plan.known.reshape(-1) == Cell.OCCUPIED
+    theta = np.where(walls, 3.9, -3.9) + 0.3 * rng.normal(size=plan.size)
+    goals = rng.choice(np.flatnonzero(~walls), 3, replace=False).tolist()
+    world = plan.forget()
+    tasks = [
+        reach(world, goals[0], discount=0.9999, step_cost=1.0),
+        reach(world, goals[1], discount=1.0, step_cost=1.0),
+        reach(world, goals[2], discount=0.95),
+    ]
+    return ObstacleGrid(world, jnp.asarray(theta)), stack_tasks(tasks)
+
+
+@pytest.mark.parametrize(
+    ("connectivity", "name", "beta"), [*((4, name, 5.0) for name in BACKUPS), (8, "Boltzmann", 50.0)]
+)
+def test_an_office(connectivity, name, beta):
+    agree(*office_and_tasks(connectivity), Behavior(BACKUPS[name], beta), 1e-6)
+
+
+def random_graph(states=300, actions=3, outcomes=4, seed=0):
+    """A graph that is no map: outcomes lead near and far, some stay, some repeat; state 0 is within reach."""
+    rng = np.random.default_rng(seed)
+    near = (np.arange(states)[:, None, None] + rng.integers(-5, 6, (states, actions, outcomes))) % states
+    successors = np.where(rng.random(near.shape) < 0.8, near, rng.integers(0, states, near.shape))
+    successors[:, 0, 0] = np.maximum(np.arange(states) - 1, 0)
+    successors[:, 1, 0] = np.arange(states)
+    successors[:, 2, 1] = successors[:, 2, 0]
+    return TabularModel(graph(successors), jnp.asarray(2 * rng.normal(size=successors.shape)))
+
+
+@each_backup
+@pytest.mark.parametrize("beta", [0.5, 50.0])
+def test_a_random_graph(beta, name):
+    """Ends that pay differently, and a task without an end."""
+    model = random_graph()
+    rng = np.random.default_rng(1)
+    terminal = np.isin(np.arange(300), [0, 150, 297])
+
+    def one(discount, low, high, ends):
+        reward, final = rng.uniform(low, high, (300, 3)), rng.normal(size=300)
+        return Task(jnp.asarray(reward), jnp.asarray(final), jnp.asarray(terminal & ends), jnp.asarray(discount))
+
+    tasks = [one(0.9, -1.5, -0.5, True), one(0.9, -1.0, 1.0, False), one(1.0, -4.0, -3.0, True)]
+    agree(model, stack_tasks(tasks), Behavior(BACKUPS[name], beta), 1e-6)
+
+
+@each_backup
+def test_dead_ends_and_traps(name):
+    """Nobody gets through a wall, so that at discount 1 some states have no values; other cells hold on to people."""
+    known = np.full((20, 22), Cell.UNKNOWN, dtype=np.int64)
+    known[15, :] = Cell.OCCUPIED
+    world = Grid(known)
+    theta = np.random.default_rng(3).normal(-2, 1, world.size)
+    theta[[100, 101, 122, 300]] = 21.0
+    tasks = [reach(world, goal, discount=1.0, step_cost=1.0) for goal in (0, 122)]
+    tasks.append(reach(world, 439, discount=0.95))
+    found = agree(ObstacleGrid(world, jnp.asarray(theta)), stack_tasks(tasks), Behavior(BACKUPS[name], 5.0), 1e-6)
+    lost = np.asarray(found.values) < -1e100
+    assert lost[:2, 16 * 22 :].all()
+    assert not lost[:, : 15 * 22].any()
+    assert not lost[2].any()
+    beside = np.array([121, 123, 144])  # of the goal that is blocked all but surely
+    assert (np.asarray(found.values)[1, beside] < -1e8).all()
+
+
+@each_backup
+def test_flat_and_sharp(name):
+    """Extreme β, where several fixed points may exist: both solve the Bellman equation."""
+    model, tasks = office_and_tasks(4)
+    tasks = eqx.tree_at(lambda tasks: tasks.discount, tasks, jnp.asarray([0.99, 0.999, 0.95]))
+    for beta in (0.1, 50.0, 1e3):
+        for solver in SOLVERS:
+            found, _ = solved(model, tasks, Behavior(BACKUPS[name], beta), solver)
+            assert found.converged.all()
+            values = np.asarray(found.values)
+            size = np.maximum(np.abs(values), np.abs(found.action_values).max(axis=-1))
+            off = np.abs(np.asarray(plain_backup(name, found.action_values, beta)) - values)
+            rounding = 1e-14 / beta  # of what the plain mellowmax takes the logarithm of
+            assert (off <= 1e-9 * size + rounding)[~np.asarray(tasks.terminal)].all()
