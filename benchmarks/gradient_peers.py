@@ -18,13 +18,15 @@ log-likelihood with respect to all parameters, their values included:
 
 and **values** is the value solve of `sidestep ordered` alone, **plain values** that by plain sweeps.
 
-Each map is given twice, as an obstacle grid (a parameter a cell) and as a table (a parameter for every outcome of every
-state and action) with the same probabilities, to show what the number of parameters does.
+With `--models cells table` each map is given twice, as an obstacle grid (a parameter a cell) and as a table (a
+parameter for every outcome of every state and action) with the same probabilities, to show what the number of
+parameters does.
 
 All get the same tolerance, the relative change at which their iterations stop. Plain sweeps may stop too early, so they
 go on until the gradient is within `--accuracy` of the exact one (by `sidestep ordered` at a tolerance of 1e-12), or as
 long as they may. All differences are shown. A method that would need more than `--memory` is not run, and the table
-says so.
+says so; one that takes longer than `--patience` is timed once and not tried on larger maps. Memory is measured for the
+first backup, on maps of `--memory-sizes`.
 
 Records (`--json`): `name`, `model`, `backup`, `cells`, `parameters`, `tasks`, `cold_seconds`, `warm_seconds` (null
 where there is no warm start), `dijkstra_seconds` (medians), `best_seconds`, `ratio` (to `sidestep ordered`, cold, in
@@ -41,7 +43,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -242,6 +244,7 @@ GRADIENTS: Mapping[str, Callable[..., Found]] = {
     "forward": forward,
 }
 BY_SWEEPS = ("plain values", "unrolled")
+OTHERS = ("unrolled", "dense implicit", "optimistix", "forward")
 ONLY_VALUES = ("values", "plain values")
 
 
@@ -271,6 +274,7 @@ class Method:
     sweeps: int = 0
     difference: float | None = None
     failed: str | None = None
+    first_seconds: float = 0.0
 
 
 def compiled(name: str, problem: Problem, limit: float = np.inf, sweeps: int = 0) -> Method:
@@ -296,19 +300,21 @@ def compiled(name: str, problem: Problem, limit: float = np.inf, sweeps: int = 0
 def checked(method: Method, exact: Array) -> Method:
     """Runs a method once, for its sweeps and how far its gradient is from the exact one."""
     if method.call is not None:
+        started = time.perf_counter()
         found, sweeps = method.call()
+        method.first_seconds = time.perf_counter() - started
         method.sweeps = int(sweeps)
         if method.name not in ONLY_VALUES:
             method.difference = difference(found, exact)
     return method
 
 
-def enough_sweeps(problem: Problem, exact: Array, accuracy: float, limit: float) -> tuple[Method, Method]:
+def enough_sweeps(problem: Problem, exact: Array, limit: float, arguments: argparse.Namespace) -> tuple[Method, Method]:
     """Plain values and their unrolled gradient, by as many sweeps as make it accurate."""
     sweeps = int(eqx.filter_jit(plain_sweeps)(problem, problem.model.parameters))
     while True:
         method = checked(compiled("unrolled", problem, limit, sweeps), exact)
-        if method.difference is None or method.difference <= accuracy or sweeps >= MOST_SWEEPS:
+        if method.difference is None or method.difference <= arguments.accuracy or sweeps >= MOST_SWEEPS:
             break
         sweeps = min(MOST_SWEEPS, int(1.3 * sweeps) + 1)
     method.sweeps = sweeps
@@ -321,8 +327,11 @@ def difference(found: Array, expected: Array) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def methods_for(problem: Problem, arguments: argparse.Namespace) -> list[Method]:
-    """All methods for a problem, compiled, run once and compared; raises `NotConverged` if values are not found."""
+def methods_for(problem: Problem, slow: Collection[str], arguments: argparse.Namespace) -> list[Method]:
+    """All methods for a problem, compiled, run once and compared; raises `NotConverged` if values are not found.
+
+    Those in `slow`, which took too long on a smaller map, are left out.
+    """
     limit = arguments.memory * 2**30
     strict = Problem(
         problem.model, problem.demonstrations, problem.behavior, Ordered(tolerance=EXACT), problem.gradient
@@ -334,13 +343,15 @@ def methods_for(problem: Problem, arguments: argparse.Namespace) -> list[Method]
         raise NotConverged("the values or the adjoint did not converge: try a smaller β or another backup")
     names = ["sidestep ordered", "sidestep jacobi", "values"]
     found = [with_warm(checked(compiled(name, problem), exact), problem, arguments) for name in names]
-    found += enough_sweeps(problem, exact, arguments.accuracy, limit)
+    found += enough_sweeps(problem, exact, limit, arguments)
     states, count = problem.model.graph.states, int(np.size(problem.model.parameters))
     for name in ("dense implicit", "optimistix", "forward"):
         # a Jacobian of plain backups, or an array of states × parameters
         least = 8 * states * (count if name == "forward" else states)
         if name == "optimistix" and importlib.util.find_spec("optimistix") is None:
             found.append(Method(name, failed="not installed"))
+        elif name in slow:
+            found.append(Method(name, bytes=least, failed=f"over {arguments.patience:g} s before"))
         elif name == "forward" and states * count > arguments.forward_limit:
             found.append(Method(name, bytes=least, failed=f"{states * count:.0e} numbers a sweep"))
         else:
@@ -361,19 +372,23 @@ def with_warm(method: Method, problem: Problem, arguments: argparse.Namespace) -
     return method
 
 
-def measure(world: World, saved: Path, model: str, backup: str, arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """The records of one map in one parametrisation, a record a method."""
+def measure(
+    world: World, saved: Path, model: str, backup: str, slow: set[str], arguments: argparse.Namespace
+) -> list[dict[str, Any]]:
+    """The records of one map in one parametrisation, a record a method; adds to `slow` what takes too long."""
     problem = problem_of(world, model, backup, arguments)
-    methods = methods_for(problem, arguments)
+    methods = methods_for(problem, slow, arguments)
+    slow |= {method.name for method in methods if method.name in OTHERS and method.first_seconds > arguments.patience}
     moves, goal = expected_costs(world.model), int(world.goals[0])
     calls: dict[str, Callable[[], float]] = {
         "dijkstra": lambda: measuring.seconds_of(lambda: dijkstra(moves, indices=goal))
     }
     for method in methods:
         for name, call in ((method.name, method.call), (f"warm {method.name}", method.warm)):
-            if call is not None:
+            if call is not None and method.name not in slow:
                 calls[name] = partial(measuring.seconds_of, call)
     taken = measuring.in_turns(calls, arguments.turns, arguments.budget)
+    taken |= {method.name: [method.first_seconds] for method in methods if method.call and method.name in slow}
     ours = taken["sidestep ordered"]
     return [
         {
@@ -405,7 +420,12 @@ def _memory(
 ) -> dict[str, Any]:
     """The memory of a process of its own, for the first backup and the sizes that it is asked for."""
     nothing: dict[str, Any] = dict.fromkeys(("peak_bytes", "imports_bytes", "excess_bytes", "call_bytes"))
-    if method.call is None or backup != arguments.backups[0] or size not in arguments.memory_sizes:
+    if (
+        method.call is None
+        or method.first_seconds > arguments.patience
+        or backup != arguments.backups[0]
+        or size not in arguments.memory_sizes
+    ):
         return nothing
     told = {key: value for key, value in vars(arguments).items() if isinstance(value, (int, float, str))}
     asked = {**told, "world": str(saved), "name": method.name, "model": model, "backup": backup}
@@ -457,7 +477,7 @@ def print_records(records: Sequence[Mapping[str, Any]], arguments: argparse.Name
     reward = "goal pays 1" if arguments.goal_pays else f"step cost {arguments.step_cost:g}"
     title = f"a gradient ({arguments.gradient}), β={arguments.beta:g}, γ={arguments.discount:g}, {reward}, "
     measuring.print_table(title + f"tolerance {arguments.tolerance:g}", columns, rows, left=("backup", "method"))
-    others = [r for r in records if not r["name"].startswith("sidestep") and r["name"] not in ONLY_VALUES]
+    others = [record for record in records if record["name"] in OTHERS]
     for record in others:
         where = f"{round(record['cells'] ** 0.5)}², {record['backup']}, {record['model']}"
         if record["ratio"] is not None and record["ratio"] < 1:
@@ -476,7 +496,7 @@ def _arguments() -> argparse.Namespace:
     add = parser.add_argument
     add("--sizes", type=int, nargs="+", default=[16, 32, 64, 128], metavar="N", help="N × N cells (10 or more)")
     add("--backups", nargs="+", choices=sorted(BACKUPS), default=["boltzmann", "logsumexp"])
-    add("--models", nargs="+", choices=("cells", "table"), default=["cells", "table"], help="what the parameters are")
+    add("--models", nargs="+", choices=("cells", "table"), default=["cells"], help="what the parameters are")
     add("--gradient", choices=("exact", "fixed_policy"), default="exact")
     add("--beta", type=float, default=5.0, help="how sharply walkers choose")
     add("--discount", type=float, default=0.99)
@@ -488,6 +508,12 @@ def _arguments() -> argparse.Namespace:
     add("--step-by-sign", action="store_true", help="the same step for every parameter, as Adam's first")
     add("--turns", type=int, default=9, help="how often each method is timed")
     add("--budget", type=float, default=4.0, help="seconds after which a method takes no more than three turns")
+    add(
+        "--patience",
+        type=float,
+        default=5.0,
+        help="seconds after which a method is timed but once",
+    )
     add("--memory", type=float, default=4.0, help="GiB above which a method is not run")
     add("--forward-limit", type=int, default=2**21, help="largest states × parameters for the forward programme")
     add("--memory-sizes", type=int, nargs="*", default=[64, 128], metavar="N", help="maps to measure the memory of")
@@ -507,12 +533,13 @@ def run(arguments: argparse.Namespace) -> None:
     records = []
     with tempfile.TemporaryDirectory() as folder:
         saved = Path(folder) / "world.npz"
-        for size in arguments.sizes:
+        slow: dict[tuple[str, str], set[str]] = {}
+        for size in sorted(arguments.sizes):
             world = half_learned_office(size, arguments.seed)
             world.save(saved)
             for backup in arguments.backups:
                 for model in arguments.models:
-                    records += measure(world, saved, model, backup, arguments)
+                    records += measure(world, saved, model, backup, slow.setdefault((backup, model), set()), arguments)
                     measuring.write_records(arguments, records)
                     measuring.note(f"{size}² {backup} {model} done")
     print_records(records, arguments)

@@ -449,7 +449,7 @@ def _arguments() -> argparse.Namespace:
     add("--accuracy", type=float, default=1e-6, help="how far from the exact values every method may be")
     add("--turns", type=int, default=9, help="how often everything is timed")
     add("--budget", type=float, default=5.0, help="seconds after which a method takes no more than three turns")
-    add("--patience", type=float, default=20.0, help="seconds after which a method is given up")
+    add("--patience", type=float, default=6.0, help="seconds after which a method is given up")
     add("--no-memory", action="store_true", help="leave out the processes that measure memory")
     add("--seed", type=int, default=0, help="draws maps and parameters")
     add("--measure-memory", help=argparse.SUPPRESS)

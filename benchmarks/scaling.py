@@ -17,7 +17,8 @@ problem and takes one cold and one warm gradient: the largest resident set of th
 included, and its excess over what was held after the imports.
 
 The **exponent** is that of the power law through the times from 128² cells on, and the worst one between two sizes
-in a row.
+in a row. Sizes are timed one after another, so on a machine that others use too the exponents of the units tell more:
+they are by how much more than Dijkstra's a gradient's cost grows.
 
 Records (`--json`): `name` (solver), `backup`, `cells`, `tasks`, `cold_seconds`, `warm_seconds`, `dijkstra_seconds`
 (medians), `cold_units`, `warm_units` (medians over turns of the ratio to the same turn's Dijkstra), `best_...` (the
@@ -242,7 +243,7 @@ def exponents(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     rows = []
     for name, backup in dict.fromkeys((record["name"], record["backup"]) for record in records):
         own = [r for r in records if (r["name"], r["backup"]) == (name, backup) and r["cells"] >= FROM_CELLS]
-        for kind in ("cold_seconds", "warm_seconds", "dijkstra_seconds"):
+        for kind in ("cold_seconds", "warm_seconds", "dijkstra_seconds", "cold_units", "warm_units"):
             if len(own) > 1:
                 fitted, worst = power_law([r["cells"] for r in own], [r[kind] for r in own])
                 rows.append({"name": name, "backup": backup, "kind": kind, "fitted": fitted, "worst": worst})
@@ -282,7 +283,7 @@ def print_records(records: Sequence[Mapping[str, Any]], arguments: argparse.Name
         (
             row["name"],
             row["backup"],
-            row["kind"].removesuffix("_seconds"),
+            row["kind"].replace("_", " "),
             f"{row['fitted']:.3f}",
             f"{row['worst']:.3f}",
         )
@@ -313,7 +314,7 @@ def _arguments() -> argparse.Namespace:
     add("--tasks", type=int, default=1, help="how many goals")
     add("--walks", type=int, default=10, help="how many walks to each goal")
     add("--turns", type=int, default=7, help="how often everything is timed")
-    add("--budget", type=float, default=8.0, help="seconds after which a method takes no more than five turns")
+    add("--budget", type=float, default=8.0, help="seconds after which a method takes no more than three turns")
     add("--seed", type=int, default=0, help="draws maps, walks and parameters")
     add("--measure-memory", help=argparse.SUPPRESS)
     arguments = parser.parse_args()

@@ -96,7 +96,7 @@ def learn_command(
     ] = None,
     iterations: Annotated[int | None, typer.Option(help="At most this many.")] = None,
     memory: Annotated[
-        float, typer.Option(help="About how much the fit's arrays may take; goals are solved in batches.", metavar="GIB")
+        float, typer.Option(help="About how many GiB the fit may take; goals are solved in batches.", metavar="GIB")
     ] = Settings.memory,
     sample: Annotated[int | None, typer.Option(help="Learn from this many walks only, drawn by the seed.")] = None,
     seed: Seed = Settings.seed,

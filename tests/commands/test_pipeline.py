@@ -11,7 +11,7 @@ from office import WALL, call, summary, write_office, written
 from PIL import Image
 
 from sidestep import cli
-from sidestep.inference.fit import _Saver
+from sidestep.inference.checkpoints import Saver
 from sidestep.io.maps import read_map
 from sidestep.runs import read_learned_map
 from sidestep.tabular.grid import Cell
@@ -194,7 +194,7 @@ def test_an_interrupted_run_goes_on(office, tmp_path, monkeypatch, capsys):
 
         return whole(walks, map_file, folder, settings, stop, resume)
 
-    monkeypatch.setattr(_Saver, "interval", -1.0)
+    monkeypatch.setattr(Saver, "pause", lambda *_: 0.0)
     monkeypatch.setattr(cli, "learn", interrupted)
     assert call(*learn) == 1
     assert written(tmp_path) == ["fit.checkpoint"]

@@ -17,7 +17,7 @@ HISTORY = [[0, -1.1, 0.1], [1, -1 / 3, 2e-9]]
 def test_round_trip(tmp_path):
     path = tmp_path / "fit.checkpoint"
     save_checkpoint(path, "key", CARRIED, HISTORY)
-    carried, history = load_checkpoint(path, "key", LIKE)
+    carried, history, _ = load_checkpoint(path, "key", LIKE)
     assert history == HISTORY
     for found, expected in zip(carried, CARRIED, strict=True):
         assert found.dtype == expected.dtype

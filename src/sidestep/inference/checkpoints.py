@@ -1,6 +1,8 @@
 """Checkpoints: where a fit stood, in one file, so that it can go on from there.
 
-The first line is JSON (what was being fitted, and the history so far), the rest the arrays that the optimiser carries.
+The first line is JSON (what was being fitted, and the history so far), the rest the arrays that the optimiser carries,
+and those that it can do without: they depend on how the tasks are batched and spread over devices, and a fit that is
+resumed on others goes on without them.
 """
 
 import hashlib
@@ -31,18 +33,25 @@ def fingerprint(problem: PyTree) -> str:
     return digest.hexdigest()
 
 
-def save_checkpoint(path: Path, key: str, carried: PyTree, history: Sequence[Sequence[int | float]]) -> None:
-    """Writes a checkpoint, whole or not at all."""
+def save_checkpoint(
+    path: Path, key: str, carried: PyTree, history: Sequence[Sequence[int | float]], kept: PyTree = ()
+) -> None:
+    """Writes a checkpoint, whole or not at all; `kept` are arrays that a resumed fit can do without."""
 
     def write(file: BinaryIO) -> None:
-        file.write(json.dumps({"fit": key, "history": list(history)}).encode() + b"\n")
-        eqx.tree_serialise_leaves(file, carried)
+        header = {"fit": key, "history": list(history), "kept": _shapes(kept)}
+        file.write(json.dumps(header).encode() + b"\n")
+        eqx.tree_serialise_leaves(file, (carried, kept))
 
     write_whole(path, write)
 
 
-def load_checkpoint(path: Path, key: str, like: PyTree) -> tuple[PyTree, list[list[int | float]]]:
-    """What the optimiser carried, in the structure of `like`, and the history.
+def load_checkpoint(
+    path: Path, key: str, like: PyTree, kept: PyTree = ()
+) -> tuple[PyTree, list[list[int | float]], PyTree]:
+    """What the optimiser carried, in the structure of `like`, the history, and what was kept.
+
+    That is `kept` itself where the file has arrays of other shapes.
 
     Raises `InputError` for a file that is no checkpoint, or one of a fit of other data or with other settings.
     """
@@ -58,9 +67,16 @@ def load_checkpoint(path: Path, key: str, like: PyTree) -> tuple[PyTree, list[li
             source=path,
         )
     try:
-        return eqx.tree_deserialise_leaves(file, like), history
+        if header.get("kept") != _shapes(kept):
+            return eqx.tree_deserialise_leaves(file, like), history, kept
+        carried, kept = eqx.tree_deserialise_leaves(file, (like, kept))
+        return carried, history, kept
     except Exception as error:  # what is not an array raises errors of many kinds
         raise InputError("not a checkpoint: the arrays cannot be read", source=path) from error
+
+
+def _shapes(arrays: PyTree) -> list[str]:
+    return [f"{leaf.dtype}{leaf.shape}" for leaf in jax.tree.leaves(arrays)]
 
 
 class Saver:
@@ -73,20 +89,20 @@ class Saver:
         self.path, self.key = None if path is None else Path(path), key
         self.next = 0.0
 
-    def load(self, like: PyTree) -> tuple[PyTree, list[list[int | float]]]:
-        """What was carried, in the structure of `like`, and the history; `like` itself if there is no file yet.
+    def load(self, like: PyTree, kept: PyTree = ()) -> tuple[PyTree, list[list[int | float]], PyTree]:
+        """What was carried, the history and what was kept; `like` and `kept` themselves if there is no file yet.
 
         Raises `InputError` without a path, and for a file that `load_checkpoint` refuses.
         """
         if self.path is None:
             raise InputError("expected a checkpoint to resume from", field="resume")
-        return load_checkpoint(self.path, self.key, like) if self.path.exists() else (like, [])
+        return load_checkpoint(self.path, self.key, like, kept) if self.path.exists() else (like, [], kept)
 
-    def save(self, carried: PyTree, history: Sequence[Sequence[int | float]]) -> None:
+    def save(self, carried: PyTree, history: Sequence[Sequence[int | float]], kept: PyTree = ()) -> None:
         """Saves, if it is time to."""
         if self.path is not None and time.monotonic() >= self.next:
             started = time.monotonic()
-            save_checkpoint(self.path, self.key, carried, history)
+            save_checkpoint(self.path, self.key, carried, history, kept)
             took = time.monotonic() - started
             self.next = started + took + self.pause(took)
 

@@ -19,6 +19,7 @@ from sidestep.inference.checkpoints import Saver
 from sidestep.inference.objective import Objective, Problem, Solved
 from sidestep.inference.optimisers import Optimiser
 from sidestep.tabular.likelihood import choices_of
+from sidestep.tabular.solvers.process import Start
 
 
 class Progress(NamedTuple):
@@ -122,17 +123,24 @@ class Climb:
         return self.solved
 
     def _save(self, x: np.ndarray, state: PyTree, history: list[Progress]) -> None:
-        self.saver.save(self._carried(x, state), history)
+        if jax.process_index() == self.objective.processes[0]:
+            self.saver.save(self._carried(x, state), history, self._kept())
 
     def _resumed(self, x: np.ndarray, state: PyTree) -> tuple[np.ndarray, PyTree, list[Progress]]:
-        carried, records = self.saver.load(self._carried(x, state))
-        x, state, self.last, self.starts, left = carried
+        carried, records, kept = self.saver.load(self._carried(x, state), self._kept())
+        x, state, self.last, left = carried
+        if kept:
+            self.starts = self.objective.placed(kept)
         self.tolerances = self.tolerances[len(self.tolerances) - int(left) :]
         return x, state, [Progress(int(record[0]), *record[1:]) for record in records]
 
     def _carried(self, x: np.ndarray, state: PyTree) -> PyTree:
-        """All that the rest of the climb depends on, as arrays."""
-        return x, state, self.last, self.starts, np.asarray(len(self.tolerances))
+        """All that the rest of the climb depends on, as arrays, but for where solves start."""
+        return x, state, self.last, np.asarray(len(self.tolerances))
+
+    def _kept(self) -> list[Start]:
+        """Where solves start, for a checkpoint: nothing where that is never changed, or is spread over processes."""
+        return self.starts if self.objective.keeps_starts and len(self.objective.processes) == 1 else []
 
     def _check(self, progress: Progress) -> None:
         """Raises if what was found at a point cannot be used."""

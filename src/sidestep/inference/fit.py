@@ -83,12 +83,13 @@ def fit(
     - `gradient`, `horizon`, `solver`: as for `solve`. On large maps, solves are only as exact as the optimiser needs
       until it has converged, and exact from then on; a solver with a tolerance of its own keeps to that.
     - `optimiser`: `LBFGS()` by default, or `Ascent()`.
-    - `memory`: about how many bytes the arrays may take; tasks are solved in batches that fit.
-    - `mesh`: devices to spread the tasks over (see `tasks_mesh`); the objective and its gradient are the same.
-    - `report`: called with a `Progress` before the first and after every iteration.
+    - `memory`: about how many bytes the arrays may take on a device; tasks are solved in batches that fit.
+    - `mesh`: devices to spread the tasks over (see `tasks_mesh`); the objective and its gradient are the same. With
+      devices of several processes, each process calls `fit` with the same arguments and gets the same model.
+    - `report`: called with a `Progress` before the first and after every iteration, in every process.
     - `checkpoint`: a file that is kept up to date while the fit runs; with `resume`, the fit goes on from there and
-      ends
-      exactly as if it had not been interrupted.
+      ends exactly as if it had not been interrupted. With other devices or another `memory` than before, or with
+      several processes (the first one writes, all must see the file), it ends there up to the tolerances.
 
     Raises `InputError` for arguments that do not go together, visited states from which a goal cannot be reached, or a
     checkpoint of another fit; `ImproperTask` for tasks without values; `NotConverged` if values do not converge at the

@@ -6,12 +6,12 @@ The sum over tasks is the only costly part, and tasks have nothing to do with ea
 of equal size, one compiled function serves them all, and with a mesh of devices each device takes its share of a
 batch's tasks and the shares are added up (JAX's SPMD; on several machines, the same on all of them).
 
-What a batch's solves leave behind (values, adjoints, orders) is where those of the next evaluation start.
+What a batch's solves leave behind (values, adjoints, orders) is where those of the next evaluation start. It stays on
+the device whose tasks they are; everything else that an evaluation yields, all processes have.
 """
 
-import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,16 +21,18 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from sidestep.demonstrations import Demonstrations
+from sidestep.errors import InputError
+from sidestep.inference.batches import Batch, batches_of, planned
+from sidestep.inference.checkpoints import fingerprint
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, Gradient
-from sidestep.tabular.likelihood import Choices, Term, choice_log_likelihood, choices_of, transition_log_likelihood
+from sidestep.tabular.likelihood import Choices, Term, choice_log_likelihood, transition_log_likelihood
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.solvers.process import Solver, Start, reachable
 from sidestep.tasks import Task
 
 MEMORY = 2.0 * 2**30
-"""How many bytes the arrays of a fit may take, unless more are allowed."""
+"""How many bytes the arrays of a fit may take on a device, unless more are allowed."""
 AXIS = "tasks"
 """The name of the axis of a mesh that tasks are spread over."""
 
@@ -46,13 +48,6 @@ class Problem(eqx.Module):
     horizon: int | None = eqx.field(static=True)
     gradient: Gradient = eqx.field(static=True)
     solver: Solver
-
-
-class Batch(NamedTuple):
-    """Some tasks, and what was done in pursuit of them."""
-
-    tasks: Task
-    choices: Choices
 
 
 class Solved(NamedTuple):
@@ -78,16 +73,30 @@ class Evaluation(NamedTuple):
 class Objective:
     """The objective of a problem, evaluated batch by batch.
 
-    - `memory`: about how many bytes the arrays may take.
+    - `memory`: about how many bytes the arrays may take on a device.
     - `mesh`: devices to spread tasks over (`tasks_mesh`); None for one device.
+
+    With a mesh over several processes, each must make it from the same problem and call the same methods with the same
+    arguments; `InputError` says where they do not.
     """
 
     def __init__(self, problem: Problem, memory: float, mesh: Mesh | None = None):
-        self.mesh = mesh
-        self.problem = _put(problem, mesh, PartitionSpec())
-        together, self.keeps_starts = _plan(problem, memory, 1 if mesh is None else mesh.size)
-        batches = _batches(problem.demonstrations, together) if "actions" in problem.terms else []
-        self.batches = [_put(batch, mesh, PartitionSpec(AXIS)) for batch in batches]
+        self.problem, self.mesh = problem, mesh
+        tasks = len(problem.demonstrations.tasks.terminal)
+        devices = 1 if mesh is None else mesh.size
+        together, self.keeps_starts = planned(problem.model, problem.solver, tasks, memory, devices)
+        _check_same(problem, mesh)
+        batches = batches_of(problem.demonstrations, together) if "actions" in problem.terms else []
+        self.batches = [_shared_out(batch, mesh) for batch in batches]
+        # devices need not hold what only the transitions depend on
+        self.solving = _on_all(eqx.tree_at(lambda problem: problem.demonstrations, problem, None), mesh)
+
+    @property
+    def processes(self) -> list[int]:
+        """The processes that tasks are spread over. With several, none has all starts."""
+        if self.mesh is None:
+            return [jax.process_index()]
+        return sorted({device.process_index for device in self.mesh.devices.flat})
 
     def cold_starts(self) -> list[Start]:
         """Where the solves of each batch start when nothing is known."""
@@ -98,7 +107,11 @@ class Objective:
         tasks = len(self.batches[0].tasks.terminal)
         cold = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (tasks, *leaf.shape)), one)
         # arrays do not change, so one serves all batches
-        return [_put(cold, self.mesh, PartitionSpec(AXIS))] * len(self.batches)
+        return self.placed([cold]) * len(self.batches)
+
+    def placed(self, starts: list[Start]) -> list[Start]:
+        """Starts of batches on the devices where their tasks are."""
+        return [_shared_out(start, self.mesh) for start in starts]
 
     def evaluate(
         self, parameters: PyTree, starts: list[Start], tolerance: float | None = None
@@ -107,21 +120,22 @@ class Objective:
 
         `tolerance` is that of the solves, where the solver leaves it open. The objective is NaN if a solve failed.
         """
-        problem, parameters = _with_tolerance(self.problem, tolerance), _put(parameters, self.mesh, PartitionSpec())
-        slope, (transitions, prior) = jax.tree.map(np.asarray, _apart_from_actions(problem, parameters))
+        slope, (transitions, prior) = jax.tree.map(np.asarray, _apart_from_actions(self.problem, parameters))
+        parameters, tolerance = _on_all((parameters, tolerance), self.mesh)
+        solving = _with_tolerance(self.solving, tolerance)
         actions, solved, left = 0.0, [], []
         for batch, start in zip(self.batches, starts, strict=True):
-            part, by, start, how = _of_actions(problem, parameters, batch, start, self.mesh)
+            part, by, after, how = _of_actions(solving, parameters, batch, start, self.mesh)
             actions += float(part)
             slope = jax.tree.map(lambda mine, more: mine + np.asarray(more), slope, by)
             solved.append(how)
-            left.append(start)
+            left.append(after)
         parts = (actions, float(transitions), float(prior))
         evaluation = Evaluation(sum(parts), *parts, slope, solved)
         return evaluation, left if self.keeps_starts else starts
 
 
-def tasks_mesh(devices: Sequence[jax.Device] | None = None) -> Mesh:
+def tasks_mesh(devices: Sequence[Any] | None = None) -> Mesh:
     """A mesh that spreads tasks over devices, by default over all that there are (of all processes)."""
     return Mesh(np.asarray(jax.devices() if devices is None else devices), (AXIS,))
 
@@ -141,11 +155,23 @@ def _apart_from_actions(problem: Problem, parameters: PyTree) -> tuple[PyTree, t
     return jax.grad(loss, has_aux=True)(parameters)
 
 
-@eqx.filter_jit
 def _of_actions(
     problem: Problem, parameters: PyTree, batch: Batch, starts: Start, mesh: Mesh | None
 ) -> tuple[Array, PyTree, Start, Solved]:
     """The actions' log-likelihood over the tasks of a batch, the slope of the loss, new starts, how the solves went."""
+    if mesh is None:
+        return _share(problem, parameters, batch, starts)
+    part, slope, left, solved = _shares(problem, parameters, batch, starts, mesh)
+    # Devices that wait for each other give up after some seconds, and one may have far more to do than the others: so
+    # they first finish all their work, and only then is it added up.
+    jax.block_until_ready((part, slope))
+    (part, slope), solved = _added_up((part, slope), solved, mesh)
+    return part, slope, left, solved
+
+
+@eqx.filter_jit
+def _share(problem: Problem, parameters: PyTree, batch: Batch, starts: Start) -> tuple[Array, PyTree, Start, Solved]:
+    """`_of_actions` on one device."""
 
     def of_one(model: TransitionModel, task: Task, choices: Choices, start: Start) -> tuple[Array, tuple]:
         value, found = choice_log_likelihood(
@@ -161,86 +187,82 @@ def _of_actions(
         stuck = (choices.counts > 0) & ~reachable(found.values[choices.states])
         return value, (found.start, Solved(found.sweeps, found.residual, found.converged, stuck))
 
-    def loss(parameters: PyTree, adjoint: Array, batch: Batch, starts: Start) -> tuple[Array, tuple]:
+    def loss(parameters: PyTree, adjoint: Array) -> tuple[Array, tuple]:
         model = problem.model.with_parameters(parameters)
-        starts = starts._replace(adjoint=adjoint)
-        values, left = jax.vmap(of_one, in_axes=(None, 0, 0, 0))(model, batch.tasks, batch.choices, starts)
+        given = starts._replace(adjoint=adjoint)
+        values, left = jax.vmap(of_one, in_axes=(None, 0, 0, 0))(model, batch.tasks, batch.choices, given)
         return -values.sum(), left
 
-    def share(parameters: PyTree, batch: Batch, starts: Start) -> tuple[Array, PyTree, Start, Solved]:
-        # the gradient by the old adjoint is the new one
-        gradient = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
-        (value, (left, solved)), (slope, adjoint) = gradient(parameters, starts.adjoint, batch, starts)
-        if mesh is not None:
-            value, slope = jax.lax.psum((value, slope), AXIS)
-            solved = jax.lax.all_gather(solved, AXIS, tiled=True)
-        return -value, slope, left._replace(adjoint=adjoint), solved
-
-    if mesh is None:
-        return share(parameters, batch, starts)
-    all_of_it, own = PartitionSpec(), PartitionSpec(AXIS)
-    spread = jax.shard_map(
-        share,
-        mesh=mesh,
-        in_specs=(all_of_it, own, own),
-        out_specs=(all_of_it, all_of_it, own, all_of_it),
-        check_vma=False,
-    )
-    return spread(parameters, batch, starts)
+    # the gradient by the old adjoint is the new one
+    gradient = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
+    (value, (left, solved)), (slope, adjoint) = gradient(parameters, starts.adjoint)
+    return -value, slope, left._replace(adjoint=adjoint), solved
 
 
-def _put(tree: PyTree, mesh: Mesh | None, spec: PartitionSpec) -> PyTree:
-    """Arrays on the devices of a mesh: on each of them all, or its share of the tasks."""
+@eqx.filter_jit
+def _shares(
+    problem: Problem, parameters: PyTree, batch: Batch, starts: Start, mesh: Mesh
+) -> tuple[Array, PyTree, Start, Solved]:
+    """`_share` of every device; sums over its tasks have an axis of devices in front."""
+    known, settings = eqx.partition((problem, parameters), eqx.is_array)
+
+    def share(known: PyTree, batch: Batch, starts: Start) -> tuple[Array, PyTree, Start, Solved]:
+        problem, parameters = eqx.combine(known, settings)
+        part, slope, left, solved = _share(problem, parameters, batch, starts)
+        part, slope = jax.tree.map(lambda leaf: leaf[None], (part, slope))
+        return part, slope, left, solved
+
+    own = PartitionSpec(AXIS)
+    spread = jax.shard_map(share, mesh=mesh, in_specs=(PartitionSpec(), own, own), out_specs=own, check_vma=False)
+    return spread(known, batch, starts)
+
+
+@eqx.filter_jit
+def _added_up(sums: PyTree, solved: Solved, mesh: Mesh) -> tuple[PyTree, Solved]:
+    """The devices' sums added up, and how all solves went; both on all devices."""
+    added = jax.tree.map(lambda leaf: leaf.sum(axis=0), sums)
+    return jax.lax.with_sharding_constraint((added, solved), NamedSharding(mesh, PartitionSpec()))
+
+
+def _on_all(tree: PyTree, mesh: Mesh | None) -> PyTree:
+    """Arrays and numbers on each device of a mesh; `InputError` if not all processes have the same ones."""
     if mesh is None:
         return tree
-    arrays, rest = eqx.partition(tree, eqx.is_array)
-    return eqx.combine(jax.device_put(jax.tree.map(np.asarray, arrays), NamedSharding(mesh, spec)), rest)
+    values, rest = eqx.partition(tree, lambda leaf: eqx.is_array(leaf) or isinstance(leaf, float))
+    try:
+        values = jax.device_put(jax.tree.map(np.asarray, values), NamedSharding(mesh, PartitionSpec()))
+    except AssertionError as error:  # JAX compares what it is given
+        raise InputError(_NOT_THE_SAME) from error
+    return eqx.combine(values, rest)
 
 
-def _with_tolerance(problem: Problem, tolerance: float | None) -> Problem:
+def _shared_out(tree: PyTree, mesh: Mesh | None) -> PyTree:
+    """Arrays over tasks, each device with its share of them; a process holds the shares of its own devices."""
+    if mesh is None:
+        return tree
+    sharding = NamedSharding(mesh, PartitionSpec(AXIS))
+
+    def put(leaf: Array) -> Array:
+        array = np.asarray(leaf)
+        return jax.make_array_from_callback(array.shape, sharding, lambda index: array[index])
+
+    return jax.tree.map(put, tree)
+
+
+_NOT_THE_SAME = """\
+expected the same model, demonstrations, settings and checkpoint in all processes, found different ones (machines that \
+are not of the same kind may differ in the last bits)"""
+
+
+def _check_same(problem: Problem, mesh: Mesh | None) -> None:
+    """Raises `InputError` unless all processes have the same problem."""
+    if jax.process_count() > 1:
+        _on_all(np.frombuffer(bytes.fromhex(fingerprint(problem)), np.uint8), mesh)
+
+
+def _with_tolerance(problem: Problem, tolerance: float | Array | None) -> Problem:
     if tolerance is None:
         return problem
     return eqx.tree_at(
         lambda problem: problem.solver.tolerance, problem, jnp.asarray(tolerance), is_leaf=lambda leaf: leaf is None
     )
-
-
-# ------------------------------------------------------------------------------------------------------- batches
-
-_WORKSPACE = {Jacobi: 12}
-"""How many times a task's probabilities a solve and its gradient take (the default is for `Ordered`), roughly."""
-_FIXED = 8
-"""And how many times, whatever the number of tasks."""
-
-
-def _plan(problem: Problem, memory: float, devices: int) -> tuple[int, bool]:
-    """How many tasks a batch has, a multiple of the devices; and whether there is room to keep starts.
-
-    Batches are as equal as can be, and as few as fit into `memory`; one of a task a device always is possible.
-    """
-    graph, tasks = problem.model.graph, len(problem.demonstrations.tasks.terminal)
-    probabilities = jax.eval_shape(problem.model.probabilities)
-    size = probabilities.size * probabilities.dtype.itemsize
-    starts = tasks * graph.states * (2 * probabilities.dtype.itemsize + 4)
-    keeps = starts <= memory / 2
-    free = memory - _FIXED * size - (starts if keeps else 0)
-    most = max(1, int(free / (_WORKSPACE.get(type(problem.solver), 3) * size)) // devices)
-    rounds = math.ceil(math.ceil(tasks / devices) / most)
-    return devices * math.ceil(tasks / devices / rounds), keeps
-
-
-def _batches(demonstrations: Demonstrations, together: int) -> list[Batch]:
-    """Batches of that many tasks; the last is filled up with tasks that have ended, and nothing done."""
-    tasks, choices = demonstrations.tasks, choices_of(demonstrations)
-    count = len(tasks.terminal)
-    missing = -count % together
-
-    def filled(leaf: Array, value: float | bool = 0) -> Array:
-        return jnp.concatenate([leaf, jnp.full((missing, *leaf.shape[1:]), value, leaf.dtype)])
-
-    ended = Task(filled(tasks.reward), filled(tasks.final_reward), filled(tasks.terminal, True), filled(tasks.discount))
-    whole = Batch(ended, jax.tree.map(filled, choices))
-    return [
-        jax.tree.map(lambda leaf, first=first: leaf[first : first + together], whole)
-        for first in range(0, count, together)
-    ]

@@ -77,10 +77,7 @@ def solve(
     behavior = eqx.tree_at(lambda people: people.beta, behavior, behavior.beta.astype(dtype))
 
     solver = solver or solver_for(behavior.backup, model.graph.states)
-    if start is None:
-        start = solver.cold_start(model.graph.states, dtype)
-        if task.terminal.ndim == 2:
-            start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(task.terminal), *leaf.shape)), start)
+    begin = start or _cold_start(solver, model.graph.states, dtype, task.terminal.shape[:-1])
 
     def one(task: Task, start: Start) -> Solution:
         process = DecisionProcess(
@@ -101,7 +98,12 @@ def solve(
         left = Start(jax.lax.stop_gradient(found.values), start.adjoint, found.order)
         return Solution(found.values, q, found.sweeps, found.residual, found.converged, left)
 
-    return jax.vmap(one)(task, start) if task.terminal.ndim == 2 else one(task, start)
+    return jax.vmap(one)(task, begin) if task.terminal.ndim == 2 else one(task, begin)
+
+
+def _cold_start(solver: Solver, states: int, dtype: jnp.dtype, tasks: tuple[int, ...]) -> Start:
+    cold = solver.cold_start(states, dtype)
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*tasks, *leaf.shape)), cold)
 
 
 def check_proper(task: Task, behavior: Behavior, actions: int, horizon: int | None = None) -> None:

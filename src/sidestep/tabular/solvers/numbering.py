@@ -11,6 +11,10 @@ from jaxtyping import Int
 
 from sidestep.tabular.solvers.compiled import compiled
 from sidestep.tabular.solvers.given import Given
+from sidestep.tabular.solvers.sweeping import LOG_SUM_EXP, backed_up
+
+_NEWTON_STEPS = 3
+"""How often a first value is improved."""
 
 
 class Numbered(NamedTuple):
@@ -87,23 +91,37 @@ def numbering_for(actions: int, outcomes: int, width: int) -> Numbering:
                 world.patience[i, a] = 1 / leaving if leaving > 0 else 0.0
 
     @compiled()
-    def first_values(world, values, bottom, bound):  # pragma: no cover
-        """Fills in values that are not known (`bottom`): of the best action tried until it leads nearer, by order."""
+    def first_values(valuing, world, values, bottom, bound):  # pragma: no cover
+        """Fills in values that are not known (`bottom`), by order: what the moves to nearer states make of a state.
+
+        Until a farther state has a value, a move there counts as staying. Where nothing nearer is known it is `bound`.
+        """
+        worths, leaving = np.empty(actions, values.dtype), np.empty(actions, values.dtype)
+        advantage = np.empty(actions, values.dtype)
         for i in range(len(values)):
             if world.fixed[i] or values[i] > bottom:
                 continue
-            best = bound
+            value, reached = bound, False
             for a in range(actions):
-                worth = world.reward[i if len(world.reward) > 1 else 0, a]
-                leaving = world.ending
+                worths[a] = world.reward[i if len(world.reward) > 1 else 0, a]
+                leaving[a] = world.ending
                 for m in range(width):
                     j = world.successors[i, a, m]
                     if j < i and values[j] > bottom:
-                        worth += world.moves[i, a, m] * values[j]
-                        leaving += world.moves[i, a, m]
-                if leaving > world.ending:
-                    best = max(best, worth / leaving)
-            values[i] = best
+                        worths[a] += world.moves[i, a, m] * values[j]
+                        leaving[a] += world.moves[i, a, m]
+                if leaving[a] > world.ending:
+                    escape = worths[a] / leaving[a]
+                    value = max(value, escape) if reached else escape
+                    reached = True
+            if reached and valuing.kind != LOG_SUM_EXP:
+                # values below the best action's, and not above them: these would come down only slowly
+                for _ in range(_NEWTON_STEPS):
+                    for a in range(actions):
+                        advantage[a] = worths[a] - leaving[a] * value
+                    gain, divisor = backed_up(valuing, advantage, leaving)
+                    value += min(gain, 0.0) / (divisor if divisor > 0 else 1.0)
+            values[i] = value
 
     @compiled()
     def out_of_order(world, values, bottom):  # pragma: no cover

@@ -1,6 +1,6 @@
 """Values, from where a task ends outwards, on the host: what to start from, and in which order.
 
-An earlier solve's values are taken on trust for 100 sweeps; if they have not converged by then, the solve starts from
+An earlier solve's values are taken on trust for 12 sweeps; if they have not converged by then, the solve starts from
 nothing. Its order is kept as long as few states want to go to a farther one.
 """
 
@@ -18,7 +18,7 @@ from sidestep.tabular.solvers.sweeping import Valuing
 
 _OUT_OF_ORDER = 0.05
 """The share of states that may want to go to a farther one, before states are put in order anew."""
-_TRUST = 100
+_TRUST = 12
 """How many sweeps a solve may take that starts from an earlier one's values."""
 
 
@@ -82,7 +82,7 @@ def _start_from(
     run = numbering_for(*sizes(given))
     order, world = _in_order(run, given, start, order, bottom)
     values = np.where(world.fixed, np.broadcast_to(given.final_reward, start.shape)[order], start[order])
-    run.first_values(world, values, bottom, asked.bound)
+    run.first_values(asked.valuing, world, values, bottom, asked.bound)
     outcome = Rounds(world, values, asked.valuing, asked.tolerance, max_sweeps).until_still()
     found.values[order] = values
     found.order[:] = order

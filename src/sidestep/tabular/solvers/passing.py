@@ -93,7 +93,8 @@ def weigh(valuing, exact, q, weights, policy):  # pragma: no cover
     variance = 0.0 * best
     for a in range(len(q)):
         behind = q[a] - best - average
-        variance += policy[a] * behind**2
+        # in this order, because an action that is never taken may be worth all but −∞
+        variance += policy[a] * behind * behind
         weights[a] = policy[a] * (1 + beta * behind) if kind == BOLTZMANN and exact else policy[a]
     if not exact or kind == HARD_MAX:
         return 0.0 * best

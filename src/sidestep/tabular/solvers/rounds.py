@@ -2,17 +2,17 @@
 
 `sweeping` holds a single sweep. A round goes over all states once:
 
-1. Where values lie below the best action's (Boltzmann average, mellowmax), up to 8 rounds sweep all states at once,
-   with everything farther shifted. A round whose changes have grown is taken back, and ends this.
+1. For the Boltzmann average, up to 8 rounds sweep all states at once, with everything farther shifted. A round whose
+   changes have grown is taken back, and ends this.
 2. Then rounds go stretch by stretch, some 32 √states states each: a stretch is swept until it is still, at most 30
-   times, before the next one, with only the states beyond the stretch shifted. Its states stay in the processor's
-   cache, and those behind it have settled when it begins.
+   times, before the next one. Its states stay in the processor's cache, and those behind it have settled when it
+   begins. For the Boltzmann average, the states beyond the stretch are shifted.
 3. When no stretch begins with a change beyond the tolerance, a sweep over all states, without exception or shift,
    decides whether the values have converged.
 
-For the hard max and the log-sum-exp there is no 1., because a shift may send values too high. An average falls at once
-when an action gets worse; but two neighbours whose best action each leads to the other, both too high, come down only
-by what a step costs from sweep to sweep: they "count to infinity".
+The other backups are not shifted: a shift may send values too high. An average falls at once when an action gets worse;
+but two neighbours whose best action each leads to the other, both too high, come down only by what a step costs from
+sweep to sweep: they "count to infinity".
 """
 
 import numpy as np
@@ -22,8 +22,10 @@ from sidestep.tabular.solvers.given import Outcome
 from sidestep.tabular.solvers.host import heed_interrupts
 from sidestep.tabular.solvers.numbering import Numbered
 from sidestep.tabular.solvers.process import lowest
-from sidestep.tabular.solvers.sweeping import BOLTZMANN, MELLOWMAX, Marks, Valuing, sweep_for
+from sidestep.tabular.solvers.sweeping import BOLTZMANN, Marks, Valuing, sweep_for
 
+_SHIFTED = (BOLTZMANN,)
+"""The backups whose sweeps shift farther values."""
 _AT_ONCE = 8
 """How many rounds sweep all states at once, at most."""
 _GROWING = 2.0
@@ -65,7 +67,7 @@ class Rounds:
 
     def until_still(self) -> Outcome:
         """Sweeps until a sweep over all states changes none by more than the tolerance, or too much has been done."""
-        residual = self._all_at_once() if self.valuing.kind in (BOLTZMANN, MELLOWMAX) else np.inf
+        residual = self._all_at_once() if self.valuing.kind in _SHIFTED else np.inf
         converged = False
         while not (converged or self._given_up() or np.isnan(residual)):
             residual = self._stretch_by_stretch() if residual > self.tolerance else residual
@@ -103,11 +105,15 @@ class Rounds:
         for again in range(_AGAIN):
             if self._given_up():
                 break
-            change, _ = self._sweep(stretch, shifted=int(stretch[-1]) + 1)
+            change, _ = self._sweep(stretch, self._beyond(stretch))
             residual = change if again == 0 else residual
             if not change > self.tolerance:
                 break
         return residual
+
+    def _beyond(self, stretch: np.ndarray) -> int:
+        """The first position that is shifted when a stretch is swept; past the last where a shift may do harm."""
+        return int(stretch[-1]) + 1 if self.valuing.kind in _SHIFTED else len(self.values)
 
     def _begin_round(self) -> None:
         self.marks.before[:] = self.values

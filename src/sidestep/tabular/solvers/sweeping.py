@@ -107,7 +107,7 @@ def _nothing_to_do(i, actions, width, successors, marks):  # pragma: no cover
 def _look_around(i, actions, width, world, values, solved, first, shifted, bottom, worths, beyond):  # pragma: no cover
     """Fills in what actions are worth, and their chance of leading to where values are to be shifted.
 
-    Returns where the best action most likely leads.
+    Returns where the best of the actions leads whose likeliest outcome has been solved in this round.
     """
     row = i if len(world.reward) > 1 else 0
     best, leads_to = bottom, i
@@ -122,7 +122,7 @@ def _look_around(i, actions, width, world, values, solved, first, shifted, botto
             if move > likeliest:
                 likeliest, toward = move, j
         worths[a], beyond[a] = worth, farther
-        if worth * world.patience[i, a] > best:
+        if solved[toward] >= first and worth * world.patience[i, a] > best:
             best, leads_to = worth * world.patience[i, a], toward
     return leads_to
 

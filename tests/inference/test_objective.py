@@ -1,0 +1,140 @@
+"""The objective of a fit, batch by batch, beside the likelihood and the prior differentiated directly."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from spread import BENT, GOALS, demonstrations
+from walled import BLANK
+
+from sidestep.inference.batches import planned
+from sidestep.inference.objective import MEMORY, Objective, Problem
+from sidestep.inference.priors import Normal
+from sidestep.tabular.backups import Behavior, BoltzmannAverage
+from sidestep.tabular.likelihood import ALL_TERMS, log_likelihood
+from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.solvers.jacobi import Jacobi
+from sidestep.tabular.solvers.ordered import Ordered
+
+SOLVERS = {"jacobi": Jacobi(), "ordered": Ordered()}
+PEOPLE = Behavior(BoltzmannAverage(), 10.0)
+MODEL = ObstacleGrid(BLANK, -2.0)
+PRIOR = Normal(-1.0, 3.0)
+POINT = MODEL.parameters + BENT
+TASKS, STATES = len(GOALS), BLANK.size
+ONE_TASK = STATES * 4 * 2 * 8.0
+"""The bytes of one model's probabilities: four actions, two outcomes, numbers of eight bytes."""
+
+
+def problem_of(solver=SOLVERS["jacobi"], terms=ALL_TERMS, shown=None, model=MODEL):
+    return Problem(model, shown or demonstrations(), PEOPLE, PRIOR, terms, None, "exact", solver)
+
+
+def directly(problem, parameters):
+    """The parts and the slope of the loss, from the likelihood of all demonstrations and the prior."""
+
+    def loss(parameters):
+        likelihood = log_likelihood(
+            problem.model.with_parameters(parameters), problem.demonstrations, PEOPLE, solver=problem.solver
+        )
+        prior = problem.prior.log_density(parameters)
+        return -likelihood.total - prior, (likelihood.actions, likelihood.transitions, prior)
+
+    (_, parts), slope = jax.jit(jax.value_and_grad(loss, has_aux=True))(parameters)
+    return np.array(parts), np.asarray(slope)
+
+
+@pytest.mark.parametrize("memory", [MEMORY, 46 * ONE_TASK, 1.0])
+@pytest.mark.parametrize("name", SOLVERS)
+def test_batches_add_up_to_the_likelihood_and_the_prior(name, memory):
+    problem = problem_of(SOLVERS[name])
+    objective = Objective(problem, memory)
+    found, _ = objective.evaluate(POINT, objective.cold_starts())
+    parts, slope = directly(problem, POINT)
+    np.testing.assert_allclose([found.actions, found.transitions, found.prior], parts, rtol=1e-9)
+    assert found.objective == pytest.approx(parts.sum(), rel=1e-9)
+    np.testing.assert_allclose(found.slope, slope, rtol=1e-9, atol=1e-9 * np.abs(slope).max())
+
+
+def test_the_less_memory_the_more_batches():
+    memories = (MEMORY, 46 * ONE_TASK, 25 * ONE_TASK, 1.0)
+    objectives = [Objective(problem_of(), memory) for memory in memories]
+    assert [len(objective.batches) for objective in objectives] == [1, 2, 5, 5]
+    for objective in objectives:
+        tasks = [np.asarray(batch.choices.counts).sum() for batch in objective.batches]
+        assert sum(tasks) == len(objective.problem.demonstrations)
+        assert len({batch.tasks.terminal.shape for batch in objective.batches}) == 1
+
+
+@pytest.mark.parametrize(("tasks", "devices", "expected"), [(5, 1, 5), (5, 4, 8), (8, 4, 8), (3, 4, 4)])
+def test_devices_share_tasks_equally(tasks, devices, expected):
+    assert planned(MODEL, Jacobi(), tasks, MEMORY, devices) == (expected, True)
+
+
+def test_memory_is_that_of_each_device():
+    """Six tasks need two batches on one device, and one on two devices."""
+    memory = 46 * ONE_TASK
+    assert planned(MODEL, Jacobi(), 6, memory, 1)[0] == 3
+    assert planned(MODEL, Jacobi(), 6, memory, 2)[0] == 6
+
+
+def test_starts_are_dropped_where_there_is_no_room():
+    roomy, tight = Objective(problem_of(), MEMORY), Objective(problem_of(), 1.0)
+    assert (roomy.keeps_starts, tight.keeps_starts) == (True, False)
+    cold = tight.cold_starts()
+    _, left = tight.evaluate(POINT, cold)
+    assert left is cold
+    _, left = roomy.evaluate(POINT, roomy.cold_starts())
+    assert np.isfinite(left[0].adjoint).all()
+    assert (np.asarray(left[0].adjoint) != 0).any()
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_where_solves_start_makes_no_difference(name):
+    objective = Objective(problem_of(SOLVERS[name]), MEMORY)
+    cold, starts = objective.evaluate(POINT, objective.cold_starts())
+    warm, _ = objective.evaluate(POINT, starts)
+    assert np.mean(warm.solved[0].sweeps) < np.mean(cold.solved[0].sweeps)
+    np.testing.assert_allclose(warm[:4], cold[:4], rtol=1e-8)
+    np.testing.assert_allclose(warm.slope, cold.slope, rtol=1e-7, atol=1e-7 * np.abs(cold.slope).max())
+
+
+def test_transitions_alone_need_no_batches():
+    problem = problem_of(terms=("transitions",))
+    objective = Objective(problem, MEMORY)
+    assert (objective.batches, objective.cold_starts()) == ([], [])
+    found, starts = objective.evaluate(POINT, [])
+    transitions = log_likelihood(MODEL.with_parameters(POINT), problem.demonstrations, PEOPLE).transitions
+    assert (found.actions, found.solved, starts) == (0.0, [], [])
+    assert found.transitions == pytest.approx(float(transitions), rel=1e-12)
+    assert found.objective == found.transitions + found.prior
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_32_bit_parameters(name):
+    model = ObstacleGrid(BLANK, jnp.full(STATES, -2.0, jnp.float32))
+    objective = Objective(problem_of(SOLVERS[name], model=model), MEMORY)
+    parameters = POINT.astype(jnp.float32)
+    found, starts = objective.evaluate(parameters, objective.cold_starts())
+    assert found.slope.dtype == starts[0].values.dtype == starts[0].adjoint.dtype == np.float32
+    parts, slope = directly(problem_of(), POINT)
+    np.testing.assert_allclose([found.actions, found.transitions, found.prior], parts, rtol=1e-4)
+    np.testing.assert_allclose(found.slope, slope, atol=1e-3 * np.abs(slope).max())
+
+
+def test_a_solve_that_fails_makes_the_objective_nan():
+    objective = Objective(problem_of(Jacobi(max_sweeps=2)), MEMORY)
+    found, _ = objective.evaluate(POINT, objective.cold_starts())
+    assert np.isnan(found.objective)
+    assert not np.asarray(found.solved[0].converged).any()
+
+
+def test_tasks_that_fill_up_a_batch_count_for_nothing():
+    """Two batches of three tasks, of which there are five: the sixth has ended."""
+    objective = Objective(problem_of(), 46 * ONE_TASK)
+    found, _ = objective.evaluate(POINT, objective.cold_starts())
+    last = found.solved[-1]
+    assert (len(objective.batches), len(last.converged)) == (2, 3)
+    assert np.asarray(objective.batches[-1].tasks.terminal)[-1].all()
+    assert np.asarray(last.converged).all()
+    assert not np.asarray(last.stuck).any()
