@@ -1,6 +1,9 @@
 """A small fit spread over devices or processes: what `test_devices` compares, and the program that its children run."""
 
 import argparse
+import os
+import sys
+import traceback
 from pathlib import Path
 
 import jax
@@ -129,4 +132,10 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except BaseException:
+        # an orderly end would wait for the other process, which waits for this one
+        traceback.print_exc()
+        sys.stderr.flush()
+        os._exit(1)

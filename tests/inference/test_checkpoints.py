@@ -82,3 +82,14 @@ PROBLEM = Pair(np.array([1.0, 2.0]), 3)
 ])  # fmt: skip
 def test_the_fingerprint_tells_problems_apart(other, same):
     assert (fingerprint(PROBLEM) == fingerprint(other)) == same
+
+
+def test_what_a_fit_can_do_without_is_read_where_it_fits(tmp_path):
+    path = tmp_path / "fit.checkpoint"
+    save_checkpoint(path, "key", CARRIED, HISTORY, [np.arange(6.0)])
+    np.testing.assert_array_equal(load_checkpoint(path, "key", LIKE, [np.zeros(6)])[2][0], np.arange(6.0))
+    for kept in ([], [np.zeros(3)], [np.zeros(6, np.float32)], [np.zeros(6)] * 2):
+        carried, history, found = load_checkpoint(path, "key", LIKE, kept)
+        assert history == HISTORY
+        np.testing.assert_array_equal(carried[0], CARRIED[0])
+        assert found is kept
