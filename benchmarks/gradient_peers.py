@@ -22,11 +22,11 @@ With `--models cells table` each map is given twice, as an obstacle grid (a para
 parameter for every outcome of every state and action) with the same probabilities, to show what the number of
 parameters does.
 
-All get the same tolerance, the relative change at which their iterations stop. Plain sweeps may stop too early, so they
-go on until the gradient is within `--accuracy` of the exact one (by `sidestep ordered` at a tolerance of 1e-12, or as
-small as it gets), or as long as they may. All differences are shown. A method that would need more than `--memory` is
-not run, and the table says so; one that takes longer than `--patience` is timed once and not tried on larger maps.
-Memory is measured for the first backup, on maps of `--memory-sizes`.
+All get the same tolerance, the relative change at which their iterations stop; plain sweeps go on until the gradient is
+within `--accuracy` of the exact one (by `sidestep ordered` at a tolerance of 1e-12, or as small as it gets). All
+differences are shown. A method that would need more than `--memory` is not run, and the table says so; one that takes
+longer than `--patience` is timed once and not tried on larger maps. Memory is measured for the first backup, on maps of
+`--memory-sizes`.
 
 Records (`--json`): `name`, `model`, `backup`, `cells`, `parameters`, `tasks`, `cold_seconds`, `warm_seconds` (null
 where there is no warm start), `dijkstra_seconds` (medians), `best_seconds`, `ratio` (to `sidestep ordered`, cold, in
@@ -67,7 +67,7 @@ from sidestep.tabular.solvers.ordered import Ordered
 from sidestep.tabular.solvers.process import DecisionProcess, at_fixed_policy
 from worlds import World, expected_costs, half_learned_office, load
 
-MOST_SWEEPS = 50_000
+MOST_SWEEPS = 5_000
 EXACT = (1e-12, 1e-11, 1e-10)
 """Tolerances of what counts as exact: the first that is reached. The Boltzmann average may waver below 1e-10."""
 Parameters = Float[Array, "..."]
@@ -218,22 +218,6 @@ def forward(problem: Problem, parameters: Parameters) -> Found:
     return unravel(by_parameters + by_values @ slopes), count
 
 
-def plain_sweeps(problem: Problem, parameters: Parameters) -> Array:
-    """How many plain sweeps it takes until no value changes by more than the tolerance, relative to the largest."""
-    tolerance = problem.solver.tolerance_for(jnp.zeros(0).dtype)
-
-    def unfinished(state: tuple[Array, Array, Array]) -> Array:
-        return (state[1] > tolerance) & (state[2] < MOST_SWEEPS)
-
-    def sweep(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        old, _, count = state
-        new = one_backup(problem, parameters, old)
-        return new, jnp.abs(new - old).max() / jnp.abs(new).max(), count + 1
-
-    start = process_of(problem, parameters).end(jnp.zeros(problem.model.graph.states))
-    return jax.lax.while_loop(unfinished, sweep, (start, jnp.asarray(jnp.inf), jnp.asarray(0)))[2]
-
-
 GRADIENTS: Mapping[str, Callable[..., Found]] = {
     "sidestep ordered": adjoint,
     "sidestep jacobi": adjoint,
@@ -311,15 +295,18 @@ def checked(method: Method, exact: Array) -> Method:
 
 
 def enough_sweeps(problem: Problem, exact: Array, limit: float, arguments: argparse.Namespace) -> tuple[Method, Method]:
-    """Plain values and their unrolled gradient, by as many sweeps as make it accurate."""
-    sweeps = int(eqx.filter_jit(plain_sweeps)(problem, problem.model.parameters))
-    while True:
-        method = checked(compiled("unrolled", problem, limit, sweeps), exact)
-        if method.difference is None or method.difference <= arguments.accuracy or sweeps >= MOST_SWEEPS:
+    """Plain values and their unrolled gradient, by about as few sweeps as make it accurate, or as many as may be."""
+    sweeps = round(4 * problem.model.graph.states**0.5)
+    method = checked(compiled("unrolled", problem, limit, sweeps), exact)
+    while method.call is not None and sweeps < MOST_SWEEPS and method.first_seconds <= arguments.patience:
+        if method.difference is not None and method.difference <= arguments.accuracy:
             break
         sweeps = min(MOST_SWEEPS, int(1.3 * sweeps) + 1)
-    method.sweeps = sweeps
-    return checked(compiled("plain values", problem, limit, sweeps), exact), method
+        more = checked(compiled("unrolled", problem, limit, sweeps), exact)
+        if more.call is None:
+            break
+        method = more
+    return checked(compiled("plain values", problem, limit, method.sweeps or sweeps), exact), method
 
 
 def difference(found: Array, expected: Array) -> float | None:

@@ -18,11 +18,14 @@ from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.solve import solve
 from sidestep.tabular.solvers.choice import solver_for
 from sidestep.tabular.solvers.compiled import compiled
+from sidestep.tabular.solvers.given import Given, positions, sizes
 from sidestep.tabular.solvers.jacobi import Jacobi
+from sidestep.tabular.solvers.numbering import numbered, numbering_for
 from sidestep.tabular.solvers.order import order_by_distance
 from sidestep.tabular.solvers.ordered import KERNELS, Ordered
 from sidestep.tabular.solvers.passing import weigh
 from sidestep.tabular.solvers.process import lowest
+from sidestep.tabular.solvers.rounds import Rounds
 from sidestep.tabular.solvers.sweeping import Valuing, backed_up
 from sidestep.tasks import reach, stack_tasks
 
@@ -66,16 +69,13 @@ def order_of(model, wanted):
 
 
 def test_order_of_a_corridor_with_a_slow_cell():
-    """It counts how often the cells on the way to cell 2 must be tried: from 0 to 5, that is 2.1, 1, 0, 1, 11, 12.
-
-    To enter cell 1 takes 1.1 tries and to enter cell 3 takes 10; from it, the first step leads to cell 2.
-    """
-    blocked = np.array([1e-9, 1 - 1 / 1.1, 1e-9, 0.9, 1e-9, 1e-9])
-    model = ObstacleGrid(Grid.unknown(1, 6), jnp.asarray(np.log(blocked) - np.log1p(-blocked)))
-    order = order_of(model, reach(Grid.unknown(1, 6), 2, discount=1.0, step_cost=1.0)).tolist()
-    assert order[0] == 2
-    assert sorted(order[1:3]) == [1, 3]  # both at distance 1
-    assert order[3:] == [0, 4, 5]
+    """To enter cell 2 takes 10 tries, so from cells 0 to 6 it takes 12, 11, 1, 0, 1, 2 and 3 to get to cell 3."""
+    blocked = np.array([1e-9, 1e-9, 0.9, 1e-9, 1e-9, 1e-9, 1e-9])
+    model = ObstacleGrid(Grid.unknown(1, 7), jnp.asarray(np.log(blocked) - np.log1p(-blocked)))
+    order = order_of(model, reach(Grid.unknown(1, 7), 3, discount=1.0, step_cost=1.0)).tolist()
+    assert order[0] == 3
+    assert sorted(order[1:3]) == [2, 4]  # both at distance 1
+    assert order[3:] == [5, 6, 1, 0]
 
 
 def test_discount_makes_slow_cells_far():
@@ -303,6 +303,27 @@ def test_what_is_no_number_is_never_a_solution(name, where):
     found, slope, _ = values_and_slopes(model, wanted, behavior)
     assert not found.converged
     assert jnp.isnan(slope).all()
+
+
+def test_the_last_sweep_leaves_nobody_out():
+    """States that seem to have nothing to do, because nobody said that values changed, are still looked at."""
+    model = some_map()
+    found = solve(model, reach(model.graph, 5, discount=0.99), people("Boltzmann", 1.0), solver=SOLVER)
+    order = np.asarray(found.start.order)
+    position = positions(order)
+    assert position is not None
+    terminal, one = np.arange(420) == 5, np.float64(1)
+    successors, probabilities = np.asarray(model.graph.successors), np.asarray(model.probabilities())
+    given = Given(successors, probabilities, np.zeros((1, 1)), np.ones(1), terminal, np.float64(0.99))
+    world = numbered(numbering_for(*sizes(given)), given, order, position)
+    values = np.asarray(found.values)[order]
+    solved = values.copy()
+    rounds = Rounds(world, values, Valuing(KERNELS[BoltzmannAverage], one, 0 * one), np.float64(1e-11), 1000)
+    assert rounds.until_still().converged
+    values[1:] *= 0.5
+    rounds.marks.changed[:], rounds.marks.solved[:] = 0, rounds.number
+    assert rounds.until_still().converged
+    np.testing.assert_allclose(values, solved, rtol=1e-8)
 
 
 class Sharper(BoltzmannAverage):
