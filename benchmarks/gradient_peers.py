@@ -59,9 +59,11 @@ from jaxtyping import Array, Float
 from scipy.sparse.csgraph import dijkstra
 
 import measuring
-from scaling import SOLVERS, Problem, stepped, take, visited_action_values
+from scaling import SOLVERS, Problem, stepped, take
+from sidestep.demonstrations import Demonstrations
 from sidestep.errors import NotConverged
 from sidestep.tabular.backups import BACKUPS, Behavior
+from sidestep.tabular.likelihood import choices_of
 from sidestep.tabular.models import TabularModel, TransitionModel
 from sidestep.tabular.solve import solve
 from sidestep.tabular.solvers.ordered import Ordered
@@ -84,7 +86,7 @@ def problem_of(world: World, model: str, backup: str, arguments: argparse.Namesp
     demos = world.demonstrations(arguments.discount, cost)
     people = Behavior(BACKUPS[backup](), arguments.beta)
     made = world.model if model == "cells" else table_of(world.model)
-    return Problem(made, demos, people, Ordered(tolerance=arguments.tolerance), arguments.gradient)
+    return Problem(made, demos, choices_of(demos), people, Ordered(tolerance=arguments.tolerance), arguments.gradient)
 
 
 def table_of(model: TransitionModel) -> TabularModel:
@@ -111,6 +113,16 @@ def one_backup(problem: Problem, parameters: Parameters, values: Array) -> Array
     if problem.gradient == "exact":
         return process.end(people.backup.value(q, people.beta))
     return process.end(at_fixed_policy(people.backup, people.beta, q))
+
+
+def visited_action_values(
+    model: TransitionModel, demos: Demonstrations, values: Array
+) -> Float[Array, "moves actions"]:
+    """Q(s, a) of the state of every move; of other states they are not needed."""
+    own = values[demos.task, demos.states][:, None]
+    after = values[demos.task[:, None, None], model.graph.successors[demos.states]]
+    gained = jnp.sum(model.probabilities()[demos.states] * (after - own[..., None]), axis=-1)
+    return demos.tasks.reward[demos.task, 0] + demos.tasks.discount[demos.task, None] * (own + gained)
 
 
 def chosen(problem: Problem, parameters: Parameters, values: Array) -> Array:
@@ -241,7 +253,7 @@ def method_function(name: str, problem: Problem, sweeps: int) -> tuple[Callable[
         function = partial(function, sweeps=sweeps)
     if name == "sidestep jacobi":
         solver = SOLVERS["jacobi"](tolerance=problem.solver.tolerance)
-        problem = Problem(problem.model, problem.demonstrations, problem.behavior, solver, problem.gradient)
+        problem = eqx.tree_at(lambda p: p.solver, problem, solver)
     return function, problem
 
 
@@ -320,7 +332,7 @@ def exact_gradient(problem: Problem) -> Array:
     """The gradient by `sidestep ordered` at a tolerance as small as is reached; raises `NotConverged` if none is."""
     for tolerance in EXACT:
         solver = Ordered(tolerance=tolerance, max_sweeps=1_000)
-        strict = Problem(problem.model, problem.demonstrations, problem.behavior, solver, problem.gradient)
+        strict = eqx.tree_at(lambda p: p.solver, problem, solver)
         found = take(strict, problem.model.parameters, problem.cold_start())
         if bool(found.converged):
             return found.gradient

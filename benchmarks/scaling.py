@@ -49,11 +49,13 @@ import measuring
 from sidestep.demonstrations import Demonstrations
 from sidestep.errors import NotConverged
 from sidestep.tabular.backups import BACKUPS, Behavior, Gradient
+from sidestep.tabular.likelihood import Choices, choice_log_likelihood, choices_of
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.solve import solve
+from sidestep.tabular.solve import Solution
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.solvers.ordered import Ordered
 from sidestep.tabular.solvers.process import Solver, Start
+from sidestep.tasks import Task
 from worlds import World, expected_costs, half_learned_office, load
 
 SOLVERS = {"ordered": Ordered, "jacobi": Jacobi}
@@ -66,6 +68,7 @@ class Problem(eqx.Module):
 
     model: TransitionModel
     demonstrations: Demonstrations
+    choices: Choices
     behavior: Behavior
     solver: Solver
     gradient: Gradient = eqx.field(static=True, default="exact")
@@ -91,7 +94,7 @@ def problem_of(world: World, name: str, backup: str, arguments: argparse.Namespa
     """The problem in a world."""
     demos = world.demonstrations(arguments.discount, arguments.step_cost)
     solver = SOLVERS[name](tolerance=arguments.tolerance)
-    return Problem(world.model, demos, Behavior(BACKUPS[backup](), arguments.beta), solver)
+    return Problem(world.model, demos, choices_of(demos), Behavior(BACKUPS[backup](), arguments.beta), solver)
 
 
 @eqx.filter_jit
@@ -99,29 +102,19 @@ def take(problem: Problem, parameters: Float[Array, "..."], start: Start) -> Ste
     """The action log-likelihood and its gradient, from a start; the new start holds the new adjoint."""
 
     def objective(parameters: Array, adjoint: Array) -> tuple[Array, tuple]:
-        model, demos = problem.model.with_parameters(parameters), problem.demonstrations
-        begun = start._replace(adjoint=adjoint)
-        found = solve(
-            model, demos.tasks, problem.behavior, gradient=problem.gradient, solver=problem.solver, start=begun
-        )
-        log_policy = problem.behavior.log_policy(visited_action_values(model, demos, found.values))
-        chosen = jnp.take_along_axis(log_policy, demos.actions[:, None], axis=-1)
-        return jnp.sum(chosen), (found.start, found.sweeps, found.converged.all())
+        model, begun = problem.model.with_parameters(parameters), start._replace(adjoint=adjoint)
+
+        def one(task: Task, choices: Choices, begun: Start) -> tuple[Array, Solution]:
+            return choice_log_likelihood(
+                model, task, choices, problem.behavior, begun, gradient=problem.gradient, solver=problem.solver
+            )
+
+        values, found = jax.vmap(one)(problem.demonstrations.tasks, problem.choices, begun)
+        return values.sum(), (found.start, found.sweeps, found.converged.all())
 
     differentiated = jax.value_and_grad(objective, argnums=(0, 1), has_aux=True)
     (value, (left, sweeps, converged)), (gradient, adjoint) = differentiated(parameters, start.adjoint)
-    converged &= jnp.isfinite(gradient).all()
     return Step(value, gradient, left._replace(adjoint=adjoint), sweeps, converged)
-
-
-def visited_action_values(
-    model: TransitionModel, demos: Demonstrations, values: Array
-) -> Float[Array, "moves actions"]:
-    """Q(s, a) of the state of every move; of other states they are not needed."""
-    own = values[demos.task, demos.states][:, None]
-    after = values[demos.task[:, None, None], model.graph.successors[demos.states]]
-    gained = jnp.sum(model.probabilities()[demos.states] * (after - own[..., None]), axis=-1)
-    return demos.tasks.reward[demos.task, 0] + demos.tasks.discount[demos.task, None] * (own + gained)
 
 
 def stepped(parameters: Array, gradient: Array, arguments: argparse.Namespace) -> Array:
@@ -179,7 +172,7 @@ def measure(
             **_went(steps[name]),
             "tolerance": arguments.tolerance,
             "step": arguments.step,
-            "moves": len(problems[name].demonstrations),
+            "moves": len(world.walks) - len(world.ends),
             **_memory(world.size, saved, name, backup, arguments),
         }
         for name in names
@@ -203,7 +196,8 @@ def _times(taken: Mapping[str, Sequence[float]], name: str) -> dict[str, Any]:
 def _went(steps: Sequence[Step]) -> dict[str, Any]:
     """The sweeps of the values, and whether values and adjoints all converged; they must."""
     cold, warm = steps
-    if not (cold.converged and warm.converged):
+    # an adjoint that did not converge leaves a gradient of NaN
+    if not all(step.converged and jnp.isfinite(step.gradient).all() for step in (cold, warm)):
         raise NotConverged("the values or the adjoint did not converge: try another tolerance or backup")
     return {"cold_sweeps": int(cold.sweeps.max()), "warm_sweeps": int(warm.sweeps.max()), "converged": True}
 

@@ -318,7 +318,8 @@ def test_the_last_sweep_leaves_nobody_out():
     world = numbered(numbering_for(*sizes(given)), given, order, position)
     values = np.asarray(found.values)[order]
     solved = values.copy()
-    rounds = Rounds(world, values, Valuing(KERNELS[BoltzmannAverage], one, 0 * one), np.float64(1e-11), 1000)
+    valuing = Valuing(KERNELS[BoltzmannAverage], one, 0 * one)
+    rounds = Rounds(world, values, np.arange(420, dtype=np.int32), valuing, np.float64(1e-11), 1000)
     assert rounds.until_still().converged
     values[1:] *= 0.5
     rounds.marks.changed[:], rounds.marks.solved[:] = 0, rounds.number

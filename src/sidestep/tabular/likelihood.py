@@ -8,7 +8,6 @@ People plan with the dynamics that they know, so both terms depend on θ: the *a
 
 from typing import Literal, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -17,7 +16,7 @@ from sidestep.demonstrations import Demonstrations
 from sidestep.tabular.backups import Behavior, Gradient
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import Solution, solve
-from sidestep.tabular.solvers.process import Solver, Start
+from sidestep.tabular.solvers.process import Solver, Start, action_values
 from sidestep.tasks import Task
 
 Term = Literal["actions", "transitions"]
@@ -105,10 +104,17 @@ def choice_log_likelihood(
     NaN if its values did not converge. Over the tasks of `choices_of(demonstrations)` it adds up to
     `action_log_likelihood`.
     """
-    solution = solve(model, task, behavior, horizon=horizon, gradient=gradient, solver=solver, start=start)
-    alone = jax.tree.map(lambda leaf: leaf[None], task)
-    first = jnp.zeros_like(choices.states)
-    q = _visited_action_values(model, alone, solution.values[None], first, choices.states)
+    solution = solve(
+        model,
+        task,
+        behavior,
+        horizon=horizon,
+        gradient=gradient,
+        solver=solver,
+        start=start,
+        visited=choices.states,
+    )
+    q = solution.action_values
     total = jnp.sum(choices.counts.astype(q.dtype) * _log_policy(behavior, q, choices.actions))
     return total * _nan_unless(solution.converged), solution
 
@@ -132,12 +138,11 @@ def _visited_action_values(
     task: Int[Array, " visits"],
     states: Int[Array, " visits"],
 ) -> Float[Array, "visits actions"]:
-    """Q(s, a) of visited states, from the values of all tasks: `DecisionProcess.action_values` for these alone."""
-    value = values[task, states]
-    differences = values[task[:, None, None], model.graph.successors[states]] - value[:, None, None]
-    expected = value[:, None] + jnp.sum(model.probabilities()[states] * differences, axis=-1)
+    """Q(s, a) of visited states, from the values of all tasks."""
+    after = values[task[:, None, None], model.graph.successors[states]]
     reward = tasks.reward[task, states if tasks.reward.shape[1] > 1 else 0].astype(values.dtype)
-    return reward + tasks.discount[task, None].astype(values.dtype) * expected
+    discount = tasks.discount[task, None].astype(values.dtype)
+    return action_values(values[task, states], after, model.probabilities()[states], reward, discount)
 
 
 def _log_policy(

@@ -109,28 +109,40 @@ class ObstacleGrid(TransitionModel):
         unknown = self.parameters.reshape(self.known.shape)
         known = jnp.where(self.known == Cell.OCCUPIED, jnp.inf, -jnp.inf)
         logits = jnp.where(self.known == Cell.UNKNOWN, unknown, known)
-        moves = [_success(logits, *step) for step in STEPS[: self.graph.actions].tolist()]
-        outcomes = [jnp.stack(outcome, axis=-1).reshape(-1, self.graph.actions) for outcome in zip(*moves, strict=True)]
-        return jnp.stack(outcomes, axis=-1)
+        # off the map nothing is blocked
+        free = jnp.pad(jax.nn.sigmoid(-logits), 1, constant_values=1)
+        blocked = jnp.pad(jax.nn.sigmoid(logits), 1)
+        # without a barrier the compiler works these out anew for every move
+        free, blocked = jax.lax.optimization_barrier((free, blocked))
+        outcomes = [
+            outcome
+            for down, right in STEPS[: self.graph.actions].tolist()
+            for outcome in _outcomes(free, blocked, down, right)
+        ]
+        return jnp.stack(outcomes, axis=-1).reshape(-1, self.graph.actions, 2)
 
 
-def _success(
-    logits: Float[Array, "rows columns"], down: int, right: int
+def _outcomes(
+    free: Float[Array, "padded_rows padded_columns"],
+    blocked: Float[Array, "padded_rows padded_columns"],
+    down: int,
+    right: int,
 ) -> tuple[Float[Array, "rows columns"], Float[Array, "rows columns"]]:
-    """The probabilities that a move from each cell succeeds, and that it fails; off the map nothing is blocked.
+    """The probabilities that a move from each cell succeeds, and that it fails, from those of the padded map's cells.
 
     Slices of the map rather than look-ups: their derivatives are slices too.
     """
-    rows, columns = logits.shape
-    around = jnp.pad(logits, 1, constant_values=-jnp.inf)
-    needed = [(down, right)] if down == 0 or right == 0 else [(down, right), (down, 0), (0, right)]
-    success, failure = 1.0, 0.0
-    for i, j in needed:
-        cell = around[1 + i : 1 + i + rows, 1 + j : 1 + j + columns]
+    rows, columns = free.shape[0] - 2, free.shape[1] - 2
+
+    def beside(cells: Array, i: int, j: int) -> Array:
+        return cells[1 + i : 1 + i + rows, 1 + j : 1 + j + columns]
+
+    success, failure = beside(free, down, right), beside(blocked, down, right)
+    for i, j in ((down, 0), (0, right)) if down and right else ():
         # 1 − Π free, summed without cancellation where obstacles are improbable
-        failure = failure + success * jax.nn.sigmoid(cell)
-        success = success * jax.nn.sigmoid(-cell)
-    return jnp.asarray(success), jnp.asarray(failure)
+        failure = failure + success * beside(blocked, i, j)
+        success = success * beside(free, i, j)
+    return success, failure
 
 
 def true_model(grid: Grid) -> ObstacleGrid:

@@ -26,6 +26,7 @@ from sidestep.tabular.solvers.process import (
     Solver,
     Start,
     Sweeps,
+    action_values,
     finite_horizon,
 )
 from sidestep.tasks import Task
@@ -35,13 +36,13 @@ class Solution(eqx.Module):
     """The values of a task under a model, and how the solve went (with a leading `tasks` axis for several tasks).
 
     - `values`: V(s); at discount 1, states that cannot reach a terminal state are near `process.lowest` (for −∞).
-    - `action_values`: Q(s, a).
+    - `action_values`: Q(s, a); of all states, or of those that were asked for.
     - `sweeps`, `residual`, `converged`: see `process.Sweeps`; a finite horizon takes one exact sweep an action.
     - `start`: what a solve of the same task under a model nearby may start from.
     """
 
     values: Float[Array, "*tasks states"]
-    action_values: Float[Array, "*tasks states actions"]
+    action_values: Float[Array, "*tasks visited actions"]
     sweeps: Int[Array, "*tasks"]
     residual: Float[Array, "*tasks"]
     converged: Bool[Array, "*tasks"]
@@ -57,6 +58,7 @@ def solve(
     gradient: Gradient = "exact",
     solver: Solver | None = None,
     start: Start | None = None,
+    visited: Int[Array, "*tasks visited"] | None = None,
 ) -> Solution:
     """The values of one task, or of a stack of tasks, for people who behave as `behavior` says under `model`.
 
@@ -66,6 +68,8 @@ def solve(
     - `start`: what an earlier solution of the same task or tasks left; without it, the solve starts from nothing. The
       solution does not depend on it beyond the tolerance. Differentiating with respect to `start.adjoint` yields the
       new adjoint λ, for the next solve to start from.
+    - `visited`: the states whose action values are wanted; by default all. Asking for few saves time and memory when
+      they are differentiated.
 
     The numbers have the dtype of the model's probabilities. May be used under `jit`, `vmap` and `grad`. Look at
     `converged` before you use the numbers; `check_proper` tells beforehand whether values exist.
@@ -79,7 +83,7 @@ def solve(
     solver = solver or solver_for(behavior.backup, model.graph.states)
     begin = start or _cold_start(solver, model.graph.states, dtype, task.terminal.shape[:-1])
 
-    def one(task: Task, start: Start) -> Solution:
+    def one(task: Task, start: Start, visited: Array | None) -> Solution:
         process = DecisionProcess(
             model.graph.successors,
             probabilities,
@@ -88,17 +92,25 @@ def solve(
             task.terminal,
             task.discount.astype(dtype),
         )
+        some = jnp.zeros(0, jnp.int32) if visited is None else visited
         if horizon is None:
-            found = _solve_fixed_point(process, behavior, gradient, solver, start)
+            found, rows = _solve_fixed_point(process, behavior, gradient, solver, start, some)
         else:
             values = finite_horizon(process, behavior.backup, behavior.beta, horizon, gradient)
             residual = jnp.asarray(0, values.dtype)
             found = Sweeps(values, start.order, jnp.asarray(horizon), residual, jnp.isfinite(values).all())
-        q = process.action_values(found.values)
-        left = Start(jax.lax.stop_gradient(found.values), start.adjoint, found.order)
-        return Solution(found.values, q, found.sweeps, found.residual, found.converged, left)
+            rows = probabilities[some]
+        values = found.values
+        if visited is None:
+            q = process.action_values(values)
+        else:
+            reward = process.reward[visited] if len(process.reward) > 1 else process.reward
+            after = values[process.successors[visited]]
+            q = action_values(values[visited], after, rows, reward, process.discount)
+        left = Start(jax.lax.stop_gradient(values), start.adjoint, found.order)
+        return Solution(values, q, found.sweeps, found.residual, found.converged, left)
 
-    return jax.vmap(one)(task, begin) if task.terminal.ndim == 2 else one(task, begin)
+    return jax.vmap(one)(task, begin, visited) if task.terminal.ndim == 2 else one(task, begin, visited)
 
 
 def _cold_start(solver: Solver, states: int, dtype: jnp.dtype, tasks: tuple[int, ...]) -> Start:
@@ -133,14 +145,20 @@ def check_proper(task: Task, behavior: Behavior, actions: int, horizon: int | No
 
 
 def _solve_fixed_point(
-    process: DecisionProcess, behavior: Behavior, gradient: Gradient, solver: Solver, start: Start
-) -> Sweeps:
+    process: DecisionProcess,
+    behavior: Behavior,
+    gradient: Gradient,
+    solver: Solver,
+    start: Start,
+    visited: Int[Array, " visited"],
+) -> tuple[Sweeps, Float[Array, "visited actions outcomes"]]:
     varying = (process.probabilities, process.reward, process.final_reward, process.discount, behavior.beta)
     held = jax.lax.stop_gradient(varying)
     given = (process.successors, process.terminal)
     found = solver.values(_process(given, held), behavior.backup, held[-1], jax.lax.stop_gradient(start))
-    given = (*given, solver, found.order)
-    return found._replace(values=_implicit(behavior.backup, gradient, given, varying, found.values, start.adjoint))
+    given = (*given, solver, found.order, visited)
+    solved: tuple[Array, Array] = _implicit(behavior.backup, gradient, given, varying, found.values, start.adjoint)
+    return found._replace(values=solved[0]), solved[1]
 
 
 def _process(given: tuple, varying: tuple) -> DecisionProcess:
@@ -156,30 +174,32 @@ def _implicit(
     varying: tuple,
     values: Float[Array, " states"],
     adjoint: Float[Array, " states"],
-) -> Float[Array, " states"]:
+) -> tuple[Float[Array, " states"], Float[Array, "visited actions outcomes"]]:
     """`values`, the solution V of V = F(V, φ) with φ = `varying`, with their gradient by the adjoint equation.
 
-    `adjoint` is where the solve of that starts. It has no influence, so its gradient is free to carry the new adjoint
-    out of the backward pass.
+    And the visited states' probabilities, whose gradient is added to the one by the values where it is: two arrays of
+    the model's size would take longer to make and to add than most of the rest.
+
+    `adjoint` is where the solve of the adjoint starts. It has no influence, so its gradient is free to carry the new
+    adjoint out of the backward pass.
     """
-    del backup, gradient, given, varying, adjoint
-    return values
+    del backup, gradient, adjoint
+    return values, varying[0][given[-1]]
 
 
 def _implicit_forward(backup: Backup, gradient: Gradient, given: tuple, varying: tuple, values: Array, adjoint: Array):
-    del backup, gradient
-    return values, (given, varying, values, adjoint)
+    found = _implicit(backup, gradient, given, varying, values, adjoint)
+    return found, (given, varying, values, adjoint)
 
 
-def _implicit_backward(backup: Backup, gradient: Gradient, saved: tuple, cotangent: Array):
+def _implicit_backward(backup: Backup, gradient: Gradient, saved: tuple, cotangents: tuple[Array, Array]):
     given, varying, values, adjoint = saved
-    solver, order = given[2:]
+    solver, order, visited = given[2:]
     process, beta = _process(given, varying), varying[-1]
     start = Start(values, adjoint, order)
-    by, found = solver.pull_back(process, backup, beta, gradient, values, cotangent, start)
-    failed = jnp.where(found.converged, 0.0, jnp.nan).astype(values.dtype)
-    by = jax.tree.map(lambda leaf: leaf + failed, by)
-    return None, tuple(by), jnp.zeros_like(values), found.values + failed
+    by, found = solver.pull_back(process, backup, beta, gradient, values, cotangents[0], start)
+    by = by._replace(probabilities=by.probabilities.at[visited].add(cotangents[1]))
+    return None, tuple(by), jnp.zeros_like(values), found.values
 
 
 _implicit.defvjp(_implicit_forward, _implicit_backward)

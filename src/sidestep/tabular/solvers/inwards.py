@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sidestep.tabular.solvers.given import Found, Outcome, given_from, positions, sizes, write
-from sidestep.tabular.solvers.host import heed_interrupts
+from sidestep.tabular.solvers.host import heed_interrupts, shared_out
 from sidestep.tabular.solvers.passing import HostGradients, Passing, Setting, Shares, passing_for
 from sidestep.tabular.solvers.process import lowest
 from sidestep.tabular.solvers.sweeping import Valuing
@@ -40,25 +40,45 @@ def pull_back(
     """
     number = values.dtype.type
     by, found = HostGradients(*into[0]), Found(*into[1])
-    for gradient in by:
-        gradient[...] = 0
     position = positions(order)
     total = np.abs(cotangent).sum()
     if position is None or total == 0 or not np.isfinite(total):
         # nothing to solve, or nothing that it could be solved for
-        found.values[:] = 0
+        _fill(0.0 if total == 0 else np.nan, found.values, *by)
         write(found, order, Outcome(0, 0.0 if total == 0 else np.nan, bool(total == 0)))
         return
     given, valuing = given_from(process), Valuing(kind, number(beta), number(tie))
     reached = number(-((-lowest(values.dtype)) ** 0.5))
     setting = Setting(given, valuing, exact, values, reached, order, position)
-    actions, outcomes, width = sizes(given)
     known = np.where(np.isfinite(start), start, number(0))
+    actions, outcomes, width = sizes(given)
     shares = _no_shares(width, setting, known[order], cotangent[order])
     run = passing_for(actions, outcomes, width)
     outcome = _pass_on_until_gone(run, setting, shares, number(total), number(tolerance), max_sweeps)
-    run.pull_back(setting, shares, found.values, by)
+    if not outcome.converged:
+        _fill(np.nan, found.values, *by)
+        write(found, order, outcome)
+        return
+    by_values = shares.adjoint, shares.weights, shares.beta
+    del shares  # the gradient takes the memory that it held
+    _fill(0.0, *by[1:])
+
+    def assemble(begin: int, end: int) -> HostGradients:
+        shared = [np.zeros_like(part) if len(np.atleast_1d(part)) == 1 else part for part in by[1:]]
+        own = HostGradients(by.probabilities, *shared)
+        run.pull_back(begin, end, setting, *by_values, found.values, own)
+        return own
+
+    for own in shared_out(assemble, len(order)):
+        for part, added in zip(by[1:], own[1:], strict=True):
+            if added is not part:
+                np.add(part, added, out=part)
     write(found, order, outcome)
+
+
+def _fill(number: float, *arrays: np.ndarray) -> None:
+    for array in arrays:
+        array[...] = number
 
 
 def _no_shares(width: int, setting: Setting, adjoint: np.ndarray, residual: np.ndarray) -> Shares:
@@ -86,6 +106,7 @@ def _pass_on_until_gone(
     finest = tolerance * total / states
     threshold = max(finest, _COARSEST * total)
     if shares.adjoint.any():
+        shared_out(lambda begin, end: run.fill_in(begin, end, finest, setting, shares), states)
         run.pass_on(finest, True, setting, shares)
     passed_on, left = 0, np.inf
     for _ in range(max_sweeps):

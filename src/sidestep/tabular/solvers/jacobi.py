@@ -86,7 +86,11 @@ class Jacobi(Solver):
         weights = backup.weights(q, beta) if gradient == "exact" else policy
         found = self._adjoint(process, weights, policy, live, cotangent, start)
         at = Gradients(process.probabilities, process.reward, process.final_reward, process.discount, beta)
-        return jax.vjp(one_backup, at)[1](found.values)[0], found
+        adjoint = jnp.where(found.converged, found.values, jnp.nan)
+        by = jax.vjp(one_backup, at)[1](adjoint)[0]
+        # what the adjoint had no part in would stay 0
+        by = jax.tree.map(lambda leaf: jnp.where(found.converged, leaf, jnp.nan), by)
+        return by, found._replace(values=adjoint)
 
     def _adjoint(
         self,

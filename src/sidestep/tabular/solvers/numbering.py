@@ -11,10 +11,8 @@ from jaxtyping import Int
 
 from sidestep.tabular.solvers.compiled import compiled
 from sidestep.tabular.solvers.given import Given
-from sidestep.tabular.solvers.sweeping import LOG_SUM_EXP, backed_up
-
-_NEWTON_STEPS = 3
-"""How often a first value is improved."""
+from sidestep.tabular.solvers.host import shared_out
+from sidestep.tabular.solvers.sweeping import backed_up
 
 
 class Numbered(NamedTuple):
@@ -42,7 +40,7 @@ class Numbering(NamedTuple):
     width: int
     number_states: Any
     first_values: Any
-    out_of_order: Any
+    favourites: Any
 
 
 def numbered(
@@ -60,7 +58,8 @@ def numbered(
         fixed=np.empty(states, bool),
         ending=1 - given.discount,
     )
-    run.number_states(order, position, given.successors, given.probabilities, given.terminal, given.discount, world)
+    arrays = (order, position, given.successors, given.probabilities, given.terminal, given.discount, world)
+    shared_out(lambda begin, end: run.number_states(begin, end, *arrays), states)
     return world
 
 
@@ -69,9 +68,11 @@ def numbering_for(actions: int, outcomes: int, width: int) -> Numbering:
     """The machine code for that many; as constants they make it twice as fast."""
 
     @compiled()
-    def number_states(order, position, successors, probabilities, terminal, discount, world):  # pragma: no cover
-        """Fills in `world` with the states taken in `order`."""
-        for i in range(len(order)):
+    def number_states(
+        begin, end, order, position, successors, probabilities, terminal, discount, world
+    ):  # pragma: no cover
+        """Fills in `world` with the states taken in `order`, from one position up to another."""
+        for i in range(begin, end):
             state = order[i]
             world.fixed[i] = terminal[state]
             for a in range(actions):
@@ -94,7 +95,8 @@ def numbering_for(actions: int, outcomes: int, width: int) -> Numbering:
     def first_values(valuing, world, values, bottom, bound):  # pragma: no cover
         """Fills in values that are not known (`bottom`), by order: what the moves to nearer states make of a state.
 
-        Until a farther state has a value, a move there counts as staying. Where nothing nearer is known it is `bound`.
+        An action that does not lead to any counts as one that costs its price twice, there and back. Where nothing
+        nearer is known the value is `bound`.
         """
         worths, leaving = np.empty(actions, values.dtype), np.empty(actions, values.dtype)
         advantage = np.empty(actions, values.dtype)
@@ -114,20 +116,20 @@ def numbering_for(actions: int, outcomes: int, width: int) -> Numbering:
                     escape = worths[a] / leaving[a]
                     value = max(value, escape) if reached else escape
                     reached = True
-            if reached and valuing.kind != LOG_SUM_EXP:
-                # values below the best action's, and not above them: these would come down only slowly
-                for _ in range(_NEWTON_STEPS):
-                    for a in range(actions):
-                        advantage[a] = worths[a] - leaving[a] * value
-                    gain, divisor = backed_up(valuing, advantage, leaving)
-                    value += min(gain, 0.0) / (divisor if divisor > 0 else 1.0)
+            if reached:
+                for a in range(actions):
+                    advantage[a] = worths[a] - leaving[a] * value
+                    if not leaving[a] > world.ending:
+                        advantage[a] += min(worths[a], 0.0)
+                gain, divisor = backed_up(valuing, advantage, leaving)
+                value += gain / (divisor if divisor > 0 else 1.0)
             values[i] = value
 
     @compiled()
-    def out_of_order(world, values, bottom):  # pragma: no cover
-        """How many states want to go to a farther one, by values that are known."""
+    def favourites(begin, end, world, values, bottom, favourite):  # pragma: no cover
+        """Fills in where states want to go, by values that are known; returns how many want to go to a farther one."""
         count = 0
-        for i in range(len(values)):
+        for i in range(begin, end):
             best, leads_to = bottom, i
             for a in range(actions):
                 for m in range(width):
@@ -136,7 +138,8 @@ def numbering_for(actions: int, outcomes: int, width: int) -> Numbering:
                     worth = values[j] + world.reward[i if len(world.reward) > 1 else 0, a] / move
                     if move > 0 and worth > best:
                         best, leads_to = worth, j
+            favourite[i] = leads_to
             count += leads_to > i and not world.fixed[i]
         return count
 
-    return Numbering(width, number_states, first_values, out_of_order)
+    return Numbering(width, number_states, first_values, favourites)

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sidestep.tabular.solvers.given import Found, Given, Outcome, given_from, positions, sizes, write
-from sidestep.tabular.solvers.numbering import Numbered, Numbering, numbered, numbering_for
+from sidestep.tabular.solvers.host import shared_out
+from sidestep.tabular.solvers.numbering import Numbered, numbered, numbering_for
 from sidestep.tabular.solvers.order import order_by_distance
 from sidestep.tabular.solvers.process import lowest
 from sidestep.tabular.solvers.rounds import Rounds
@@ -61,8 +62,9 @@ def find_values(
     if (start > nothing).any():
         outcome = _start_from(start, order, asked, min(_TRUST, max_sweeps), found)
     if not outcome.converged and outcome.sweeps < max_sweeps:
-        cold = np.full_like(start, nothing), np.full_like(order, -1)
-        again = _start_from(*cold, asked, max_sweeps - outcome.sweeps, found)
+        # a start that led nowhere may have had a good order
+        cold, known_order = np.full_like(start, nothing), found.order if outcome.sweeps else order
+        again = _start_from(cold, known_order, asked, max_sweeps - outcome.sweeps, found)
         outcome = again._replace(sweeps=outcome.sweeps + again.sweeps)
     write(found, found.order, outcome)
 
@@ -78,33 +80,45 @@ def _start_from(
     start: Float[np.ndarray, " states"], order: Int[np.ndarray, " states"], asked: _Asked, max_sweeps: int, found: Found
 ) -> Outcome:
     """Solves from values and an order that may serve; writes down the values and the order that did."""
-    given, bottom = asked.given, start.dtype.type(lowest(start.dtype))
-    run = numbering_for(*sizes(given))
-    order, world = _in_order(run, given, start, order, bottom)
-    values = np.where(world.fixed, np.broadcast_to(given.final_reward, start.shape)[order], start[order])
-    run.first_values(asked.valuing, world, values, bottom, asked.bound)
-    outcome = Rounds(world, values, asked.valuing, asked.tolerance, max_sweeps).until_still()
-    found.values[order] = values
-    found.order[:] = order
+    begun = _begin(start, order, asked) if positions(order) is not None else None
+    if begun is None or begun.astray > _OUT_OF_ORDER * len(order):
+        given = asked.given
+        best = order_by_distance(
+            given.successors, given.probabilities, given.reward, given.terminal, float(given.discount)
+        )
+        begun = _begin(start, best, asked)
+    rounds = Rounds(begun.world, begun.values, begun.favourite, asked.valuing, asked.tolerance, max_sweeps)
+    outcome = rounds.until_still()
+    found.values[begun.order] = begun.values
+    found.order[:] = begun.order
     return outcome
 
 
-def _in_order(
-    run: Numbering,
-    given: Given,
-    start: Float[np.ndarray, " states"],
-    order: Int[np.ndarray, " states"],
-    bottom: np.floating,
-) -> tuple[Int[np.ndarray, " states"], Numbered]:
-    """The order, the one given if it still serves; and the task with its states numbered by it."""
-    position = positions(order)
-    if position is not None:
-        world = numbered(run, given, order, position)
-        if run.out_of_order(world, start[order], bottom) <= _OUT_OF_ORDER * len(order):
-            return order, world
-    order = order_by_distance(
-        given.successors, given.probabilities, given.reward, given.terminal, float(given.discount)
-    )
+class _Begun(NamedTuple):
+    """A task with its states numbered by an order, and first values for all of them.
+
+    `favourite` is where each state wants to go by the values that it started from, the state itself where these are not
+    known; `astray` says how many want to go to a farther one.
+    """
+
+    order: Int[np.ndarray, " states"]
+    world: Numbered
+    values: Float[np.ndarray, " states"]
+    favourite: Int[np.ndarray, " states"]
+    astray: int
+
+
+def _begin(start: Float[np.ndarray, " states"], order: Int[np.ndarray, " states"], asked: _Asked) -> _Begun:
+    given, bottom = asked.given, start.dtype.type(lowest(start.dtype))
+    run = numbering_for(*sizes(given))
     position = positions(order)
     assert position is not None
-    return order, numbered(run, given, order, position)
+    world = numbered(run, given, order, position)
+    values, fixed = start[order], np.flatnonzero(world.fixed)
+    values[fixed] = np.broadcast_to(given.final_reward, start.shape)[order[fixed]]
+    favourite = np.empty_like(order)
+    astray = sum(
+        shared_out(lambda begin, end: run.favourites(begin, end, world, values, bottom, favourite), len(order))
+    )
+    run.first_values(asked.valuing, world, values, bottom, asked.bound)
+    return _Begun(order, world, values, favourite, astray)

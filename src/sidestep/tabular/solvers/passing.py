@@ -70,6 +70,7 @@ class HostGradients(NamedTuple):
 class Passing(NamedTuple):
     """The machine code for one number of actions, of outcomes, and of outcomes that leave a state."""
 
+    fill_in: Any
     pass_on: Any
     pull_back: Any
 
@@ -156,6 +157,14 @@ def passing_for(actions: int, outcomes: int, width: int) -> Passing:
     """The machine code for that many; as constants they make it twice as fast."""
 
     @compiled()
+    def fill_in(begin, end, threshold, setting, shares):  # pragma: no cover
+        """Fills in the entries of states that are sure to be needed: those whose first λ is above a threshold."""
+        q, policy = np.empty(actions, setting.values.dtype), np.empty(actions, setting.values.dtype)
+        for i in range(begin, end):
+            if abs(shares.adjoint[i]) > threshold:
+                _fill_in(i, actions, outcomes, setting, shares, q, policy)
+
+    @compiled()
     def pass_on(threshold, warm, setting, shares):  # pragma: no cover
         """Passes on the residuals above a threshold, the farthest state first; or (`warm`) what a first λ amounts to.
 
@@ -184,21 +193,26 @@ def passing_for(actions: int, outcomes: int, width: int) -> Passing:
         return at_work, left_alone
 
     @compiled()
-    def pull_back(setting, shares, adjoint, by):  # pragma: no cover
-        """Adds λᵀ ∂F/∂φ to the gradients `by` φ; fills in λ with the states' own numbers."""
+    def pull_back(begin, end, setting, found, weights, beta, adjoint, by):  # pragma: no cover
+        """Fills in the gradients `by` φ with λᵀ ∂F/∂φ, and λ with the states' own numbers, for a range of positions.
+
+        λ is what was `found`, `weights` and `beta` are as in `Shares`. Gradients by numbers that states share are added
+        to.
+        """
         given, values = setting.given, setting.values
-        for i in range(len(adjoint)):
-            weight = shares.adjoint[i]
+        for i in range(begin, end):
+            weight = found[i]
             state = setting.order[i]
             adjoint[state] = weight
+            by.probabilities[state] = 0
             if weight == 0:
                 continue
             if given.terminal[state]:
                 by.final_reward[state if len(by.final_reward) > 1 else 0] += weight
                 continue
-            by.beta[()] += weight * shares.beta[i]
+            by.beta[()] += weight * beta[i]
             for a in range(actions):
-                share = weight * shares.weights[i, a]
+                share = weight * weights[i, a]
                 by.reward[state if by.reward.shape[0] > 1 else 0, a if by.reward.shape[1] > 1 else 0] += share
                 by.discount[()] += share * _expected(setting, state, a, outcomes)
                 for k in range(outcomes):
@@ -207,4 +221,4 @@ def passing_for(actions: int, outcomes: int, width: int) -> Passing:
                         gained = values[after] - values[state]
                         by.probabilities[state, a, k] += share * given.discount * gained
 
-    return Passing(pass_on, pull_back)
+    return Passing(fill_in, pass_on, pull_back)

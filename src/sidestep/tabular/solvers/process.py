@@ -53,18 +53,28 @@ class DecisionProcess(eqx.Module):
     discount: Float[Array, ""]
 
     def action_values(self, values: Float[Array, " states"]) -> Float[Array, "states actions"]:
-        """Q(s, a) = R(s, a) + γ Σ T V (eq. 4).
-
-        Summed as differences from V(s), so that the rounding of probabilities that are nearly 1 does not meet values
-        that are large: where moves mostly fail it would drown the gradient.
-        """
-        differences = values[self.successors] - values[:, None, None]
-        expected = values[:, None] + jnp.sum(self.probabilities * differences, axis=-1)
-        return self.reward + self.discount * expected
+        """Q(s, a) of all states; see `action_values`."""
+        return action_values(values, values[self.successors], self.probabilities, self.reward, self.discount)
 
     def end(self, values: Float[Array, " states"]) -> Float[Array, " states"]:
         """The values with those of terminal states put in."""
         return jnp.where(self.terminal, self.final_reward, values)
+
+
+def action_values(
+    values: Float[Array, " some"],
+    values_after: Float[Array, "some actions outcomes"],
+    probabilities: Float[Array, "some actions outcomes"],
+    reward: Float[Array, "#some #actions"],
+    discount: Float[Array, "*#some"],
+) -> Float[Array, "some actions"]:
+    """Q(s, a) = R(s, a) + γ Σ T V (eq. 4) of some states, from their values and those of where they lead.
+
+    Summed as differences from V(s), so that the rounding of probabilities that are nearly 1 does not meet values that
+    are large: where moves mostly fail it would drown the gradient.
+    """
+    differences = values_after - values[:, None, None]
+    return reward + discount * (values[:, None] + jnp.sum(probabilities * differences, axis=-1))
 
 
 class Start(NamedTuple):
@@ -136,7 +146,10 @@ class Solver(eqx.Module):
         cotangent: Float[Array, " states"],
         start: Start,
     ) -> tuple[Gradients, Sweeps]:
-        """λᵀ ∂F/∂φ for the adjoint λ of g = `cotangent` at the fixed point `values`; `values` of the sweeps is λ."""
+        """λᵀ ∂F/∂φ for the adjoint λ of g = `cotangent` at the fixed point `values`; `values` of the sweeps is λ.
+
+        Both are NaN if λ did not converge.
+        """
 
     def tolerance_for(self, dtype: jnp.dtype) -> float | Float[Array, ""]:
         """The tolerance, or the default one for numbers of that kind."""

@@ -16,15 +16,15 @@ sweep to sweep: they "count to infinity".
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from sidestep.tabular.solvers.given import Outcome
-from sidestep.tabular.solvers.host import heed_interrupts
+from sidestep.tabular.solvers.host import heed_interrupts, shared_out
 from sidestep.tabular.solvers.numbering import Numbered
 from sidestep.tabular.solvers.process import lowest
-from sidestep.tabular.solvers.sweeping import BOLTZMANN, Marks, Valuing, sweep_for
+from sidestep.tabular.solvers.sweeping import BOLTZMANN, LOG_SUM_EXP, Marks, Valuing, sweep_for
 
-_SHIFTED = (BOLTZMANN,)
+_SHIFTED = (BOLTZMANN, LOG_SUM_EXP)
 """The backups whose sweeps shift farther values."""
 _AT_ONCE = 8
 """How many rounds sweep all states at once, at most."""
@@ -52,6 +52,7 @@ class Rounds:
         self,
         world: Numbered,
         values: Float[np.ndarray, " states"],
+        favourite: Int[np.ndarray, " states"],
         valuing: Valuing,
         tolerance: np.floating,
         max_sweeps: int,
@@ -59,7 +60,7 @@ class Rounds:
         states = len(values)
         self.world, self.values, self.valuing, self.tolerance = world, values, valuing, tolerance
         self.max_sweeps = max_sweeps
-        self.marks = Marks(values.copy(), np.zeros(states, np.int32), np.zeros(states, np.int32))
+        self.marks = Marks(values.copy(), favourite, np.zeros(states, np.int32), np.zeros(states, np.int32))
         self.everywhere = np.arange(states, dtype=np.int32)
         size = max(_SMALLEST_STRETCH, int(_STRETCH * states**0.5))
         self.stretches = np.split(self.everywhere, range(size, states, size))
@@ -72,21 +73,20 @@ class Rounds:
         while not (converged or self._given_up() or np.isnan(residual)):
             residual = self._stretch_by_stretch() if residual > self.tolerance else residual
             if residual <= self.tolerance and not self._given_up():
-                self._begin_round()
-                residual, _ = self._sweep(self.everywhere, shifted=len(self.values), everyone=True)
+                residual = self._once_more()
                 converged = bool(residual <= self.tolerance)
         return Outcome(-(-self.solved // len(self.values)), float(residual), converged)
 
     def _all_at_once(self) -> float:
-        """Step 1; the largest change in the last round, infinite if that was taken back."""
-        last = np.inf
+        """Step 1; the largest change in the last round, infinite if all was taken back."""
+        first_values, last = self.values.copy(), np.inf
         for _ in range(_AT_ONCE):
             if self._given_up():
                 break
             self._begin_round()
             residual, at_work = self._sweep(self.everywhere, shifted=0)
             if not residual <= _GROWING * last:
-                self.values[:] = self.marks.before
+                self.values[:] = first_values
                 return np.inf
             last = residual
             if residual <= self.tolerance or at_work <= _FEW * len(self.values):
@@ -120,26 +120,43 @@ class Rounds:
         self.first = self.number + 1
         self.rounds += 1
 
-    def _sweep(self, which: np.ndarray, shifted: int, everyone: bool = False) -> tuple[float, int]:
+    def _once_more(self) -> float:
+        """Step 3, from the values as they are, so that all cores can share in it; the largest change."""
+        self._begin_round()
+        self.number += 1
+        self.solved += len(self.values)
+        into = np.empty_like(self.values)
+
+        def solve(begin: int, end: int) -> float:
+            return self._solve(self.everywhere[begin:end], into, shifted=len(into), everyone=True)[0]
+
+        residual = float(np.max(shared_out(solve, len(into))))
+        np.copyto(self.values, into, where=~self.world.fixed)
+        return residual
+
+    def _sweep(self, which: np.ndarray, shifted: int) -> tuple[float, int]:
         """One sweep; the largest change, and how many states were solved."""
         heed_interrupts()
         self.number += 1
-        bottom = self.values.dtype.type(lowest(self.values.dtype))
-        change, solved = sweep_for(*self.world.moves.shape[1:])(
+        change, solved = self._solve(which, self.values, shifted, everyone=self.number == 1)
+        self.solved += solved
+        return change, solved
+
+    def _solve(self, which: np.ndarray, into: np.ndarray, shifted: int, everyone: bool = False) -> tuple[float, int]:
+        return sweep_for(*self.world.moves.shape[1:])(
             which,
             self.valuing,
             self.world,
             self.values,
+            into,
             self.marks,
             self.number,
             self.first,
             shifted,
             everyone,
             _STILL * self.tolerance,
-            bottom,
+            self.values.dtype.type(lowest(self.values.dtype)),
         )
-        self.solved += solved
-        return change, solved
 
     def _given_up(self) -> bool:
         # rounds count too: a few states that never settle should not keep all others waiting

@@ -7,10 +7,10 @@ says which states are swept when.
 after those of the states that it wants to go to. Where nobody ever turned back, one sweep would do.
 
 **Shift.** People do turn back, a little: a state's value depends on its farther neighbours too, whose values are still
-old. All values far out change by about the same amount, because what changed near the goal is passed outwards. So
-farther neighbours that have not been solved yet are first moved by as much as the state's favourite nearer neighbour
-has moved since the round over all states began; by the same share of the value where values fall with the distance. At
-the fixed point nothing moves, and the equations are the old ones.
+old. What changed near the goal is passed outwards, and changes all values that hang on it by about the same amount. So
+as soon as a state is solved, the farther states whose favourite it is (where their best action leads) are moved by as
+much as it has moved since the round over all states began; by the same share of the value where values fall with the
+distance. At the fixed point nothing moves, and the equations are the old ones.
 
 **Work that is not done.** A state is left alone as long as neither it nor any of its neighbours has changed by more
 than `still` since it was last solved. That is less than the tolerance, but it may add up; so it alone does not decide
@@ -46,11 +46,13 @@ class Marks(NamedTuple):
     """What the sweeps have done so far, by position.
 
     - `before`: the values when the present round over all states began.
+    - `favourite`: where the best of the actions leads whose likeliest outcome is nearer; the state itself if none is.
     - `changed`: the sweep in which the value last changed by more than `still`.
     - `solved`: the sweep in which the state was last solved, or found to need no solving.
     """
 
     before: np.ndarray
+    favourite: np.ndarray
     changed: np.ndarray
     solved: np.ndarray
 
@@ -75,12 +77,13 @@ def backed_up(valuing, advantage, leaving):  # pragma: no cover
         below += odds * behind
         left += odds * leaving[a]
         both += odds * behind * leaving[a]
-    policy_left = left / total
+    share = 1 / total
+    policy_left = left * share
     if kind == HARD_MAX:
         return best, policy_left
     if kind == BOLTZMANN:
-        below /= total
-        own_left = policy_left + beta * (both / total - below * policy_left)
+        below *= share
+        own_left = policy_left + beta * (both * share - below * policy_left)
         return best + below, max(own_left, policy_left)
     if kind == LOG_SUM_EXP:
         return best + np.log(total) / beta, policy_left
@@ -104,39 +107,51 @@ def _nothing_to_do(i, actions, width, successors, marks):  # pragma: no cover
 
 
 @inlined(fastmath=_FAST)
-def _look_around(i, actions, width, world, values, solved, first, shifted, bottom, worths, beyond):  # pragma: no cover
-    """Fills in what actions are worth, and their chance of leading to where values are to be shifted.
-
-    Returns where the best of the actions leads whose likeliest outcome has been solved in this round.
-    """
-    row = i if len(world.reward) > 1 else 0
-    best, leads_to = bottom, i
-    for a in range(actions):
-        worth = world.reward[row, a]
-        farther, likeliest, toward = 0.0 * worth, 0.0 * worth, i
-        for m in range(width):
-            j, move = world.successors[i, a, m], world.moves[i, a, m]
-            worth += move * values[j]
-            if j >= shifted and j > i and solved[j] < first:
-                farther += move
-            if move > likeliest:
-                likeliest, toward = move, j
-        worths[a], beyond[a] = worth, farther
-        if solved[toward] >= first and worth * world.patience[i, a] > best:
-            best, leads_to = worth * world.patience[i, a], toward
-    return leads_to
+def _shifted(j, before, moved, size):  # pragma: no cover
+    """The value of a farther state if it has moved by as much as one whose value was of this size."""
+    old = before[j]
+    return old + moved * min(abs(old) / size, 1.0) if size > 0 else old + moved
 
 
 @inlined(fastmath=_FAST)
-def _shift(i, leads_to, values, marks, first, reached):  # pragma: no cover
-    """By how much the values beyond a state are to be moved, from how the neighbour `leads_to` has moved."""
-    new, before = values[leads_to], marks.before[leads_to]
-    moved = 0.0 * new
-    if marks.solved[leads_to] >= first and new > reached and before > reached:
-        moved = new - before
-        if abs(values[i]) < abs(new):
-            moved *= abs(values[i]) / abs(new)
-    return moved
+def _look_around(i, actions, width, world, values, marks, shifted, bottom, reached, worths):  # pragma: no cover
+    """Fills in what actions are worth; returns the escape, the largest worth's size, and the state's favourite."""
+    row = i if len(world.reward) > 1 else 0
+    before = marks.before
+    moved, size_here = values[i] - before[i], abs(before[i])
+    moves_along = values[i] > reached and before[i] > reached and moved != 0
+    escape, best, size, favourite = bottom, bottom, 0.0 * bottom, i
+    for a in range(actions):
+        worth = world.reward[row, a]
+        likeliest, toward = 0.0 * worth, i
+        for m in range(width):
+            j, move = world.successors[i, a, m], world.moves[i, a, m]
+            value = values[j]
+            if moves_along and j > i and j >= shifted and marks.favourite[j] >= i and before[j] > reached:
+                value = _shifted(j, before, moved, size_here)
+            worth += move * value
+            if move > likeliest:
+                likeliest, toward = move, j
+        worths[a] = worth
+        size = max(size, abs(worth))
+        tried = worth * world.patience[i, a] if world.patience[i, a] > 0 else bottom
+        escape = max(escape, tried)
+        nearer = tried if toward < i else bottom
+        favourite = toward if nearer > best else favourite
+        best = max(best, nearer)
+    return escape, size, favourite
+
+
+@inlined(fastmath=_FAST)
+def _shift(i, actions, width, world, values, marks, shifted, reached):  # pragma: no cover
+    """Moves the farther states whose favourite state i is by as much as it has moved in this round."""
+    before = marks.before
+    if values[i] > reached and before[i] > reached:
+        for a in range(actions):
+            for m in range(width):
+                j = world.successors[i, a, m]
+                if j > i and j >= shifted and marks.favourite[j] == i and before[j] > reached:
+                    values[j] = _shifted(j, before, values[i] - before[i], abs(before[i]))
 
 
 @inlined(fastmath=_FAST)
@@ -164,16 +179,17 @@ def sweep_for(actions: int, width: int) -> Any:
 
     @compiled(fastmath=_FAST)
     def sweep(
-        which, valuing, world, values, marks, number, first, shifted, everyone, still, bottom
+        which, valuing, world, values, into, marks, number, first, shifted, everyone, still, bottom
     ):  # pragma: no cover
         """Solves the own equations of the states at the positions `which` (ascending), in sweep `number`.
 
-        Those with nothing to do are left out, unless `everyone` takes part. Values from the position `shifted` on are
+        The new values go `into` an array: that of the values themselves if states are to see those solved before them.
+        States with nothing to do are left out, unless `everyone` takes part. Values from the position `shifted` on are
         shifted; `first` is the first sweep of the present round over all states. Returns the largest relative change,
         NaN if any is, and how many states were solved.
         """
-        worths, beyond = np.empty(actions, values.dtype), np.empty(actions, values.dtype)
-        leaving, advantage = np.empty(actions, values.dtype), np.empty(actions, values.dtype)
+        worths, leaving = np.empty(actions, values.dtype), np.empty(actions, values.dtype)
+        advantage = np.empty(actions, values.dtype)
         changed, solved = marks.changed, marks.solved
         # below this lie values at discount 1 of states that cannot reach a terminal state
         reached = -np.sqrt(-bottom)
@@ -188,31 +204,25 @@ def sweep_for(actions: int, width: int) -> Any:
                 solved[i] = number
                 continue
             at_work += 1
-            leads_to = _look_around(i, actions, width, world, values, solved, first, shifted, bottom, worths, beyond)
-            shift = _shift(i, leads_to, values, marks, first, reached)
-            escape, size = bottom, 0.0 * bottom
-            for a in range(actions):
-                worths[a] += shift * beyond[a]
-                size = max(size, abs(worths[a]))
-                if world.patience[i, a] > 0:
-                    escape = max(escape, worths[a] * world.patience[i, a])
-            old, value = values[i], bottom
+            escape, size, marks.favourite[i] = _look_around(
+                i, actions, width, world, values, marks, shifted, bottom, reached, worths
+            )
+            old, value = marks.before[i] if solved[i] < first else values[i], bottom
             if escape > reached:
-                guess = old
-                if old > reached and solved[i] < first:
-                    guess += shift
                 value = _solved(
-                    i, actions, width, world, valuing, guess, escape, reached, bottom, worths, leaving, advantage
+                    i, actions, width, world, valuing, values[i], escape, reached, bottom, worths, leaving, advantage
                 )
-            change = 0.0 * bottom
-            if old > reached or value > reached:
-                change = abs(value - old) / max(abs(value), size, smallest)
-            values[i] = value
+            change, scale = abs(value - old), max(abs(value), size, smallest)
+            if not (old > reached or value > reached):
+                change = 0.0 * bottom
+            into[i] = value
             solved[i] = number
-            if not change <= still:
+            if not change <= still * scale:
                 changed[i] = number
-            if change > largest or np.isnan(change):
-                largest = change
+                if shifted < len(values):
+                    _shift(i, actions, width, world, values, marks, shifted, reached)
+            if change > largest * scale or np.isnan(change):
+                largest = change / scale
         return largest, at_work
 
     return sweep
