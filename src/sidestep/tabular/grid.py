@@ -60,11 +60,13 @@ class Grid:
             raise InputError(f"expected three finite numbers x, y, yaw, found {self.origin}", field="origin")
         if self.connectivity not in (4, 8):
             raise InputError(f"expected 4 or 8, found {self.connectivity}", field="connectivity")
+        # a byte a cell, whatever they came in: maps may have ten million
+        object.__setattr__(self, "known", self.known.astype(np.int8))
 
     @classmethod
     def unknown(cls, rows: int, columns: int, connectivity: Connectivity = 4) -> "Grid":
         """A grid of which nothing is known, cells one metre wide, its lower-left corner at (0, 0)."""
-        return cls(np.full((rows, columns), Cell.UNKNOWN, dtype=np.int64), connectivity=connectivity)
+        return cls(np.full((rows, columns), Cell.UNKNOWN, dtype=np.int8), connectivity=connectivity)
 
     @property
     def shape(self) -> tuple[int, int]:
