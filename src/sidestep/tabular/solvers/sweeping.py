@@ -10,7 +10,9 @@ after those of the states that it wants to go to. Where nobody ever turned back,
 old. What changed near the goal is passed outwards, and changes all values that hang on it by about the same amount. So
 as soon as a state is solved, the farther states whose favourite it is (where their best action leads) are moved by as
 much as it has moved since the round over all states began; by the same share of the value where values fall with the
-distance. At the fixed point nothing moves, and the equations are the old ones.
+distance. At the fixed point nothing moves, and the equations are the old ones. A state that was worth more than the one
+it would be moved with does not hang on it, whatever the order says: two that were moved by one another would lift
+each other for ever.
 
 **Work that is not done.** A state is left alone as long as neither it nor any of its neighbours has changed by more
 than `still` since it was last solved. That is less than the tolerance, but it may add up; so it alone does not decide
@@ -29,6 +31,9 @@ HARD_MAX, BOLTZMANN, LOG_SUM_EXP, MELLOWMAX = range(4)
 
 _SMALLEST_EXPONENT = -80.0
 """Odds of less than exp of this are lost in rounding."""
+
+_NEWTON_STEPS, _FAR = 4, 0.1
+"""How often a state's value is improved at most, and how large a step down (times β) asks for another."""
 
 _FAST = {"contract", "reassoc", "nsz", "arcp"}
 """What the compiler may do with sums and products; not to take NaN or infinity for impossible."""
@@ -127,7 +132,7 @@ def _look_around(i, actions, width, world, values, marks, shifted, bottom, reach
         for m in range(width):
             j, move = world.successors[i, a, m], world.moves[i, a, m]
             value = values[j]
-            if moves_along and j > i and j >= shifted and marks.favourite[j] >= i and before[j] > reached:
+            if moves_along and j > i and j >= shifted and marks.favourite[j] >= i and reached < before[j] < before[i]:
                 value = _shifted(j, before, moved, size_here)
             worth += move * value
             if move > likeliest:
@@ -150,7 +155,7 @@ def _shift(i, actions, width, world, values, marks, shifted, reached):  # pragma
         for a in range(actions):
             for m in range(width):
                 j = world.successors[i, a, m]
-                if j > i and j >= shifted and marks.favourite[j] == i and before[j] > reached:
+                if j > i and j >= shifted and marks.favourite[j] == i and reached < before[j] < before[i]:
                     values[j] = _shifted(j, before, values[i] - before[i], abs(before[i]))
 
 
@@ -158,7 +163,11 @@ def _shift(i, actions, width, world, values, marks, shifted, reached):  # pragma
 def _solved(
     i, actions, width, world, valuing, guess, escape, reached, bottom, worths, leaving, advantage
 ):  # pragma: no cover
-    """The value by the state's own equation: one Newton step from a guess (see `process`)."""
+    """The value by the state's own equation: one Newton step from a guess (see `process`).
+
+    A guess far above the root of the log-sum-exp ends below it, perhaps far below, where actions that never leave
+    seemed to matter most; so from there it takes another step.
+    """
     above = valuing.kind == LOG_SUM_EXP
     value = escape
     if guess > reached:
@@ -167,10 +176,15 @@ def _solved(
         leaving[a] = world.ending
         for m in range(width):
             leaving[a] += world.moves[i, a, m]
-        advantage[a] = worths[a] - leaving[a] * value
-    gain, divisor = backed_up(valuing, advantage, leaving)
-    value += gain / (divisor if divisor > 0 else 1.0)
-    return max(value, escape) if above else max(min(value, escape), bottom)
+    for _ in range(_NEWTON_STEPS):
+        for a in range(actions):
+            advantage[a] = worths[a] - leaving[a] * value
+        gain, divisor = backed_up(valuing, advantage, leaving)
+        step = gain / (divisor if divisor > 0 else 1.0)
+        value = max(value + step, escape) if above else max(min(value + step, escape), bottom)
+        if not (above and valuing.beta * step < -_FAR):
+            break
+    return value
 
 
 @cache
