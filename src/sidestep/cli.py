@@ -11,7 +11,14 @@ from typing import Annotated, Any, Literal
 import jax
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 
 from sidestep.commands.evaluate import evaluate_map
@@ -240,15 +247,20 @@ def _working(text: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def _fitting(iterations: int) -> Iterator[Callable[[FitProgress], None]]:
-    """A progress bar on a terminal for a fit of at most `iterations`."""
+    """A progress bar on a terminal for a fit of at most `iterations`, and how long these would take.
+
+    When a fit converges cannot be known; so the time is the longest that is left, at the pace of the last ten minutes.
+    """
     columns = (
         TextColumn("learning"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
-        TextColumn("{task.fields[state]}"),
+        TextColumn("at most"),
+        TimeRemainingColumn(),
+        TextColumn("left; {task.fields[state]}"),
     )
-    with Progress(*columns, console=errors, transient=True) as bar:
+    with Progress(*columns, console=errors, transient=True, speed_estimate_period=600) as bar:
         task = bar.add_task("learning", total=iterations, state="compiling")
 
         def report(progress: FitProgress) -> None:

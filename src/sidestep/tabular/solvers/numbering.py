@@ -12,7 +12,6 @@ from jaxtyping import Int
 from sidestep.tabular.solvers.compiled import compiled
 from sidestep.tabular.solvers.given import Given
 from sidestep.tabular.solvers.host import shared_out
-from sidestep.tabular.solvers.sweeping import backed_up
 
 
 class Numbered(NamedTuple):
@@ -39,7 +38,6 @@ class Numbering(NamedTuple):
 
     width: int
     number_states: Any
-    first_values: Any
     favourites: Any
 
 
@@ -92,40 +90,6 @@ def numbering_for(actions: int, outcomes: int, width: int) -> Numbering:
                 world.patience[i, a] = 1 / leaving if leaving > 0 else 0.0
 
     @compiled()
-    def first_values(valuing, world, values, bottom, bound):  # pragma: no cover
-        """Fills in values that are not known (`bottom`), by order: what the moves to nearer states make of a state.
-
-        An action that does not lead to any counts as one that costs its price twice, there and back. Where nothing
-        nearer is known the value is `bound`.
-        """
-        worths, leaving = np.empty(actions, values.dtype), np.empty(actions, values.dtype)
-        advantage = np.empty(actions, values.dtype)
-        for i in range(len(values)):
-            if world.fixed[i] or values[i] > bottom:
-                continue
-            value, reached = bound, False
-            for a in range(actions):
-                worths[a] = world.reward[i if len(world.reward) > 1 else 0, a]
-                leaving[a] = world.ending
-                for m in range(width):
-                    j = world.successors[i, a, m]
-                    if j < i and values[j] > bottom:
-                        worths[a] += world.moves[i, a, m] * values[j]
-                        leaving[a] += world.moves[i, a, m]
-                if leaving[a] > world.ending:
-                    escape = worths[a] / leaving[a]
-                    value = max(value, escape) if reached else escape
-                    reached = True
-            if reached:
-                for a in range(actions):
-                    advantage[a] = worths[a] - leaving[a] * value
-                    if not leaving[a] > world.ending:
-                        advantage[a] += min(worths[a], 0.0)
-                gain, divisor = backed_up(valuing, advantage, leaving)
-                value += gain / (divisor if divisor > 0 else 1.0)
-            values[i] = value
-
-    @compiled()
     def favourites(begin, end, world, values, bottom, favourite):  # pragma: no cover
         """Fills in where states want to go, by values that are known; returns how many want to go to a farther one."""
         count = 0
@@ -142,4 +106,4 @@ def numbering_for(actions: int, outcomes: int, width: int) -> Numbering:
             count += leads_to > i and not world.fixed[i]
         return count
 
-    return Numbering(width, number_states, first_values, favourites)
+    return Numbering(width, number_states, favourites)

@@ -1,7 +1,7 @@
 """Values, from where a task ends outwards, on the host: what to start from, and in which order.
 
 An earlier solve's values are taken on trust for 12 sweeps; if they have not converged by then, the solve starts from
-nothing. Its order is kept as long as few states want to go to a farther one.
+no values. An order is kept as long as few states want to go to a farther one.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from sidestep.tabular.solvers.numbering import Numbered, numbered, numbering_for
 from sidestep.tabular.solvers.order import order_by_distance
 from sidestep.tabular.solvers.process import lowest
 from sidestep.tabular.solvers.rounds import Rounds
-from sidestep.tabular.solvers.sweeping import Valuing
+from sidestep.tabular.solvers.sweeping import Valuing, first_values_for
 
 _OUT_OF_ORDER = 0.05
 """The share of states that may want to go to a farther one, before states are put in order anew."""
@@ -120,5 +120,5 @@ def _begin(start: Float[np.ndarray, " states"], order: Int[np.ndarray, " states"
     astray = sum(
         shared_out(lambda begin, end: run.favourites(begin, end, world, values, bottom, favourite), len(order))
     )
-    run.first_values(asked.valuing, world, values, bottom, asked.bound)
+    first_values_for(*world.moves.shape[1:])(asked.valuing, world, values, bottom, asked.bound)
     return _Begun(order, world, values, favourite, astray)

@@ -240,3 +240,44 @@ def sweep_for(actions: int, width: int) -> Any:
         return largest, at_work
 
     return sweep
+
+
+@cache
+def first_values_for(actions: int, width: int) -> Any:
+    """The machine code of values to begin with, for that many actions and outcomes."""
+
+    @compiled()
+    def first_values(valuing, world, values, bottom, bound):  # pragma: no cover
+        """Fills in values that are not known (`bottom`), by order: what the moves to nearer states make of a state.
+
+        An action that does not lead to any counts as one that costs its price twice, there and back. Where nothing
+        nearer is known the value is `bound`.
+        """
+        worths, leaving = np.empty(actions, values.dtype), np.empty(actions, values.dtype)
+        advantage = np.empty(actions, values.dtype)
+        for i in range(len(values)):
+            if world.fixed[i] or values[i] > bottom:
+                continue
+            value, reached = bound, False
+            for a in range(actions):
+                worths[a] = world.reward[i if len(world.reward) > 1 else 0, a]
+                leaving[a] = world.ending
+                for m in range(width):
+                    j = world.successors[i, a, m]
+                    if j < i and values[j] > bottom:
+                        worths[a] += world.moves[i, a, m] * values[j]
+                        leaving[a] += world.moves[i, a, m]
+                if leaving[a] > world.ending:
+                    escape = worths[a] / leaving[a]
+                    value = max(value, escape) if reached else escape
+                    reached = True
+            if reached:
+                for a in range(actions):
+                    advantage[a] = worths[a] - leaving[a] * value
+                    if not leaving[a] > world.ending:
+                        advantage[a] += min(worths[a], 0.0)
+                gain, divisor = backed_up(valuing, advantage, leaving)
+                value += gain / (divisor if divisor > 0 else 1.0)
+            values[i] = value
+
+    return first_values
