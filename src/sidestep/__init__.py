@@ -9,7 +9,7 @@ from sidestep.evaluation import Reward, evaluate, plan_paths
 from sidestep.inference.climb import Progress
 from sidestep.inference.fit import Fit, fit
 from sidestep.inference.objective import tasks_mesh
-from sidestep.inference.optimisers import LBFGS, Ascent
+from sidestep.inference.optimisers import LBFGS, Ascent, Resilient
 from sidestep.inference.priors import Normal
 from sidestep.io.demonstrations import demonstrations
 from sidestep.io.maps import read_map, write_map
@@ -49,6 +49,7 @@ __all__ = [
     "Ordered",
     "Plan",
     "Progress",
+    "Resilient",
     "Reward",
     "RollOuts",
     "SidestepError",

@@ -22,7 +22,7 @@ from rich.progress import (
 from rich.table import Table
 
 from sidestep.commands.evaluate import evaluate_map
-from sidestep.commands.learn import Settings, Terms, learn, optimiser_of
+from sidestep.commands.learn import Settings, Terms, learn, most_iterations
 from sidestep.commands.plan import plan_path
 from sidestep.commands.simulate import Walkers, simulate_walks
 from sidestep.errors import SidestepError
@@ -126,7 +126,7 @@ def learn_command(
         sample=sample,
         seed=seed,
     )
-    with _fitting(optimiser_of(settings).iterations) as report:
+    with _fitting(most_iterations(settings)) as report:
         summary = learn(walks, map_file, out, settings, report, resume)
     data = summary["data"]
     console.print(

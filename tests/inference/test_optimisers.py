@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sidestep.inference.optimisers import LBFGS, Ascent
+from sidestep.inference.optimisers import LBFGS, Ascent, Resilient
 
 CURVATURE = np.array([1.0, 10.0, 100.0])
 LOWEST = np.array([1.0, -2.0, 0.5])
@@ -89,6 +89,85 @@ def test_ascent_slows_down_along_a_cosine():
     np.testing.assert_allclose(lengths, expected, atol=1e-6)
 
 
+HEIGHTS = np.array([0.5, 2.0, 6.0, 7.0])
+
+
+def cliffs(x):
+    """Rises gently with the distance from 0, and steeply, by thousands, below a height of its own in each direction.
+
+    The edges are so sharp that at the lowest point the slope would have to be known to a billionth of a unit.
+    """
+    below = 1e6 * (HEIGHTS - x)
+    value = np.sum(x**2 / 8) + np.sum(5e-3 * np.logaddexp(0, below))
+    odds = np.exp(np.minimum(below, 0)) / (1 + np.exp(-np.abs(below)))
+    return float(value), x / 4 - 5e3 * odds
+
+
+def test_resilient_ascent_stops_at_the_edge_of_cliffs():
+    optimiser = Resilient(tolerance=1e-3)
+    x, state, asked = np.full(4, 9.0), optimiser.init(np.full(4, 9.0)), []
+
+    def evaluate(x):
+        asked.append(x)
+        return cliffs(x)
+
+    for _ in range(100):
+        if optimiser.settled(cliffs(x)[1], state):
+            break
+        after = optimiser.step(evaluate, x, *cliffs(x), state)
+        assert after is not None
+        assert cliffs(after[0])[0] < cliffs(x)[0]
+        x, state = after
+    assert optimiser.settled(cliffs(x)[1], state)
+    np.testing.assert_allclose(x, HEIGHTS, atol=2e-3)
+    # no step that was taken has fallen deep below an edge
+    assert len(asked) < 200
+
+
+def test_resilient_ascent_leaves_out_only_what_pushes_back():
+    """A second parameter's cliff does not hold up the first one."""
+    optimiser = Resilient(first=1.0)
+    x = np.array([5.0, 2.2])
+
+    def evaluate(x):
+        return float(x @ x / 8 + 1e3 * max(2.0 - x[1], 0)), np.array([x[0] / 4, x[1] / 4 - 1e3 * (x[1] < 2.0)])
+
+    after = optimiser.step(evaluate, x, *evaluate(x), optimiser.init(x))
+    assert after is not None
+    np.testing.assert_array_equal(after[0], [4.0, 2.2])
+    np.testing.assert_allclose(after[1], [1.4, 0.25])
+
+
+def test_resilient_ascent_comes_back_up_quickly():
+    """Where a slope becomes steeper on the way, the next step is four times as long."""
+    optimiser = Resilient(first=0.01)
+    x = np.array([0.0])
+
+    def evaluate(x):
+        return float(-np.exp(x[0])), -np.exp(x)
+
+    after = optimiser.step(evaluate, x, *evaluate(x), optimiser.init(x))
+    assert after is not None
+    np.testing.assert_allclose(after, ([0.01], [0.04]))
+
+
+def test_resilient_ascent_says_where_nothing_can_be_gained():
+    pit = np.zeros(2)
+    optimiser = Resilient()
+    found = optimiser.step(lambda x: (float(np.abs(x).sum()), np.ones(2)), pit, 0.0, np.ones(2), optimiser.init(pit))
+    assert found is None
+    assert optimiser.step(bowl, LOWEST, *bowl(LOWEST), optimiser.init(LOWEST)) is None
+
+
+def test_optimisers_say_why_they_have_converged():
+    slope, lengths = np.array([0.5, -2.0]), np.array([1.0, 0.1])
+    assert not LBFGS(tolerance=1.9).settled(slope, None)
+    assert LBFGS(tolerance=2.0).settled(slope, None) == "the largest gradient is 2"
+    assert not Ascent(tolerance=1.9).settled(slope, None)
+    assert not Resilient(tolerance=0.69).settled(slope, lengths)
+    assert Resilient(tolerance=0.71).settled(slope, lengths) == "the next step promises 0.7 nats"
+
+
 @pytest.mark.parametrize(("one", "other", "same"), [
     (LBFGS(), LBFGS(iterations=7, tolerance=1.0), True),
     (LBFGS(), LBFGS(memory=3), False),
@@ -96,6 +175,8 @@ def test_ascent_slows_down_along_a_cosine():
     (Ascent(), Ascent(iterations=7), False),
     (Ascent(), Ascent(learning_rate=0.1), False),
     (LBFGS(), Ascent(), False),
+    (Resilient(), Resilient(iterations=7, tolerance=2.0), True),
+    (Resilient(), Resilient(first=0.1), False),
 ])  # fmt: skip
 def test_a_fit_can_go_on_under_the_same_key(one, other, same):
     assert (one.key == other.key) == same

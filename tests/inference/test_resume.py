@@ -7,12 +7,12 @@ from walled import BLANK, walks
 from sidestep.errors import InputError
 from sidestep.inference.checkpoints import Saver
 from sidestep.inference.fit import fit
-from sidestep.inference.optimisers import LBFGS, Ascent
+from sidestep.inference.optimisers import LBFGS, Ascent, Resilient
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.models import ObstacleGrid
 
-OPTIMISERS = {"L-BFGS": LBFGS(), "ascent": Ascent(iterations=40)}
+OPTIMISERS = {"L-BFGS": LBFGS(), "ascent": Ascent(iterations=40), "resilient": Resilient(tolerance=1e-4)}
 PEOPLE = Behavior(BoltzmannAverage(), 10.0)
 DEMONSTRATIONS = walks()
 

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import jax.numpy as jnp
 import numpy as np
 
 from sidestep.demonstrations import Demonstrations
@@ -15,7 +16,7 @@ from sidestep.evaluation import Reward
 from sidestep.inference.climb import Progress
 from sidestep.inference.fit import Fit, fit
 from sidestep.inference.objective import MEMORY
-from sidestep.inference.optimisers import LBFGS, Ascent, Optimiser
+from sidestep.inference.optimisers import LBFGS, Ascent, Optimiser, Resilient
 from sidestep.inference.priors import Normal
 from sidestep.io.demonstrations import demonstrations_of_moves
 from sidestep.io.gridding import grid_walks
@@ -24,7 +25,7 @@ from sidestep.io.walks import Walks, read_walks
 from sidestep.plotting import figure_fit, save
 from sidestep.runs import LearnedMap, write_learned_map
 from sidestep.tabular.backups import BACKUPS, Behavior, Gradient
-from sidestep.tabular.grid import Connectivity
+from sidestep.tabular.grid import Cell, Connectivity
 from sidestep.tabular.likelihood import Term
 from sidestep.tabular.models import ObstacleGrid
 
@@ -129,9 +130,12 @@ def fit_map(
         raise InputError(f"expected GiB above 0, found {settings.memory}", field="memory")
     people = Behavior(BACKUPS[settings.backup](), settings.beta)
     prior = Normal(settings.prior_mean, settings.prior_variance)
+    optimiser = optimiser_of(settings, model.graph.states, len(demonstrations))
     if settings.terms == "both":
         # where people walked is known without a solve: begin there
         model = fit(model, demonstrations, people, prior=prior, terms=("transitions",)).model
+    if isinstance(optimiser, Resilient):
+        model = _taken_as_blocked(model, demonstrations, prior)
     return fit(
         model,
         demonstrations,
@@ -140,7 +144,7 @@ def fit_map(
         terms=TERMS[settings.terms],
         gradient=settings.gradient,
         horizon=settings.horizon,
-        optimiser=optimiser_of(settings),
+        optimiser=optimiser,
         memory=settings.memory * 2**30,
         report=report,
         checkpoint=checkpoint,
@@ -148,14 +152,42 @@ def fit_map(
     )
 
 
-def optimiser_of(settings: Settings) -> Optimiser:
-    """L-BFGS for the exact gradient, first-order ascent for the fixed-policy one."""
-    kind = LBFGS if settings.gradient == "exact" else Ascent
-    if settings.iterations is None:
-        return kind()
-    if settings.iterations < 1:
+LARGE = 10_000
+"""From how many cells on a map is large; smaller ones are learned by L-BFGS (`docs/design.md` says why)."""
+_SURE = 4.0
+"""How many of the prior's standard deviations above its mean a cell is taken as blocked."""
+_A_MOVE = 1e-3
+"""A large map is learned when the next step promises less than this for each of people's moves (nats)."""
+
+
+def optimiser_of(settings: Settings, cells: int, moves: int) -> Optimiser:
+    """L-BFGS for the exact gradient, `Resilient` for what people do on large maps; ascent for the fixed-policy one."""
+    if settings.iterations is not None and settings.iterations < 1:
         raise InputError(f"expected at least 1, found {settings.iterations}", field="iterations")
-    return kind(iterations=settings.iterations)
+    limit = {} if settings.iterations is None else {"iterations": settings.iterations}
+    if settings.gradient == "fixed_policy":
+        return Ascent(**limit)
+    if cells < LARGE or settings.terms == "transitions":
+        return LBFGS(**limit)
+    return Resilient(tolerance=_A_MOVE * moves, **limit)
+
+
+def most_iterations(settings: Settings) -> int:
+    """How many iterations a fit takes at the latest, whatever the map."""
+    return optimiser_of(settings, cells=0, moves=0).iterations
+
+
+def _taken_as_blocked(model: ObstacleGrid, demonstrations: Demonstrations, prior: Normal) -> ObstacleGrid:
+    """The model, with all unknown cells that nobody visited as good as blocked.
+
+    Then nobody could have taken another way, and the prior pulls cells down until people would have. From below it is a
+    long climb: of all the gaps in a wall, the likelihood only sees the one that people would take next.
+    """
+    visited = np.zeros(model.graph.states, dtype=bool)
+    visited[np.asarray(demonstrations.states)] = visited[np.asarray(demonstrations.next_states)] = True
+    unseen = jnp.asarray(~visited & (np.asarray(model.known).ravel() == Cell.UNKNOWN))
+    sure = prior.mean + _SURE * jnp.sqrt(prior.variance / 2)
+    return model.with_parameters(jnp.where(unseen, sure, model.parameters))
 
 
 def peak_memory() -> int | None:

@@ -34,11 +34,12 @@ class Progress(NamedTuple):
 
 
 class Summit(NamedTuple):
-    """Where a climb ended: θ, the way there, how the last solves went, and why it ended."""
+    """Where a climb ended: θ, the way there, how the last solves went, whether the optimiser had settled, and why."""
 
     parameters: PyTree
     history: list[Progress]
     solved: list[Solved]
+    settled: bool
     message: str
 
 
@@ -63,7 +64,7 @@ class Climb:
         self.starts = objective.cold_starts()
         self.last = _Point(np.full_like(self.start, np.nan), np.zeros(4), np.zeros_like(self.start))
         self.solved: list[Solved] = []
-        self.tolerances = _tolerances(objective.problem)
+        self.tolerances = _tolerances(objective.problem, optimiser)
 
     def run(self, report: Callable[[Progress], None] | None, resume: bool) -> Summit:
         """Climbs until converged or stopped; raises `NotConverged` where values stop converging on the way."""
@@ -79,7 +80,8 @@ class Climb:
             history.append(progress)
             if report:
                 report(progress)
-            message = _reason_to_stop(progress, self.optimiser)
+            settled = self.optimiser.settled(point.slope, state)
+            message = _reason_to_stop(progress, settled, self.optimiser)
             after = None if message else self.optimiser.step(self._loss, x, -progress.objective, point.slope, state)
             if after is not None:
                 x, state = after
@@ -89,7 +91,8 @@ class Climb:
                 self._be_more_exact()
             else:
                 unsaid = f"stopped: no step gains anything; the largest gradient is {progress.gradient:.2g}"
-                return Summit(self.to_parameters(jnp.asarray(x)), history, self._solved_at(x), message or unsaid)
+                parameters = self.to_parameters(jnp.asarray(x))
+                return Summit(parameters, history, self._solved_at(x), bool(settled), message or unsaid)
 
     def _look(self, x: np.ndarray) -> _Point:
         """The objective at x."""
@@ -153,21 +156,21 @@ class Climb:
             )
 
 
-_LARGE, _LOOSE = 10_000, 1e-7
-"""From how many states on solves are loose at first, and how loose."""
+_LARGE = 10_000
+"""From how many states on solves are only as exact as the optimiser needs, at first."""
 
 
-def _tolerances(problem: Problem) -> list[float | None]:
+def _tolerances(problem: Problem, optimiser: Optimiser) -> list[float | None]:
     """The tolerances of the solves, one after the other; None for the solver's own."""
     dtype = jax.eval_shape(problem.model.probabilities).dtype
     if problem.solver.tolerance is not None or dtype != np.float64 or problem.model.graph.states < _LARGE:
         return [None]
-    return [_LOOSE, float(problem.solver.tolerance_for(dtype))]
+    return [optimiser.exactness, float(problem.solver.tolerance_for(dtype))]
 
 
-def _reason_to_stop(now: Progress, optimiser: Optimiser) -> str:
-    if now.gradient <= optimiser.tolerance:
-        return f"converged: the largest gradient is {now.gradient:.2g}"
+def _reason_to_stop(now: Progress, settled: str, optimiser: Optimiser) -> str:
+    if settled:
+        return f"converged: {settled}"
     if now.iteration >= optimiser.iterations:
         return f"stopped after {now.iteration} iterations; the largest gradient is {now.gradient:.2g}"
     return ""

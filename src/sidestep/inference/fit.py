@@ -4,9 +4,9 @@ The objective is the posterior up to a constant (eqs. 1 and 6),
 
     log L(θ) + log prior(θ),
 
-which `fit` climbs from the model's own parameters. With `gradient="exact"` that is done by L-BFGS or by first-order
-ascent. The fixed-policy gradient of the Boltzmann average (eq. 9, the paper's) is not the gradient of any function,
-so a line search has nothing to search along: use first-order ascent with it.
+which `fit` climbs from the model's own parameters. With `gradient="exact"` that is done by L-BFGS, by first-order
+ascent, or by steps that stay off cliffs. The fixed-policy gradient of the Boltzmann average (eq. 9, the paper's) is not
+the gradient of any function, so there is nothing to search along: use first-order ascent with it.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ from sidestep.errors import InputError
 from sidestep.inference.checkpoints import Saver, fingerprint
 from sidestep.inference.climb import Climb, Progress
 from sidestep.inference.objective import MEMORY, Objective, Problem, Solved
-from sidestep.inference.optimisers import LBFGS, Optimiser
+from sidestep.inference.optimisers import LBFGS, Ascent, Optimiser
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, Gradient
 from sidestep.tabular.likelihood import ALL_TERMS, Term, transition_probabilities
@@ -82,7 +82,7 @@ def fit(
     - `terms`: which parts of the likelihood count, "actions", "transitions" or both.
     - `gradient`, `horizon`, `solver`: as for `solve`. On large maps, solves are only as exact as the optimiser needs
       until it has converged, and exact from then on; a solver with a tolerance of its own keeps to that.
-    - `optimiser`: `LBFGS()` by default, or `Ascent()`.
+    - `optimiser`: `LBFGS()` by default, or `Ascent()`, or `Resilient()` (for large maps with people who avoid walls).
     - `memory`: about how many bytes the arrays may take on a device; tasks are solved in batches that fit.
     - `mesh`: devices to spread the tasks over (see `tasks_mesh`); the objective and its gradient are the same. With
       devices of several processes, each process calls `fit` with the same arguments and gets the same model.
@@ -105,14 +105,13 @@ def fit(
     climb = Climb(Objective(problem, memory, mesh), optimiser, saver)
     found = climb.run(report, resume)
     solved = _of_all_tasks(found.solved, len(demonstrations.tasks.terminal))
-    settled = found.history[-1].gradient <= optimiser.tolerance
     return Fit(
         model=model.with_parameters(found.parameters),
         history=tuple(found.history),
         sweeps=solved.sweeps,
         residual=solved.residual,
         task_converged=solved.converged,
-        converged=settled and bool(solved.converged.all()),
+        converged=found.settled and bool(solved.converged.all()),
         message=found.message,
     )
 
@@ -135,10 +134,11 @@ def _check_settings(terms: tuple[Term, ...], gradient: Gradient, behavior: Behav
         raise InputError(f"expected one or both of {ALL_TERMS}, found {terms}", field="terms")
     if gradient not in ("exact", "fixed_policy"):
         raise InputError(f"expected 'exact' or 'fixed_policy', found {gradient!r}", field="gradient")
-    if gradient == "fixed_policy" and isinstance(optimiser, LBFGS) and isinstance(behavior.backup, BoltzmannAverage):
+    searches = not isinstance(optimiser, Ascent)
+    if gradient == "fixed_policy" and searches and isinstance(behavior.backup, BoltzmannAverage):
         raise InputError(
-            "the fixed-policy gradient of the Boltzmann average is not the gradient of any function, so L-BFGS has "
-            "nothing to search along: expected Ascent() as the optimiser, or gradient='exact'",
+            "the fixed-policy gradient of the Boltzmann average is not the gradient of any function, so there is "
+            "nothing for a search to go along: expected Ascent() as the optimiser, or gradient='exact'",
             field="gradient",
         )
 

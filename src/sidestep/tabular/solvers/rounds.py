@@ -6,7 +6,7 @@
    shifted. If changes grow from one round to the next, all is taken back to the first values, and this ends.
 2. Then rounds go stretch by stretch, some 32 √states states each: a stretch is swept until it is still, at most 30
    times, before the next one. Its states stay in the processor's cache, and those behind it have settled when it
-   begins. The states beyond the stretch are shifted if all were in step 1.
+   begins. The states beyond the stretch are shifted if all were in step 1, in the first 16 rounds.
 3. When no stretch begins with a change beyond the tolerance, a sweep over all states, without exception or shift and
    from the values as they are, decides whether the values have converged.
 
@@ -32,6 +32,8 @@ _FEW = 0.01
 """The share of states still at work below which rounds go stretch by stretch."""
 _STRETCH, _SMALLEST_STRETCH = 32, 256
 """How many states a stretch has: this many times the root of their number, but no fewer than that."""
+_SHIFTING = 16
+"""In how many rounds values are shifted, at most; two states that move each other may never come to rest."""
 _AGAIN = 30
 """How often a stretch is swept in a round, at most."""
 _STILL = 0.25
@@ -111,7 +113,8 @@ class Rounds:
 
     def _beyond(self, stretch: np.ndarray) -> int:
         """The first position that is shifted when a stretch is swept; past the last where a shift may do harm."""
-        return int(stretch[-1]) + 1 if self.valuing.kind in _SHIFTED else len(self.values)
+        shifted = self.valuing.kind in _SHIFTED and self.rounds <= _SHIFTING
+        return int(stretch[-1]) + 1 if shifted else len(self.values)
 
     def _begin_round(self) -> None:
         self.marks.before[:] = self.values

@@ -1,0 +1,69 @@
+"""Large maps are learned from above: by steps that stay off cliffs, from cells taken as blocked."""
+
+import numpy as np
+import pytest
+
+from sidestep.commands import learn
+from sidestep.commands.learn import Settings, fit_map
+from sidestep.commands.simulate import Walkers, walk
+from sidestep.demonstrations import gather
+from sidestep.domains.offices import office
+from sidestep.inference.fit import fit
+from sidestep.inference.priors import Normal
+from sidestep.scoring import relevant_obstacles, score_map, visit_ranking
+from sidestep.tabular.backups import Behavior, LogSumExp
+from sidestep.tabular.grid import Grid
+from sidestep.tabular.models import ObstacleGrid
+from sidestep.tasks import reach
+
+TRUTH = office(20, 24, seed=0)
+UNKNOWN = Grid.unknown(20, 24)
+SETTINGS = Settings(backup="logsumexp", beta=5.0, discount=1.0, step_cost=1.0, prior_mean=0.5, prior_variance=8.0)
+
+
+@pytest.fixture(scope="module")
+def demonstrations():
+    trajectories, goals = walk(TRUTH, Walkers(60, 6, discount=1.0, step_cost=1.0, seed=0))
+    return gather(trajectories, [reach(UNKNOWN, goal, discount=1.0, step_cost=1.0) for goal in goals])
+
+
+@pytest.fixture
+def everything_is_large(monkeypatch):
+    monkeypatch.setattr(learn, "LARGE", 1)
+
+
+@pytest.mark.usefixtures("everything_is_large")
+def test_a_large_map_is_learned(demonstrations):
+    found = fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, SETTINGS)
+    objectives = [progress.objective for progress in found.history]
+    assert found.converged, found.message
+    assert "promises" in found.message
+    assert objectives == sorted(objectives)
+    visited = demonstrations.visited()
+    relevant = relevant_obstacles(TRUTH, visited[:, 0], visited[:, 1])
+    everywhere = np.ones(TRUTH.shape, dtype=bool)
+    learned = score_map(np.asarray(found.model.blocked), TRUTH, everywhere, relevant).average_precision_relevant
+    by_visits = score_map(visit_ranking(visited[:, 0], TRUTH), TRUTH, everywhere, relevant).average_precision_relevant
+    assert learned is not None
+    assert by_visits is not None
+    assert learned > 2 * by_visits
+
+
+def test_it_ends_where_a_search_along_the_gradient_does(demonstrations, monkeypatch):
+    """But for what the tolerance leaves: some thousandths of a nat a move."""
+    by_search = fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, SETTINGS)
+    monkeypatch.setattr(learn, "LARGE", 1)
+    from_above = fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, SETTINGS)
+    assert len(from_above.history) < len(by_search.history)
+    assert from_above.final.objective > by_search.final.objective - 5e-3 * len(demonstrations)
+
+
+@pytest.mark.usefixtures("everything_is_large")
+def test_the_climb_begins_with_cells_that_nobody_visited_taken_as_blocked(demonstrations):
+    start = fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, SETTINGS).history[0]
+    prior, people = Normal(0.5, 8.0), Behavior(LogSumExp(), 5.0)
+    by_walks = fit(ObstacleGrid(UNKNOWN, 0.5), demonstrations, people, prior=prior, terms=("transitions",)).final
+    unseen = TRUTH.size - len(np.unique([*demonstrations.states, *demonstrations.next_states]))
+    # each is four standard deviations, √(8/2), from the mean: 8² / 8 nats
+    assert start.prior == pytest.approx(by_walks.prior - 8 * unseen)
+    assert start.transitions == pytest.approx(by_walks.transitions)
