@@ -69,7 +69,8 @@ def measure(name: str, truth: Grid, arguments: argparse.Namespace) -> dict[str, 
     )
 
     def report(progress: Progress) -> None:
-        note(f"{name}: {progress.iteration} objective {progress.objective:.4f} gradient {progress.gradient:.2g}")
+        seconds = time.perf_counter() - started
+        note(f"{name}: {progress.iteration} after {seconds:.0f} s, objective {progress.objective:.2f}")
 
     started = time.perf_counter()
     found = fit_map(ObstacleGrid(given, settings.prior_mean), demonstrations, settings, report)
@@ -94,6 +95,7 @@ def measure(name: str, truth: Grid, arguments: argparse.Namespace) -> dict[str, 
         "iterations": found.final.iteration,
         "converged": found.converged,
         "largest_gradient": found.final.gradient,
+        "objective": found.final.objective,
         "average_precision_relevant": scores.average_precision_relevant,
         "by_visits": by_visits.average_precision_relevant,
     }

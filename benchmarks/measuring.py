@@ -154,7 +154,7 @@ def write_records(arguments: argparse.Namespace, records: Sequence[Mapping[str, 
     """Writes flat records to the file given by `--json`, if one is, with the settings and what they were run on."""
     if not arguments.json:
         return
-    settings = {key: str(value) if isinstance(value, Path) else value for key, value in vars(arguments).items()}
+    settings = {key: _plain(value) for key, value in vars(arguments).items()}
     machine = {
         "device": jax.devices()[0].device_kind,
         "processor": platform.machine(),
@@ -165,6 +165,13 @@ def write_records(arguments: argparse.Namespace, records: Sequence[Mapping[str, 
     }
     del settings["json"]
     write_json(arguments.json, {"settings": settings, "machine": machine, **more, "records": list(records)})
+
+
+def _plain(setting: Any) -> Any:
+    """A setting as JSON has it: paths as text, in lists too."""
+    if isinstance(setting, Path):
+        return str(setting)
+    return [_plain(each) for each in setting] if isinstance(setting, list) else setting
 
 
 # ---------------------------------------------------------------------------------------------------- running

@@ -34,10 +34,10 @@ def test_calls_take_turns_and_slow_ones_take_fewer(script):
 
 def test_records_are_written_with_the_settings(script, tmp_path):
     file = tmp_path / "records.json"
-    arguments = argparse.Namespace(json=file, quick=True, sizes=[3])
+    arguments = argparse.Namespace(json=file, quick=True, sizes=[3], maps=[Path("a.yaml")])
     script("measuring").write_records(arguments, [{"name": "a", "seconds": np.float64(1.5)}], extra=[1])
     written = json.loads(file.read_text())
-    assert written["settings"] == {"quick": True, "sizes": [3]}
+    assert written["settings"] == {"quick": True, "sizes": [3], "maps": ["a.yaml"]}
     assert written["records"] == [{"name": "a", "seconds": 1.5}]
     assert written["extra"] == [1]
 

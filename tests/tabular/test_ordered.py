@@ -12,7 +12,7 @@ from numba.core import config as numba_settings
 from problems import BACKUPS, generic_task, obstacle_problem, random_problem, relative_error
 
 from sidestep.errors import InputError
-from sidestep.tabular.backups import Behavior, BoltzmannAverage
+from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.solve import solve
@@ -329,6 +329,16 @@ def test_the_last_sweep_leaves_nobody_out():
 
 class Sharper(BoltzmannAverage):
     """A backup that nobody has written machine code for, though its parent has it."""
+
+
+def test_values_that_move_each_other_come_to_rest():
+    """In this world of cells that are all but closed, shifts in every round would send two states round in a cycle."""
+    random = np.random.default_rng(78)
+    walls, closed = random.random((60, 60)) < 0.3, random.random((60, 60)) < 0.1
+    grid = Grid(np.where(closed, -1, walls.astype(int)))
+    goal = reach(grid, int(np.flatnonzero(grid.known == 0)[0]), discount=1.0, step_cost=1.0)
+    found = solve(ObstacleGrid(grid, 8.0), goal, Behavior(LogSumExp(), 5.0), solver=Ordered(max_sweeps=600))
+    assert found.converged
 
 
 def test_backups_without_machine_code_are_refused():
