@@ -45,7 +45,8 @@ class Settings:
     - `discount`, `step_cost`: the walkers' reward, as in `reach`.
     - `prior_mean`, `prior_variance`: of every unknown cell's logit.
     - `connectivity`: 4 or 8. `terms`: which parts of the likelihood count. `gradient`: "exact" climbs by L-BFGS
-      (on large maps by `Resilient`), "fixed_policy" by first-order ascent. `horizon`: how many moves walkers look ahead (None: all).
+      (on large maps by `Resilient`), "fixed_policy" by first-order ascent. `horizon`: how many moves walkers look
+      ahead (None: all).
     - `iterations`: at most this many (None: the optimiser's own limit). `memory`: about how many GiB the fit's arrays
       may take.
     - `sample`: learn from that many walks only, drawn by `seed` (None: from all).

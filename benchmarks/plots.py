@@ -1,0 +1,75 @@
+"""Pictures of benchmark records: time and peak memory against the number of cells.
+
+    python benchmarks/plots.py scaling.json --out docs/images/scaling.png
+
+A line is a method and its backup; solid from nothing, dashed after an optimiser's step. Where records have it, a dotted
+line shows one shortest-path search on the same map, the unit.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+
+Record = Mapping[str, Any]
+MARKERS = "os^Dv<>PX*"
+
+
+def lines(records: Sequence[Record], field: str) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Label, cells and values of each method that has values in a field, in the order of the records."""
+    labels = {f"{record['name']}, {record['backup']}": (record["name"], record["backup"]) for record in records}
+    for label, method in labels.items():
+        own = [record for record in records if (record["name"], record["backup"]) == method]
+        found = sorted((record["cells"], record[field]) for record in own if record.get(field) is not None)
+        if found:
+            cells, values = np.array(found, dtype=float).T
+            yield label, cells, values
+
+
+def draw_times(axes: Axes, records: Sequence[Record]) -> None:
+    """Seconds from nothing and after a step, and those of the unit."""
+    markers = dict(zip((label for label, *_ in lines(records, "cold_seconds")), cycle(MARKERS), strict=False))
+    for label, cells, seconds in lines(records, "cold_seconds"):
+        axes.plot(cells, seconds, marker=markers[label], label=label)
+    axes.set_prop_cycle(None)
+    for label, cells, seconds in lines(records, "warm_seconds"):
+        axes.plot(cells, seconds, "--", marker=markers[label], markerfacecolor="white")
+    for _, cells, seconds in list(lines(records, "dijkstra_seconds"))[:1]:
+        axes.plot(cells, seconds, "k:", label="one shortest-path search")
+    axes.set(xscale="log", yscale="log", xlabel="cells", ylabel="seconds (dashed: after a step)")
+
+
+def draw_memory(axes: Axes, records: Sequence[Record]) -> None:
+    """The processes' peaks."""
+    for (label, cells, peak), marker in zip(lines(records, "peak_bytes"), cycle(MARKERS), strict=False):
+        axes.plot(cells, peak / 2**20, marker=marker, label=label)
+    axes.set(xscale="log", ylim=(0, None), xlabel="cells", ylabel="peak memory of the process (MiB)")
+
+
+def main() -> int:
+    """Draws what the arguments ask for."""
+    parser = argparse.ArgumentParser(description="Pictures of benchmark records.")
+    parser.add_argument("records", type=Path, help="what a benchmark has written with --json")
+    parser.add_argument("--out", type=Path, required=True, metavar="PICTURE.png")
+    arguments = parser.parse_args()
+    records = json.loads(arguments.records.read_text())["records"]
+    figure, (times, memory) = plt.subplots(1, 2, figsize=(10, 4.5), layout="constrained")
+    draw_times(times, records)
+    draw_memory(memory, records)
+    times.legend(fontsize="small", frameon=False)
+    for axes in (times, memory):
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(alpha=0.3)
+    figure.savefig(arguments.out, dpi=150)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
