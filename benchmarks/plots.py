@@ -10,7 +10,6 @@ import argparse
 import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -33,14 +32,21 @@ def lines(records: Sequence[Record], field: str) -> Iterator[tuple[str, np.ndarr
             yield label, cells, values
 
 
+def styles(records: Sequence[Record]) -> dict[str, dict[str, Any]]:
+    """A colour and a marker for each method, the same in all panels."""
+    labels = dict.fromkeys(f"{record['name']}, {record['backup']}" for record in records)
+    return {
+        label: {"color": f"C{number}", "marker": MARKERS[number % len(MARKERS)]} for number, label in enumerate(labels)
+    }
+
+
 def draw_times(axes: Axes, records: Sequence[Record]) -> None:
     """Seconds from nothing and after a step, and those of the unit."""
-    markers = dict(zip((label for label, *_ in lines(records, "cold_seconds")), cycle(MARKERS), strict=False))
+    style = styles(records)
     for label, cells, seconds in lines(records, "cold_seconds"):
-        axes.plot(cells, seconds, marker=markers[label], label=label)
-    axes.set_prop_cycle(None)
+        axes.plot(cells, seconds, label=label, **style[label])
     for label, cells, seconds in lines(records, "warm_seconds"):
-        axes.plot(cells, seconds, "--", marker=markers[label], markerfacecolor="white")
+        axes.plot(cells, seconds, "--", markerfacecolor="white", **style[label])
     for _, cells, seconds in list(lines(records, "dijkstra_seconds"))[:1]:
         axes.plot(cells, seconds, "k:", label="one shortest-path search")
     axes.set(xscale="log", yscale="log", xlabel="cells", ylabel="seconds (dashed: after a step)")
@@ -48,8 +54,9 @@ def draw_times(axes: Axes, records: Sequence[Record]) -> None:
 
 def draw_memory(axes: Axes, records: Sequence[Record]) -> None:
     """The processes' peaks."""
-    for (label, cells, peak), marker in zip(lines(records, "peak_bytes"), cycle(MARKERS), strict=False):
-        axes.plot(cells, peak / 2**20, marker=marker, label=label)
+    style = styles(records)
+    for label, cells, peak in lines(records, "peak_bytes"):
+        axes.plot(cells, peak / 2**20, label=label, **style[label])
     axes.set(xscale="log", ylim=(0, None), xlabel="cells", ylabel="peak memory of the process (MiB)")
 
 

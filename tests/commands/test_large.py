@@ -1,5 +1,7 @@
 """Large maps are learned from above: by steps that stay off cliffs, from cells taken as blocked."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,9 @@ from sidestep.commands.learn import Settings, fit_map
 from sidestep.commands.simulate import Walkers, walk
 from sidestep.demonstrations import gather
 from sidestep.domains.offices import office
+from sidestep.inference import climb
 from sidestep.inference.fit import fit
+from sidestep.inference.optimisers import LBFGS, Ascent, Resilient
 from sidestep.inference.priors import Normal
 from sidestep.scoring import relevant_obstacles, score_map, visit_ranking
 from sidestep.tabular.backups import Behavior, LogSumExp
@@ -29,7 +33,9 @@ def demonstrations():
 
 @pytest.fixture
 def everything_is_large(monkeypatch):
+    """For the choice of the optimiser, and for solves that are only as exact as it needs."""
     monkeypatch.setattr(learn, "LARGE", 1)
+    monkeypatch.setattr(climb, "_LARGE", 1)
 
 
 @pytest.mark.usefixtures("everything_is_large")
@@ -64,6 +70,33 @@ def test_the_climb_begins_with_cells_that_nobody_visited_taken_as_blocked(demons
     prior, people = Normal(0.5, 8.0), Behavior(LogSumExp(), 5.0)
     by_walks = fit(ObstacleGrid(UNKNOWN, 0.5), demonstrations, people, prior=prior, terms=("transitions",)).final
     unseen = TRUTH.size - len(np.unique([*demonstrations.states, *demonstrations.next_states]))
-    # each is four standard deviations, √(8/2), from the mean: 8² / 8 nats
-    assert start.prior == pytest.approx(by_walks.prior - 8 * unseen)
+    # P(blocked) = σ(8), 7.5 from the prior's mean
+    assert start.prior == pytest.approx(by_walks.prior - 7.5**2 / 8 * unseen)
     assert start.transitions == pytest.approx(by_walks.transitions)
+
+
+@pytest.mark.usefixtures("everything_is_large")
+def test_what_the_map_knows_is_left_alone(demonstrations):
+    half = Grid(np.where(np.arange(24) < 12, TRUTH.known, -1))
+    start = fit_map(ObstacleGrid(half, 0.5), demonstrations, replace(SETTINGS, iterations=1)).history[0]
+    visited = np.unique([*demonstrations.states, *demonstrations.next_states])
+    unseen = np.setdiff1d(np.flatnonzero(half.known == -1), visited)
+    prior, people = Normal(0.5, 8.0), Behavior(LogSumExp(), 5.0)
+    by_walks = fit(ObstacleGrid(half, 0.5), demonstrations, people, prior=prior, terms=("transitions",)).final
+    assert start.prior == pytest.approx(by_walks.prior - 7.5**2 / 8 * len(unseen))
+
+
+@pytest.mark.parametrize(("options", "cells", "kind"), [
+    ({}, 9_999, LBFGS),
+    ({}, 10_000, Resilient),
+    ({"terms": "actions"}, 10_000, Resilient),
+    ({"terms": "transitions"}, 10_000, LBFGS),
+    ({"gradient": "fixed_policy"}, 10_000, Ascent),
+])  # fmt: skip
+def test_who_climbs(options, cells, kind):
+    chosen = learn.optimiser_of(replace(SETTINGS, **options), cells, moves=2000)
+    assert isinstance(chosen, kind)
+    if isinstance(chosen, Resilient):
+        assert chosen.tolerance == pytest.approx(2.0)
+    assert learn.optimiser_of(replace(SETTINGS, **options, iterations=7), cells, moves=2000).iterations == 7
+    assert learn.most_iterations(replace(SETTINGS, **options)) == chosen.iterations

@@ -42,6 +42,19 @@ def run(optimiser, function, start, steps):
     return way
 
 
+def test_resilient_ascent_keeps_the_dtype_of_the_start():
+    x = np.full(3, 4.0, dtype=np.float32)
+    state = Resilient().init(x)
+    for _ in range(3):
+        value, slope = bowl(x)
+        after = Resilient().step(
+            lambda x: (bowl(x)[0], bowl(x)[1].astype(np.float32)), x, value, slope.astype(np.float32), state
+        )
+        assert after is not None
+        x, state = after
+        assert (x.dtype, state.dtype) == (np.float32, np.float32)
+
+
 @pytest.mark.parametrize(("function", "start", "lowest", "steps"), [
     (bowl, [5.0, 5.0, 5.0], LOWEST, 30),
     (banana, [-1.2, 1.0], [1, 1], 60),
@@ -118,10 +131,20 @@ def test_resilient_ascent_stops_at_the_edge_of_cliffs():
         assert after is not None
         assert cliffs(after[0])[0] < cliffs(x)[0]
         x, state = after
+        # none that was taken has fallen deep below an edge
+        assert (x > HEIGHTS - 0.01).all()
     assert optimiser.settled(cliffs(x)[1], state)
     np.testing.assert_allclose(x, HEIGHTS, atol=2e-3)
-    # no step that was taken has fallen deep below an edge
     assert len(asked) < 200
+
+
+def test_a_step_that_failed_is_no_sign_of_convergence():
+    """Where there are no values the step is tried shorter, but the next one is as long as ever."""
+    optimiser = Resilient(first=1.0)
+    x = np.array([-40.0])
+    after = optimiser.step(lambda x: cliff(x + 40.5), x, *cliff(x + 40.5), optimiser.init(x))
+    assert after is not None
+    np.testing.assert_allclose(after, ([-39.75], [1.4]))
 
 
 def test_resilient_ascent_leaves_out_only_what_pushes_back():

@@ -136,7 +136,7 @@ def fit_map(
         # where people walked is known without a solve: begin there
         model = fit(model, demonstrations, people, prior=prior, terms=("transitions",)).model
     if isinstance(optimiser, Resilient):
-        model = _taken_as_blocked(model, demonstrations, prior)
+        model = _taken_as_blocked(model, demonstrations)
     return fit(
         model,
         demonstrations,
@@ -155,8 +155,8 @@ def fit_map(
 
 LARGE = 10_000
 """From how many cells on a map is large; smaller ones are learned by L-BFGS (`docs/design.md` says why)."""
-_SURE = 4.0
-"""How many of the prior's standard deviations above its mean a cell is taken as blocked."""
+_CLOSED = 8.0
+"""The logit of a cell that is taken as blocked: some 3,000 tries, longer than most ways round."""
 _A_MOVE = 1e-3
 """A large map is learned when the next step promises less than this for each of people's moves (nats)."""
 
@@ -175,10 +175,10 @@ def optimiser_of(settings: Settings, cells: int, moves: int) -> Optimiser:
 
 def most_iterations(settings: Settings) -> int:
     """How many iterations a fit takes at the latest, whatever the map."""
-    return optimiser_of(settings, cells=0, moves=0).iterations
+    return max(optimiser_of(settings, cells, moves=1).iterations for cells in (0, LARGE))
 
 
-def _taken_as_blocked(model: ObstacleGrid, demonstrations: Demonstrations, prior: Normal) -> ObstacleGrid:
+def _taken_as_blocked(model: ObstacleGrid, demonstrations: Demonstrations) -> ObstacleGrid:
     """The model, with all unknown cells that nobody visited as good as blocked.
 
     Then nobody could have taken another way, and the prior pulls cells down until people would have. From below it is a
@@ -187,8 +187,7 @@ def _taken_as_blocked(model: ObstacleGrid, demonstrations: Demonstrations, prior
     visited = np.zeros(model.graph.states, dtype=bool)
     visited[np.asarray(demonstrations.states)] = visited[np.asarray(demonstrations.next_states)] = True
     unseen = jnp.asarray(~visited & (np.asarray(model.known).ravel() == Cell.UNKNOWN))
-    sure = prior.mean + _SURE * jnp.sqrt(prior.variance / 2)
-    return model.with_parameters(jnp.where(unseen, sure, model.parameters))
+    return model.with_parameters(jnp.where(unseen, _CLOSED, model.parameters))
 
 
 def peak_memory() -> int | None:

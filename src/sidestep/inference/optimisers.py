@@ -109,13 +109,14 @@ class Resilient(eqx.Module):
     steps are worth; there the objective falls by thousands of nats within a thousandth of a unit of θ. At the optimum
     hundreds of parameters stand each at such a cliff of its own, which is as good as a kink to a quasi-Newton method.
 
-    So only the signs of the gradient count (resilient propagation, Riedmiller and Braun 1993). A step is taken if the
-    objective rises and at most the share 0.15 of what the slope promised is pushed back by parameters whose slope has
-    turned. Otherwise those that push back more than that share of their own stay where they are, and it is tried again
-    without them. A step grows by 1.4 where it was taken, by 4 if the slope has become steeper on the way, and falls to
-    a quarter where the slope has turned.
+    So only the gradient's signs give the direction (resilient propagation, Riedmiller and Braun 1993). A step is taken
+    if the objective rises and at most the share 0.15 of what the slope promised is pushed back by parameters whose
+    slope has turned. Otherwise those that push back more than that share of their own stay where they are, with a
+    quarter of their step, and it is tried again without them; where there are none, with all steps a quarter as long,
+    this time. Where a step was taken it grows by 1.4, by 4 if the slope has become steeper on the way, and falls to a
+    quarter where the slope has turned.
 
-    - `iterations`: when to stop at the latest.
+    - `iterations`: how many steps are taken at most; each may need several evaluations.
     - `tolerance`: the fit has converged when its next step promises less than this (nats, all parameters together).
     - `first`, `longest`: the first and the longest step, in units of θ.
     """
@@ -139,20 +140,23 @@ class Resilient(eqx.Module):
         self, evaluate: Evaluate, x: Vector, value: float, slope: Vector, state: Vector
     ) -> tuple[Vector, Vector] | None:
         """The next point; None where none that was tried gains anything."""
-        lengths, free = state, slope != 0
+        lengths, free, share = state, slope != 0, 1.0
         for _ in range(_TRIALS):
-            step = np.where(free, -lengths * np.sign(slope), 0)
+            step = np.where(free, -share * lengths * np.sign(slope), 0).astype(x.dtype)
             after, new_slope = evaluate(x + step)
+            if not np.isfinite(after):
+                share *= _CUT
+                continue
             promised, pushed_back = -slope * step, np.maximum(new_slope * step, 0)
-            turned = pushed_back > 0
             if after < value and pushed_back.sum() <= _PUSHED_BACK * promised.sum():
                 growth = np.where(np.abs(new_slope) >= np.abs(slope), _STEEPER, _GROWTH)
                 grown = np.where(free, np.minimum(growth * lengths, self.longest), lengths)
-                return x + step, np.where(turned, _CUT * lengths, grown)
+                return x + step, np.where(pushed_back > 0, _CUT * lengths, grown).astype(x.dtype)
             too_far = pushed_back > _PUSHED_BACK * promised
-            # where no slope has turned, the step was too long for another reason
-            lengths = np.where(too_far, _CUT * lengths, lengths) if too_far.any() else _CUT * lengths
-            free = free & ~too_far
+            if too_far.any():
+                lengths, free = np.where(too_far, _CUT * lengths, lengths), free & ~too_far
+            else:
+                share *= _CUT
             free = free if free.any() else slope != 0
         return None
 
@@ -166,8 +170,8 @@ Optimiser = LBFGS | Ascent | Resilient
 
 _GROWTH, _STEEPER, _CUT, _PUSHED_BACK = 1.4, 4.0, 0.25, 0.15
 """By how much a step grows, grows on a slope that becomes steeper, and falls; which share may be pushed back."""
-_TRIALS = 60
-"""How often a step of `Resilient` is tried with fewer and fewer parameters."""
+_TRIALS = 40
+"""How often a step of `Resilient` is tried, with fewer and fewer parameters or shorter, before it is given up."""
 
 
 @eqx.filter_jit

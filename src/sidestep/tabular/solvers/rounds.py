@@ -6,7 +6,8 @@
    shifted. If changes grow from one round to the next, all is taken back to the first values, and this ends.
 2. Then rounds go stretch by stretch, some 32 √states states each: a stretch is swept until it is still, at most 30
    times, before the next one. Its states stay in the processor's cache, and those behind it have settled when it
-   begins. The states beyond the stretch are shifted if all were in step 1, in the first 16 rounds.
+   begins. For these two backups the states beyond the stretch are shifted, in the first 16 rounds (those of step 1
+   among them).
 3. When no stretch begins with a change beyond the tolerance, a sweep over all states, without exception or shift and
    from the values as they are, decides whether the values have converged.
 
