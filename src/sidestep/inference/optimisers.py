@@ -105,9 +105,10 @@ class Ascent(eqx.Module):
 class Resilient(eqx.Module):
     """Ascent with a step of its own for every parameter, that stays off cliffs; needs the exact gradient.
 
-    A wall hides that people would gain a thousand steps by passing it until P(blocked) of a gap falls below what those
-    steps are worth; there the objective falls by thousands of nats within a thousandth of a unit of θ. At the optimum
-    hundreds of parameters stand each at such a cliff of its own, which is as good as a kink to a quasi-Newton method.
+    A gap in a wall that would save people a thousand steps does not tempt them while passing it takes more tries than
+    that. Where it begins to, the objective of people who walked around falls by thousands of nats within a thousandth
+    of a unit of θ. At the optimum hundreds of parameters stand each at such a cliff of its own, which is as good as a
+    kink to a quasi-Newton method.
 
     So only the gradient's signs give the direction (resilient propagation, Riedmiller and Braun 1993). A step is taken
     if the objective rises and at most the share 0.15 of what the slope promised is pushed back by parameters whose
