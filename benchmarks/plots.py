@@ -21,12 +21,16 @@ Record = Mapping[str, Any]
 MARKERS = "os^Dv<>PX*"
 
 
+def label_of(record: Record) -> str:
+    """What a line is called."""
+    return f"{record['name']}, {record['backup']}"
+
+
 def lines(records: Sequence[Record], field: str) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Label, cells and values of each method that has values in a field, in the order of the records."""
-    labels = {f"{record['name']}, {record['backup']}": (record["name"], record["backup"]) for record in records}
-    for label, method in labels.items():
-        own = [record for record in records if (record["name"], record["backup"]) == method]
-        found = sorted((record["cells"], record[field]) for record in own if record.get(field) is not None)
+    for label in dict.fromkeys(map(label_of, records)):
+        own = [record for record in records if label_of(record) == label and record.get(field) is not None]
+        found = sorted((record["cells"], record[field]) for record in own)
         if found:
             cells, values = np.array(found, dtype=float).T
             yield label, cells, values
@@ -34,7 +38,7 @@ def lines(records: Sequence[Record], field: str) -> Iterator[tuple[str, np.ndarr
 
 def styles(records: Sequence[Record]) -> dict[str, dict[str, Any]]:
     """A colour and a marker for each method, the same in all panels."""
-    labels = dict.fromkeys(f"{record['name']}, {record['backup']}" for record in records)
+    labels = dict.fromkeys(map(label_of, records))
     return {
         label: {"color": f"C{number}", "marker": MARKERS[number % len(MARKERS)]} for number, label in enumerate(labels)
     }

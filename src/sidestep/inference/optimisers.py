@@ -58,8 +58,7 @@ class LBFGS(eqx.Module):
     def settled(self, slope: Vector, state: PyTree[Array]) -> str:
         """Why it has converged, or nothing."""
         del state
-        largest = np.abs(slope).max()
-        return f"the largest gradient is {largest:.2g}" if largest <= self.tolerance else ""
+        return _why_flat(slope, self.tolerance)
 
 
 class Ascent(eqx.Module):
@@ -98,8 +97,7 @@ class Ascent(eqx.Module):
     def settled(self, slope: Vector, state: PyTree[Array]) -> str:
         """Why it has converged, or nothing."""
         del state
-        largest = np.abs(slope).max()
-        return f"the largest gradient is {largest:.2g}" if largest <= self.tolerance else ""
+        return _why_flat(slope, self.tolerance)
 
 
 class Resilient(eqx.Module):
@@ -173,6 +171,12 @@ _GROWTH, _STEEPER, _CUT, _PUSHED_BACK = 1.4, 4.0, 0.25, 0.15
 """By how much a step grows, grows on a slope that becomes steeper, and falls; which share may be pushed back."""
 _TRIALS = 40
 """How often a step of `Resilient` is tried, with fewer and fewer parameters or shorter, before it is given up."""
+
+
+def _why_flat(slope: Vector, tolerance: float) -> str:
+    """That no component of a slope is larger than a tolerance, in words; nothing if one is."""
+    largest = np.abs(slope).max()
+    return f"the largest gradient is {largest:.2g}" if largest <= tolerance else ""
 
 
 @eqx.filter_jit
