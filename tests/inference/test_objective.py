@@ -11,8 +11,10 @@ from sidestep.inference.batches import planned
 from sidestep.inference.objective import MEMORY, Objective, Problem
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
+from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import ALL_TERMS, log_likelihood
 from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.solvers.host import cores
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.solvers.ordered import Ordered
 
@@ -78,12 +80,13 @@ def test_memory_is_that_of_each_device():
     assert planned(MODEL, Jacobi(), 6, memory, 2)[0] == 6
 
 
-def test_starts_are_dropped_where_there_is_no_room():
+def test_starts_and_parts_are_dropped_where_there_is_no_room():
     roomy, tight = Objective(problem_of(), MEMORY), Objective(problem_of(), 1.0)
-    assert (roomy.keeps_starts, tight.keeps_starts) == (True, False)
+    assert (roomy.keeps, tight.keeps) == (True, False)
     cold = tight.cold_starts()
-    _, left = tight.evaluate(POINT, cold)
+    found, left = tight.evaluate(POINT, cold)
     assert left is cold
+    assert found.parts == []
     _, left = roomy.evaluate(POINT, roomy.cold_starts())
     assert np.isfinite(left[0].adjoint).all()
     assert (np.asarray(left[0].adjoint) != 0).any()
@@ -97,6 +100,64 @@ def test_where_solves_start_makes_no_difference(name):
     assert np.mean(warm.solved[0].sweeps) < np.mean(cold.solved[0].sweeps)
     np.testing.assert_allclose(warm[:4], cold[:4], rtol=1e-8)
     np.testing.assert_allclose(warm.slope, cold.slope, rtol=1e-7, atol=1e-7 * np.abs(cold.slope).max())
+
+
+def a_task_a_batch():
+    """An objective with a batch for each of its five tasks, and one with all in one."""
+    objective, whole = Objective(problem_of(SOLVERS["ordered"]), 25 * ONE_TASK), Objective(problem_of(), MEMORY)
+    assert (len(objective.batches), objective.keeps, len(whole.batches)) == (5, True, 1)
+    return objective, whole
+
+
+def test_what_a_batch_added_at_the_same_point_is_taken_over():
+    objective, _ = a_task_a_batch()
+    found, starts = objective.evaluate(POINT, objective.cold_starts())
+    assert sum(part.actions for part in found.parts) == found.actions
+    marked = [part._replace(actions=2.0**index) for index, part in enumerate(found.parts)]
+    again, left = objective.evaluate(POINT, starts, known=marked)
+    assert again.actions == 31
+    np.testing.assert_array_equal(again.slope, found.slope)
+    assert all(one is other for one, other in zip(left, starts, strict=True))
+    elsewhere, _ = objective.evaluate(POINT + 1e-9, starts, known=marked)
+    assert elsewhere.actions == pytest.approx(found.actions, rel=1e-6)
+
+
+def test_only_batches_that_a_change_concerns_are_solved_anew():
+    """One parameter is moved by as much as would change one task's part by a nat, and others hardly."""
+    objective, whole = a_task_a_batch()
+    found, starts = objective.evaluate(POINT, objective.cold_starts())
+    slopes = np.abs([part.slope for part in found.parts])
+    rest = slopes.sum(axis=0) - slopes.max(axis=0)
+    cell = np.argmin(np.where(slopes.max(axis=0) > 1e-3, rest / slopes.max(axis=0), np.inf))
+    move = 1 / slopes[:, cell].max()
+    moved = POINT.at[cell].add(move)
+    concerned = slopes[:, cell] * move >= 0.1
+    assert 0 < concerned.sum() < 5
+    again, _ = objective.evaluate(moved, starts, known=found.parts, negligible=0.1)
+    kept = [now is before for now, before in zip(again.parts, found.parts, strict=True)]
+    np.testing.assert_array_equal(kept, ~concerned)
+    exact, _ = whole.evaluate(moved, whole.cold_starts())
+    assert abs(exact.actions - found.actions) > 0.5
+    assert again.actions == pytest.approx(exact.actions, abs=0.1)
+
+
+def test_what_changed_since_is_counted_from_where_a_part_was_solved():
+    """A part that was taken over twice does not drift away by less than is negligible each time."""
+    objective, _ = a_task_a_batch()
+    found, starts = objective.evaluate(POINT, objective.cold_starts())
+    first = found.parts[0]
+    direction = 0.06 * np.sign(first.slope) / np.abs(first.slope).sum()
+    once, starts = objective.evaluate(POINT + direction, starts, known=found.parts, negligible=0.1)
+    assert once.parts[0] is first
+    twice, _ = objective.evaluate(POINT + 2 * direction, starts, known=once.parts, negligible=0.1)
+    assert twice.parts[0] is not first
+
+
+def test_long_solves_come_in_batches_of_no_more_tasks_than_cores():
+    large, small = (ObstacleGrid(Grid.unknown(100, columns), 0.0) for columns in (100, 99))
+    assert planned(large, Ordered(), 2 * cores(), MEMORY, 1) == (cores(), True)
+    for model, solver, devices in ((small, Ordered(), 1), (large, Jacobi(), 1), (large, Ordered(), 2)):
+        assert planned(model, solver, 2 * cores(), MEMORY, devices) == (2 * cores(), True)
 
 
 def test_transitions_alone_need_no_batches():

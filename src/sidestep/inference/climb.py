@@ -15,8 +15,9 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
 from sidestep.errors import InputError, NotConverged
+from sidestep.inference.batches import LARGE
 from sidestep.inference.checkpoints import Saver
-from sidestep.inference.objective import Objective, Problem, Solved
+from sidestep.inference.objective import Objective, Part, Problem, Solved
 from sidestep.inference.optimisers import Optimiser
 from sidestep.tabular.likelihood import choices_of
 from sidestep.tabular.solvers.process import Start
@@ -54,7 +55,8 @@ class _Point(NamedTuple):
 class Climb:
     """The way of an optimiser up an objective.
 
-    The last point is remembered, for line searches ask twice; its solves are where the next ones start.
+    The last point is remembered, for line searches ask twice; its solves are where the next ones start. What batches of
+    tasks added is remembered too, for rough looks (see `objective`).
     """
 
     def __init__(self, objective: Objective, optimiser: Optimiser, saver: Saver):
@@ -64,6 +66,7 @@ class Climb:
         self.starts = objective.cold_starts()
         self.last = _Point(np.full_like(self.start, np.nan), np.zeros(4), np.zeros_like(self.start))
         self.solved: list[Solved] = []
+        self.known: list[Part] = []
         self.tolerances = _tolerances(objective.problem, optimiser)
 
     def run(self, report: Callable[[Progress], None] | None, resume: bool) -> Summit:
@@ -94,18 +97,24 @@ class Climb:
                 parameters = self.to_parameters(jnp.asarray(x))
                 return Summit(parameters, history, self._solved_at(x), bool(settled), message or unsaid)
 
-    def _look(self, x: np.ndarray) -> _Point:
-        """The objective at x."""
-        if not np.array_equal(x, self.last.x):
-            parameters = self.to_parameters(jnp.asarray(x))
-            found, self.starts = self.objective.evaluate(parameters, self.starts, self.tolerances[0])
-            parts = np.array([found.objective, found.actions, found.transitions, found.prior])
-            self.last, self.solved = _Point(x, parts, np.asarray(ravel_pytree(found.slope)[0])), found.solved
-        return self.last
+    def _look(self, x: np.ndarray, rough: bool = False) -> _Point:
+        """The objective at x; a rough look takes over what seems to be as it was when last looked at."""
+        if np.array_equal(x, self.last.x):
+            return self.last
+        negligible = _NEGLIGIBLE * abs(self.last.parts[0]) if rough else 0.0
+        parameters = self.to_parameters(jnp.asarray(x))
+        found, self.starts = self.objective.evaluate(
+            parameters, self.starts, self.tolerances[0], self.known, negligible
+        )
+        parts = np.array([found.objective, found.actions, found.transitions, found.prior])
+        point, self.known = _Point(x, parts, np.asarray(ravel_pytree(found.slope)[0])), found.parts
+        if not rough:
+            self.last, self.solved = point, found.solved
+        return point
 
-    def _loss(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+    def _loss(self, x: np.ndarray, rough: bool = False) -> tuple[float, np.ndarray]:
         """Minus the objective, and its slope."""
-        point = self._look(x)
+        point = self._look(x, rough)
         # a solve that failed makes them NaN: worse than any other point, so that no search ends there
         usable = np.isfinite(point.parts[0]) and np.isfinite(point.slope).all()
         return -float(point.parts[0]) if usable else np.inf, point.slope
@@ -116,7 +125,7 @@ class Climb:
 
     def _forget(self) -> None:
         """Makes the next look at any point a new one."""
-        self.last = self.last._replace(x=np.full_like(self.start, np.nan))
+        self.last, self.known = self.last._replace(x=np.full_like(self.start, np.nan)), []
 
     def _solved_at(self, x: np.ndarray) -> list[Solved]:
         """How the solves at x went; looked at once more if the last look was elsewhere or before an interruption."""
@@ -143,7 +152,7 @@ class Climb:
 
     def _kept(self) -> list[Start]:
         """Where solves start, for a checkpoint: nothing where that is never changed, or is spread over processes."""
-        return self.starts if self.objective.keeps_starts and len(self.objective.processes) == 1 else []
+        return self.starts if self.objective.keeps and len(self.objective.processes) == 1 else []
 
     def _check(self, progress: Progress) -> None:
         """Raises if what was found at a point cannot be used."""
@@ -156,14 +165,14 @@ class Climb:
             )
 
 
-_LARGE = 10_000
-"""From how many states on solves are only as exact as the optimiser needs, at first."""
+_NEGLIGIBLE = 1e-6
+"""What makes a smaller difference, as a share of the objective, is left out of rough looks."""
 
 
 def _tolerances(problem: Problem, optimiser: Optimiser) -> list[float | None]:
     """The tolerances of the solves, one after the other; None for the solver's own."""
     dtype = jax.eval_shape(problem.model.probabilities).dtype
-    if problem.solver.tolerance is not None or dtype != np.float64 or problem.model.graph.states < _LARGE:
+    if problem.solver.tolerance is not None or dtype != np.float64 or problem.model.graph.states < LARGE:
         return [None]
     return [optimiser.exactness, float(problem.solver.tolerance_for(dtype))]
 

@@ -8,6 +8,10 @@ batch's tasks and the shares are added up (JAX's SPMD; on several machines, the 
 
 What a batch's solves leave behind (values, adjoints, orders) is where those of the next evaluation start. It stays on
 the device whose tasks they are; everything else that an evaluation yields, all processes have.
+
+An evaluation may also take over parts of an earlier one: what a batch adds is known, to first order, to change by less
+than Σ |∂ log L/∂θ · Δθ|, and where the tasks of a batch are elsewhere than the parameters that have changed that is
+nothing. It is an estimate, so who asks for one must look again before relying on it.
 """
 
 from collections.abc import Sequence
@@ -59,8 +63,20 @@ class Solved(NamedTuple):
     stuck: Bool[Array, "tasks choices"]
 
 
+class Part(NamedTuple):
+    """What the tasks of a batch add to the actions' log-likelihood and to the slope of the loss, and at which θ."""
+
+    parameters: PyTree[np.ndarray]
+    actions: float
+    slope: PyTree[np.ndarray]
+    solved: Solved
+
+
 class Evaluation(NamedTuple):
-    """The objective and its parts at some θ, the slope of the loss (minus the objective), and how its solves went."""
+    """The objective and its parts at some θ, the slope of the loss (minus the objective), and how its solves went.
+
+    `parts` are what the batches added, for a next evaluation to take over; none where there is no room to keep them.
+    """
 
     objective: float
     actions: float
@@ -68,6 +84,7 @@ class Evaluation(NamedTuple):
     prior: float
     slope: PyTree[np.ndarray]
     solved: list[Solved]
+    parts: list[Part]
 
 
 class Objective:
@@ -84,7 +101,7 @@ class Objective:
         self.problem, self.mesh = problem, mesh
         tasks = len(problem.demonstrations.tasks.terminal)
         devices = 1 if mesh is None else mesh.size
-        together, self.keeps_starts = planned(problem.model, problem.solver, tasks, memory, devices)
+        together, self.keeps = planned(problem.model, problem.solver, tasks, memory, devices)
         _check_same(problem, mesh)
         batches = batches_of(problem.demonstrations, together) if "actions" in problem.terms else []
         self.batches = [_shared_out(batch, mesh) for batch in batches]
@@ -114,30 +131,52 @@ class Objective:
         return [_shared_out(start, self.mesh) for start in starts]
 
     def evaluate(
-        self, parameters: PyTree, starts: list[Start], tolerance: float | None = None
+        self,
+        parameters: PyTree,
+        starts: list[Start],
+        tolerance: float | None = None,
+        known: Sequence[Part] = (),
+        negligible: float = 0.0,
     ) -> tuple[Evaluation, list[Start]]:
         """The objective at θ, and where the next evaluation may start.
 
-        `tolerance` is that of the solves, where the solver leaves it open. The objective is NaN if a solve failed.
+        - `tolerance`: that of the solves, where the solver leaves it open. The objective is NaN if a solve failed.
+        - `known`: the parts of an earlier evaluation with the same tolerance. Those at the same θ are taken over, and
+          those to which, by their slope, the way from their θ to this one makes a difference below `negligible` (nats).
         """
         slope, (transitions, prior) = jax.tree.map(np.asarray, _apart_from_actions(self.problem, parameters))
+        here = jax.tree.map(np.asarray, parameters)
         parameters, tolerance = _on_all((parameters, tolerance), self.mesh)
         solving = _with_tolerance(self.solving, tolerance)
-        actions, solved, left = 0.0, [], []
-        for batch, start in zip(self.batches, starts, strict=True):
-            part, by, after, how = _of_actions(solving, parameters, batch, start, self.mesh)
-            actions += float(part)
-            slope = jax.tree.map(lambda mine, more: mine + np.asarray(more), slope, by)
-            solved.append(how)
+        actions, solved, parts, left = 0.0, [], [], []
+        for index, (batch, start) in enumerate(zip(self.batches, starts, strict=True)):
+            if known and _unchanged(known[index], here, negligible):
+                part, after = known[index], start
+            else:
+                found, by, after, how = _of_actions(solving, parameters, batch, start, self.mesh)
+                part = Part(here, float(found), jax.tree.map(np.asarray, by), how)
+            actions += part.actions
+            slope = jax.tree.map(np.add, slope, part.slope)
+            solved.append(part.solved)
+            if self.keeps:
+                parts.append(part)
             left.append(after)
-        parts = (actions, float(transitions), float(prior))
-        evaluation = Evaluation(sum(parts), *parts, slope, solved)
-        return evaluation, left if self.keeps_starts else starts
+        terms = (actions, float(transitions), float(prior))
+        return Evaluation(sum(terms), *terms, slope, solved, parts), left if self.keeps else starts
 
 
 def tasks_mesh(devices: Sequence[Any] | None = None) -> Mesh:
     """A mesh that spreads tasks over devices, by default over all that there are (of all processes)."""
     return Mesh(np.asarray(jax.devices() if devices is None else devices), (AXIS,))
+
+
+def _unchanged(part: Part, parameters: PyTree[np.ndarray], negligible: float) -> bool:
+    """Whether a part is at the same θ, or, by its slope, as good as that."""
+    moves = jax.tree.leaves(jax.tree.map(np.subtract, parameters, part.parameters))
+    if not any(move.any() for move in moves):
+        return True
+    slopes = jax.tree.leaves(part.slope)
+    return sum(float(np.abs(slope * move).sum()) for slope, move in zip(slopes, moves, strict=True)) < negligible
 
 
 @eqx.filter_jit

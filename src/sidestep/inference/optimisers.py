@@ -1,13 +1,12 @@
 """How a fit climbs: L-BFGS with a line search, first-order ascent, or steps that stay off cliffs.
 
 An optimiser is three pure functions over vectors: `init` makes what it carries from step to step, `step` takes one, and
-`settled` says why it has converged, if it has. It is given the loss (minus the objective) as a function
-`evaluate(x) -> (value, slope)`. Its `exactness` says how exact solves have to be until it has converged.
+`settled` says why it has converged, if it has. It is given the loss (minus the objective) as a function, `Evaluate`.
+Its `exactness` says how exact solves have to be until it has converged.
 """
 
 import warnings
-from collections.abc import Callable
-from typing import ClassVar
+from typing import ClassVar, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,7 +16,15 @@ from jaxtyping import Array, Float, PyTree
 from scipy.optimize import line_search
 
 Vector = Float[np.ndarray, " parameters"]
-Evaluate = Callable[[Vector], tuple[float, Vector]]
+
+
+@runtime_checkable
+class Evaluate(Protocol):
+    """The loss, and its slope."""
+
+    def __call__(self, x: Vector, *, rough: bool = False) -> tuple[float, Vector]:
+        """Both at x; a rough look may leave out what seems to be as it was where the last look was, and costs less."""
+        ...
 
 
 class LBFGS(eqx.Module):
@@ -140,14 +147,17 @@ class Resilient(eqx.Module):
     ) -> tuple[Vector, Vector] | None:
         """The next point; None where none that was tried gains anything."""
         lengths, free, share = state, slope != 0, 1.0
-        for _ in range(_TRIALS):
+        for trial in range(_TRIALS):
             step = np.where(free, -share * lengths * np.sign(slope), 0).astype(x.dtype)
-            after, new_slope = evaluate(x + step)
+            # few people have to do with what was put back: look at all only before relying on it
+            after, new_slope = evaluate(x + step, rough=trial > 0)
+            if trial > 0 and _gains(step, value, slope, after, new_slope):
+                after, new_slope = evaluate(x + step)
             if not np.isfinite(after):
                 share *= _CUT
                 continue
             promised, pushed_back = -slope * step, np.maximum(new_slope * step, 0)
-            if after < value and pushed_back.sum() <= _PUSHED_BACK * promised.sum():
+            if _gains(step, value, slope, after, new_slope):
                 growth = np.where(np.abs(new_slope) >= np.abs(slope), _STEEPER, _GROWTH)
                 grown = np.where(free, np.minimum(growth * lengths, self.longest), lengths)
                 return x + step, np.where(pushed_back > 0, _CUT * lengths, grown).astype(x.dtype)
@@ -171,6 +181,11 @@ _GROWTH, _STEEPER, _CUT, _PUSHED_BACK = 1.4, 4.0, 0.25, 0.15
 """By how much a step grows, grows on a slope that becomes steeper, and falls; which share may be pushed back."""
 _TRIALS = 40
 """How often a step of `Resilient` is tried, with fewer and fewer parameters or shorter, before it is given up."""
+
+
+def _gains(step: Vector, value: float, slope: Vector, after: float, new_slope: Vector) -> bool:
+    """Whether the loss falls along a step, and little of what the slope promised is pushed back at its end."""
+    return after < value and np.maximum(new_slope * step, 0).sum() <= _PUSHED_BACK * (-slope * step).sum()
 
 
 def _why_flat(slope: Vector, tolerance: float) -> str:

@@ -92,14 +92,14 @@ _WORTH_SHARING = 2**14
 def shared_out(work: Callable[[int, int], Any], count: int) -> list[Any]:
     """What `work(begin, end)` returns for ranges that cover 0…count; side by side if this is the only task."""
     only_task = getattr(_here, "stop", None) is None
-    parts = max(1, min(_cores(), count // _WORTH_SHARING)) if only_task else 1
+    parts = max(1, min(cores(), count // _WORTH_SHARING)) if only_task else 1
     ends = [count * part // parts for part in range(parts + 1)]
     if parts == 1:
         return [work(0, count)]
     return list(_threads().map(work, ends[:-1], ends[1:]))
 
 
-def _cores() -> int:
+def cores() -> int:
     """How many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -107,4 +107,4 @@ def _cores() -> int:
 @cache
 def _threads() -> ThreadPoolExecutor:
     """One thread a core; machine code does not hold Python's lock."""
-    return ThreadPoolExecutor(_cores(), thread_name_prefix="sidestep-sweeps")
+    return ThreadPoolExecutor(cores(), thread_name_prefix="sidestep-sweeps")
