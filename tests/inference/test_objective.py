@@ -104,7 +104,7 @@ def test_where_solves_start_makes_no_difference(name):
 
 def a_task_a_batch():
     """An objective with a batch for each of its five tasks, and one with all in one."""
-    objective, whole = Objective(problem_of(SOLVERS["ordered"]), 25 * ONE_TASK), Objective(problem_of(), MEMORY)
+    objective, whole = Objective(problem_of(), 25 * ONE_TASK), Objective(problem_of(), MEMORY)
     assert (len(objective.batches), objective.keeps, len(whole.batches)) == (5, True, 1)
     return objective, whole
 

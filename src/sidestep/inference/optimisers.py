@@ -185,7 +185,8 @@ _TRIALS = 40
 
 def _gains(step: Vector, value: float, slope: Vector, after: float, new_slope: Vector) -> bool:
     """Whether the loss falls along a step, and little of what the slope promised is pushed back at its end."""
-    return after < value and np.maximum(new_slope * step, 0).sum() <= _PUSHED_BACK * (-slope * step).sum()
+    pushed_back = np.maximum(new_slope * step, 0).sum()
+    return bool(after < value and pushed_back <= _PUSHED_BACK * (-slope * step).sum())
 
 
 def _why_flat(slope: Vector, tolerance: float) -> str:
