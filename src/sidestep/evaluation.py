@@ -4,26 +4,38 @@
 small and between sampled ones where it is large.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
-from sidestep.scoring import path_lengths, relevant_obstacles, score_map, score_paths
-from sidestep.tabular.graph import moves_into
+from sidestep.replanning import lengths_with_bumps, world_of
+from sidestep.scoring import (
+    path_lengths,
+    relevant_obstacles,
+    score_lengths,
+    score_map,
+    shortest_lengths,
+    walkable_graph,
+)
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, TransitionModel
 from sidestep.tabular.planning import plan
-from sidestep.tabular.solvers.process import reachable
 from sidestep.tasks import Task, reach
 
 MOST_PLACES = 150
 """The most starts, and the most goals, that paths are planned between; on larger maps they are drawn at random."""
 MOST_FOLLOWED = 200
 """The most paths with bumps that are followed to the end for the regret."""
+MOST_CELLS = 40_000_000
+"""The most cells, of all goals' plans together: on maps of more than 200,000 cells fewer paths are planned."""
+FEWEST = 10
+"""The fewest goals, and the fewest paths with bumps, whatever the map."""
+
+Report = Callable[[str, int, int], None]
+"""Is told what is being done, how much of it is done, and how much there is to do."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +50,32 @@ class Reward:
         return reach(grid, goal, discount=self.discount, step_cost=self.step_cost)
 
 
+class Sample(NamedTuple):
+    """How many starts and goals paths are planned between, and how many paths with bumps are followed, at most."""
+
+    starts: int
+    goals: int
+    followed: int
+
+
+def sample_for(cells: int) -> Sample:
+    """As many as take minutes on a map of so many cells; a plan takes time in proportion to them, a start hardly any.
+
+    >>> sample_for(10_000)
+    Sample(starts=150, goals=150, followed=200)
+    """
+    plans = max(FEWEST, MOST_CELLS // cells)
+    return Sample(MOST_PLACES, min(MOST_PLACES, plans), min(MOST_FOLLOWED, plans))
+
+
+class _Pairs(NamedTuple):
+    """Starts and goals (states) with a way between them, by ascending goal, and the length of the shortest one."""
+
+    starts: Int[np.ndarray, " pairs"]
+    goals: Int[np.ndarray, " pairs"]
+    shortest: Float[np.ndarray, " pairs"]
+
+
 def evaluate(
     model: ObstacleGrid,
     truth: Grid,
@@ -45,29 +83,33 @@ def evaluate(
     visited: Int[np.ndarray, "visits 2"],
     reward: Reward,
     seed: int = 0,
+    report: Report = lambda *_: None,
 ) -> Mapping[str, float | None]:
     """All scores of a learned map, by name: those of `scoring.MapScores` and `scoring.PathScores`, and `regret`.
 
     - `scored`: the cells that had to be learned.
     - `visited`: (state, goal) of the moves that were learned from; they tell which obstacles matter.
-    - `reward`: what planned paths pursue. `seed` draws their starts and goals on maps too large for all pairs.
+    - `reward`: what planned paths pursue. `seed` draws their starts and goals on maps too large for all pairs (see
+      `sample_for`).
 
     The regret is by how much a robot that follows the plans goes farther than the shortest way, on average and in cell
     sides: where it bumps into something it stays, having gone the length of the move, notes the obstacle and plans
     again. Values are `None` where there is nothing to average; the regret also where the map is so wrong about cells
     that it takes for known that the robot never arrives.
     """
+    report("finding the obstacles that matter", 0, 1)
     blocked = np.asarray(model.blocked, dtype=np.float64)
     relevant = relevant_obstacles(truth, visited[:, 0], visited[:, 1])
+    report("finding the obstacles that matter", 1, 1)
     # nobody can plan to where the learned map is known to be occupied, whatever the truth says
     free = np.flatnonzero((truth.known == Cell.FREE) & (blocked < 1))
-    random = np.random.default_rng(seed)
-    starts, goals = (_some(free, MOST_PLACES, random) for _ in range(2))
-    paths, path_goals = plan_paths(model, truth, starts, goals, reward)
+    random, sample = np.random.default_rng(seed), sample_for(truth.size)
+    pairs = _pairs_with_a_way(_some(free, sample.starts, random), _some(free, sample.goals, random), truth)
+    lengths = _planned_lengths(model, pairs, truth, reward, report)
     return {
         **asdict(score_map(blocked, truth, scored, relevant)),
-        **asdict(score_paths(paths, path_goals, truth)),
-        "regret": _regret(model, paths, path_goals, truth, reward, random),
+        **asdict(score_lengths(lengths, pairs.shortest)),
+        "regret": _regret(model, pairs, lengths, truth, reward, sample.followed, random, report),
     }
 
 
@@ -75,54 +117,75 @@ def _some(states: Int[np.ndarray, " states"], most: int, random: np.random.Gener
     return np.sort(random.choice(states, most, replace=False)) if len(states) > most else states
 
 
+def _pairs_with_a_way(starts: Int[np.ndarray, " starts"], goals: Int[np.ndarray, " goals"], truth: Grid) -> _Pairs:
+    """All pairs of a start and another place as the goal that the truth has a way between."""
+    own_starts, own_goals = np.tile(starts, len(goals)), np.repeat(goals, len(starts))
+    shortest = shortest_lengths(walkable_graph(truth), own_starts, own_goals)
+    kept = np.isfinite(shortest) & (own_starts != own_goals)
+    return _Pairs(own_starts[kept], own_goals[kept], shortest[kept])
+
+
+def _planned_lengths(
+    model: ObstacleGrid, pairs: _Pairs, truth: Grid, reward: Reward, report: Report
+) -> Float[np.ndarray, " pairs"]:
+    """The lengths of the paths planned between pairs, infinite for those that are not legal.
+
+    Only the paths to one goal are held at a time: all together may take gigabytes.
+    """
+    graph, geometry, lengths = walkable_graph(truth), truth.forget(), np.full(len(pairs.goals), np.inf)
+    goals = np.unique(pairs.goals)
+    for done, goal in enumerate(goals):
+        report(_PLANNING, done, len(goals))
+        own = pairs.goals == goal
+        paths = plan(model, reward.reach(geometry, int(goal))).follow(pairs.starts[own])
+        lengths[own] = path_lengths(graph, paths, pairs.goals[own])
+    report(_PLANNING, len(goals), len(goals))
+    return lengths
+
+
+_PLANNING, _FOLLOWING = "planning to goals", "following paths that bump"
+
+
 def _regret(
     model: ObstacleGrid,
-    paths: Sequence[Int[np.ndarray, " _"]],
-    goals: Int[np.ndarray, " paths"],
+    pairs: _Pairs,
+    lengths: Float[np.ndarray, " pairs"],
     truth: Grid,
     reward: Reward,
+    most: int,
     random: np.random.Generator,
+    report: Report,
 ) -> float | None:
-    """The mean over all pairs that have a way; of paths that are not legal, a sample is followed."""
-    lengths, shortest = path_lengths(paths, goals, truth)
-    possible = np.isfinite(shortest)
-    if not possible.any():
+    """The mean over all pairs; of paths that are not legal, a sample is followed."""
+    if not len(lengths):
         return None
-    legal = possible & np.isfinite(lengths)
-    bumping = np.flatnonzero(possible & ~legal)
-    followed = [
-        length_with_bumps(model, truth, int(paths[index][0]), int(goals[index]), reward) - shortest[index]
-        for index in _some(bumping, MOST_FOLLOWED, random)
-    ]
-    total = np.sum(lengths[legal] - shortest[legal]) + (len(bumping) * np.mean(followed) if followed else 0.0)
-    return float(total / possible.sum()) if np.isfinite(total) else None
+    legal = np.isfinite(lengths)
+    bumping = np.flatnonzero(~legal)
+    followed = _some(bumping, most, random)
+    excess = _followed_lengths(model, pairs, followed, truth, reward, report) - pairs.shortest[followed]
+    total = np.sum(lengths[legal] - pairs.shortest[legal]) + (len(bumping) * excess.mean() if len(excess) else 0.0)
+    return float(total / len(lengths)) if np.isfinite(total) else None
 
 
-def length_with_bumps(model: ObstacleGrid, truth: Grid, start: int, goal: int, reward: Reward) -> float:
-    """How far a robot goes in the true world that plans in a learned map, and again whenever it bumps into something.
-
-    In cell sides, with moves that failed; infinite if it never arrives because the learned map is sure of an obstacle
-    that is not there.
-    """
-    needed, walls = moves_into(truth), np.append(truth.known.reshape(-1) != Cell.FREE, False)
-    change, task = truth.steps, reward.reach(truth.forget(), goal)
-    known, here, length = np.array(model.known), start, 0.0
-    for _ in range(1 + int(walls.sum())):
-        planned = plan(eqx.tree_at(lambda model: model.known, model, jnp.asarray(known)), task)
-        if not bool(reachable(planned.solution.values[here])):
-            return np.inf
-        for after in planned.path_from(here)[1:]:
-            step = np.array(np.divmod(after, truth.shape[1])) - np.divmod(here, truth.shape[1])
-            action = int(np.flatnonzero((change == step).all(axis=1))[0])
-            length += float(np.linalg.norm(step))
-            bumped = [cell for cell in needed[here, action] if walls[cell]]
-            if bumped:
-                known.flat[bumped] = Cell.OCCUPIED
-                break
-            here = int(after)
-        else:
-            return length if here == goal else np.inf
-    return np.inf
+def _followed_lengths(
+    model: ObstacleGrid,
+    pairs: _Pairs,
+    followed: Int[np.ndarray, " followed"],
+    truth: Grid,
+    reward: Reward,
+    report: Report,
+) -> Float[np.ndarray, " followed"]:
+    """How far a robot goes between some of the pairs; those to the same goal share the plan that it sets out with."""
+    world, geometry, lengths = world_of(truth), truth.forget(), np.zeros(len(followed))
+    goals = pairs.goals[followed]
+    for goal in np.unique(goals):
+        report(_FOLLOWING, int((goals < goal).sum()), len(followed))
+        task = reward.reach(geometry, int(goal))
+        lengths[goals == goal] = lengths_with_bumps(
+            model, world, task, int(goal), pairs.starts[followed][goals == goal]
+        )
+    report(_FOLLOWING, len(followed), len(followed))
+    return lengths
 
 
 def plan_paths(
@@ -134,30 +197,13 @@ def plan_paths(
 ) -> tuple[Sequence[Int[np.ndarray, " _"]], Int[np.ndarray, " paths"]]:
     """The optimal paths under a model from every start to every other goal, and the goal of each.
 
-    A path that never arrives ends where the plan leads nowhere new or after as many moves as there are states. Raises
-    `NotConverged` if a plan's values did not converge.
+    A path that never arrives ends before the first state that would repeat. Raises `NotConverged` if a plan's values
+    did not converge.
     """
     geometry = grid.forget()
     paths, path_goals = [], []
     for goal in goals:
         others = starts[starts != goal]
-        intended = np.asarray(plan(model, reward.reach(geometry, int(goal))).intended)
-        paths += _followed(intended, others, int(goal))
+        paths += plan(model, reward.reach(geometry, int(goal))).follow(others)
         path_goals += [int(goal)] * len(others)
     return paths, np.asarray(path_goals, dtype=np.int64)
-
-
-def _followed(
-    intended: Int[np.ndarray, " states"], starts: Int[np.ndarray, " starts"], goal: int
-) -> list[Int[np.ndarray, " _"]]:
-    """The paths from all starts, moved on together until all are at the goal or stand still."""
-    visited = [starts]
-    while len(visited) <= len(intended):
-        here = visited[-1]
-        after = np.where(here == goal, goal, intended[here])
-        if (after == here).all():
-            break
-        visited.append(after)
-    together = np.stack(visited, axis=1)
-    lengths = np.where((together == goal).any(axis=1), (together == goal).argmax(axis=1) + 1, together.shape[1])
-    return [path[:length] for path, length in zip(together, lengths, strict=True)]

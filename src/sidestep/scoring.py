@@ -146,49 +146,71 @@ def score_paths(
     goals: Sequence[int] | Integer[np.ndarray, " paths"],
     truth: Grid,
 ) -> PathScores:
-    """Scores of planned paths; arguments and errors as for `path_lengths`.
+    """Scores of planned paths.
+
+    - `paths`: the states along each path, the start first. A path that repeats a state in place is not legal.
+    - `goals`: the state that each path was planned to.
+
+    Raises `InputError` for a path without states, a number of goals that differs from the number of paths, and states
+    that are not on the map.
 
     >>> truth = Grid(np.array([[0, 1, 0], [0, 0, 0]]))
     >>> score_paths([np.array([0, 3, 4, 5, 2]), np.array([0, 1, 2])], [2, 2], truth)
     PathScores(legal_share=0.5, excess_length=0.0)
     """
-    lengths, shortest = path_lengths(paths, goals, truth)
+    if len(paths) != len(goals):
+        raise InputError(f"expected {len(paths)}, one for each path, found {len(goals)}", field="goals")
+    if not len(paths):
+        return PathScores(None, None)
+    empty = [len(path) == 0 for path in paths]
+    if any(empty):
+        raise InputError("expected at least one state", source="path", row=empty.index(True) + 1)
+    wanted = np.asarray(goals)
+    _check_states(np.concatenate(paths), truth, "paths")
+    _check_states(wanted, truth, "goals")
+    graph = walkable_graph(truth)
+    starts = np.array([path[0] for path in paths])
+    # a lone start on an obstacle has made no move that could be illegal
+    shortest = np.where(_free(truth)[starts], shortest_lengths(graph, starts, wanted), np.inf)
+    return score_lengths(path_lengths(graph, paths, wanted), shortest)
+
+
+def score_lengths(lengths: Float[np.ndarray, " paths"], shortest: Float[np.ndarray, " paths"]) -> PathScores:
+    """Scores of planned paths by their lengths (`path_lengths`) and those of the shortest ways (`shortest_lengths`)."""
     possible = np.isfinite(shortest)
     legal = possible & np.isfinite(lengths)
     return PathScores(_mean(legal[possible]), _mean(lengths[legal] - shortest[legal]))
 
 
 def path_lengths(
-    paths: Sequence[Integer[np.ndarray, " _"]],
-    goals: Sequence[int] | Integer[np.ndarray, " paths"],
-    truth: Grid,
-) -> tuple[Float[np.ndarray, " paths"], Float[np.ndarray, " paths"]]:
-    """The length of each path and of the shortest way between its ends, in cell sides.
+    graph: csr_array, paths: Sequence[Integer[np.ndarray, " _"]], goals: Integer[np.ndarray, " paths"]
+) -> Float[np.ndarray, " paths"]:
+    """The length of each path in cell sides, infinite where it does not arrive or makes a move not in the graph.
 
-    - `paths`: the states along each path, the start first. A path that repeats a state in place is not legal.
-    - `goals`: the state that each path was planned to.
-
-    A path that is not legal in the truth or does not arrive has infinite length, and a pair of start and goal between
-    which the truth has no way has an infinite shortest way. Raises `InputError` for a path without states, a number of
-    goals that differs from the number of paths, and states that are not on the map.
+    `graph` is a `walkable_graph`; every path has at least one state.
     """
-    if len(paths) != len(goals):
-        raise InputError(f"expected {len(paths)}, one for each path, found {len(goals)}", field="goals")
-    if not len(paths):
-        return np.zeros(0), np.zeros(0)
-    sizes = np.array([len(path) for path in paths])
-    if not sizes.all():
-        raise InputError("expected at least one state", source="path", row=int(np.argmin(sizes)) + 1)
-    states, wanted = np.concatenate(paths), np.asarray(goals)
-    _check_states(states, truth, "paths")
-    _check_states(wanted, truth, "goals")
-    graph = walkable_graph(truth)
-    last = np.cumsum(sizes) - 1
-    starts = states[last - sizes + 1]
-    lengths = np.where(states[last] == wanted, _path_lengths(graph, states, last), np.inf)
-    # a lone start on an obstacle has made no move that could be illegal
-    shortest = np.where(_free(truth)[starts], _shortest_lengths(graph, starts, wanted), np.inf)
-    return lengths, shortest
+    states = np.concatenate(paths)
+    ends = np.cumsum([len(path) for path in paths])
+    last, first = ends - 1, np.append(0, ends[:-1])
+    # indices with two axes give a matrix in every version of SciPy
+    length = graph[states[None, :-1], states[None, 1:]].toarray()[0]
+    length = np.append(np.where(length > 0, length, np.inf), 0.0)
+    length[last] = 0.0  # from the end of one path to the start of the next is no move
+    return np.where(states[last] == goals, np.add.reduceat(length, first), np.inf)
+
+
+def shortest_lengths(
+    graph: csr_array, starts: Integer[np.ndarray, " paths"], goals: Integer[np.ndarray, " paths"]
+) -> Float[np.ndarray, " paths"]:
+    """The length of the shortest way from each start to its goal in cell sides, infinite where there is none.
+
+    `graph` is a `walkable_graph`. One shortest-path search for each different goal.
+    """
+    shortest = np.full(len(starts), np.inf)
+    for goal in np.unique(goals):
+        own = goals == goal
+        shortest[own] = dijkstra(graph, indices=int(goal))[starts[own]]
+    return shortest
 
 
 def visit_ranking(visited: Integer[np.ndarray, " moves"], grid: Grid) -> Float[np.ndarray, "rows columns"]:
@@ -269,29 +291,6 @@ def _head_start(
     no_way_is_longer = 4.0 * (states + 1)
     result[np.isin(components, components[stranded])] = -no_way_is_longer
     return result
-
-
-def _path_lengths(
-    graph: csr_array, states: Integer[np.ndarray, " states"], last: Int[np.ndarray, " paths"]
-) -> Float[np.ndarray, " paths"]:
-    """The length of each path, infinite where a move is not in the graph; `last` is where each path ends."""
-    # indices with two axes give a matrix in every version of SciPy
-    length = graph[states[None, :-1], states[None, 1:]].toarray()[0]
-    length = np.append(np.where(length > 0, length, np.inf), 0.0)
-    length[last] = 0.0  # from the end of one path to the start of the next is no move
-    first = np.append(0, last[:-1] + 1)
-    return np.add.reduceat(length, first)
-
-
-def _shortest_lengths(
-    graph: csr_array, starts: Integer[np.ndarray, " paths"], goals: Integer[np.ndarray, " paths"]
-) -> Float[np.ndarray, " paths"]:
-    """The length of the shortest way from each start to its goal, infinite where there is none."""
-    shortest = np.full(len(starts), np.inf)
-    for goal in np.unique(goals):
-        own = goals == goal
-        shortest[own] = dijkstra(graph, indices=int(goal))[starts[own]]
-    return shortest
 
 
 def _ranking_scores(

@@ -46,12 +46,22 @@ class Plan(eqx.Module):
             raise InputError(f"expected a state in 0…{len(self.terminal) - 1}, found {start}", field="start")
         if not bool(reachable(self.solution.values[start])):
             raise InputError(f"the goal cannot be reached from state {start}", field="start")
+        return self.follow(np.array([start]))[0]
+
+    def follow(self, starts: Int[np.ndarray, " starts"]) -> list[Int[np.ndarray, " _"]]:
+        """The states that the plan means to pass from each start on: `path_from`, but also where there is no way."""
         intended, terminal = np.asarray(self.intended), np.asarray(self.terminal)
-        path, seen = [start], {start}
-        while not terminal[path[-1]] and (state := int(intended[path[-1]])) not in seen:
-            path.append(state)
-            seen.add(state)
-        return np.asarray(path)
+        return [_followed(intended, terminal, start) for start in starts.tolist()]
+
+
+def _followed(
+    intended: Int[np.ndarray, " states"], terminal: Bool[np.ndarray, " states"], start: int
+) -> Int[np.ndarray, " steps"]:
+    path, seen = [start], {start}
+    while not terminal[path[-1]] and (state := int(intended[path[-1]])) not in seen:
+        path.append(state)
+        seen.add(state)
+    return np.asarray(path)
 
 
 def plan(model: TransitionModel, task: Task, behavior: Behavior | None = None, solver: Solver | None = None) -> Plan:
