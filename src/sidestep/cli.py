@@ -15,6 +15,7 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -175,8 +176,8 @@ def evaluate_command(
     seed: Seed = 0,
 ) -> None:
     """AUC, average precision, recall, and how legal and how long the planned paths are."""
-    with _working("planning between all pairs"):
-        scores = evaluate_map(folder, truth, out, seed)
+    with _stages() as report:
+        scores = evaluate_map(folder, truth, out, seed, report)
     _print_scores({str(folder): scores})
 
 
@@ -266,6 +267,31 @@ def _fitting(iterations: int) -> Iterator[Callable[[FitProgress], None]]:
         def report(progress: FitProgress) -> None:
             state = f"objective {progress.objective:.3f}, largest gradient {progress.gradient:.2g}"
             bar.update(task, completed=progress.iteration, state=state)
+
+        yield report
+
+
+@contextmanager
+def _stages() -> Iterator[Callable[[str, int, int], None]]:
+    """A progress bar on a terminal for each stage of a work, with the time that is left of it.
+
+    How much a later stage has to do is known when it begins; so no time is told for the whole.
+    """
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("left"),
+    )
+    with Progress(*columns, console=errors, transient=True, speed_estimate_period=600) as bar:
+        begun: dict[str, TaskID] = {}
+
+        def report(stage: str, done: int, of: int) -> None:
+            if stage not in begun:
+                begun[stage] = bar.add_task(stage, total=of)
+            bar.update(begun[stage], completed=done)
 
         yield report
 

@@ -7,16 +7,19 @@ from typing import Any
 import numpy as np
 
 from sidestep.errors import InputError
-from sidestep.evaluation import evaluate
+from sidestep.evaluation import Report, evaluate, sample_for
 from sidestep.io.maps import read_map
 from sidestep.runs import add_to_summary, read_learned_map
 
 
-def evaluate_map(folder: Path, truth_file: Path, out: Path | None = None, seed: int = 0) -> Mapping[str, Any]:
+def evaluate_map(
+    folder: Path, truth_file: Path, out: Path | None = None, seed: int = 0, report: Report = lambda *_: None
+) -> Mapping[str, Any]:
     """Scores the learned map of `folder` against a true map and returns the scores (see `sidestep.scoring`).
 
-    They are written to `summary.json` in `out`; without `out`, added to the learned map's own. `seed` draws starts and
-    goals on maps too large for paths between all pairs of free cells. Raises `InputError` for maps of another size.
+    They are written to `summary.json` in `out`; without `out`, added to the learned map's own; with `sample`, how many
+    starts and goals paths were planned between, and how many paths with bumps were followed, at most. `seed` draws
+    these on maps too large for paths between all pairs of free cells. Raises `InputError` for maps of another size.
     """
     learned = read_learned_map(folder)
     truth = read_map(truth_file, connectivity=learned.grid.connectivity)
@@ -36,6 +39,7 @@ def evaluate_map(folder: Path, truth_file: Path, out: Path | None = None, seed: 
         raise InputError(
             f"expected the learned map's {learned.grid.origin}, found {truth.origin}", source=truth_file, field="origin"
         )
-    scores = evaluate(learned.model(), truth, learned.unknown, learned.visited, learned.reward, seed)
-    add_to_summary(folder, out or folder, None, {"truth": str(truth_file), **scores})
+    scores = evaluate(learned.model(), truth, learned.unknown, learned.visited, learned.reward, seed, report)
+    sample = sample_for(truth.size)._asdict()
+    add_to_summary(folder, out or folder, None, {"truth": str(truth_file), "sample": sample, **scores})
     return scores
