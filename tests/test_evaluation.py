@@ -1,10 +1,12 @@
 """Scores of learned maps, on maps small enough to score by hand."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from sidestep import evaluation
-from sidestep.evaluation import Reward, evaluate, plan_paths
+from sidestep.evaluation import Reward, evaluate, plan_paths, sample_for
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, true_model
 
@@ -134,3 +136,22 @@ def test_large_maps_are_sampled_by_seed(monkeypatch):
                     for one in found[2:]]  # fmt: skip
     assert any(paths_differ)
     assert all(one["auc"] == found[0]["auc"] for one in found)
+
+
+def test_larger_maps_are_sampled_less_but_never_not_at_all():
+    samples = [sample_for(cells) for cells in (9, 40_000, 185_428, 1_684_044, 10**8)]
+    assert samples[0] == samples[1] == (evaluation.MOST_PLACES, evaluation.MOST_PLACES, evaluation.MOST_FOLLOWED)
+    for smaller, larger in pairwise(samples):
+        assert all(few <= many for few, many in zip(larger, smaller, strict=True))
+    assert samples[-1].goals == samples[-1].followed == evaluation.FEWEST
+    assert samples[3].goals * 1_684_044 <= evaluation.MOST_CELLS
+
+
+def test_the_work_that_is_reported_is_done():
+    """Each stage begins, ends, and never goes back; plans go to all goals, and 13 paths bump."""
+    told = []
+    scores(ObstacleGrid(TRUTH.forget(), -20.0), report=lambda *stage: told.append(stage))
+    for stage, total in (("planning to goals", 7), ("following paths that bump", 13)):
+        done = [done for name, done, of in told if name == stage and of == total]
+        assert done == sorted(done)
+        assert (done[0], done[-1]) == (0, total)
