@@ -11,6 +11,7 @@ import pytest
 from numba.core import config as numba_settings
 from problems import BACKUPS, generic_task, obstacle_problem, random_problem, relative_error
 
+from sidestep.domains.offices import office
 from sidestep.errors import InputError
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
 from sidestep.tabular.grid import Grid
@@ -339,6 +340,24 @@ def test_values_that_move_each_other_come_to_rest():
     goal = reach(grid, int(np.flatnonzero(grid.known == 0)[0]), discount=1.0, step_cost=1.0)
     found = solve(ObstacleGrid(grid, 8.0), goal, Behavior(LogSumExp(), 5.0), solver=Ordered(max_sweeps=600))
     assert found.converged
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_start_that_leads_astray_costs_no_more_than_it_was_trusted(seed):
+    """Where walls have opened everywhere neither old values nor their order serve, and all is as from no start."""
+    random = np.random.default_rng(seed)
+    truth = office(60, 60, seed)
+    wall = truth.known.reshape(-1) == 1
+    logits = np.where(wall, 8.0, -5.0)
+    opened = np.where(np.isin(np.arange(truth.size), random.choice(np.flatnonzero(wall), 60)), -1.0, logits)
+    closed_model, open_model = (ObstacleGrid(truth.forget(), jnp.asarray(made)) for made in (logits, opened))
+    goal = reach(truth.forget(), int(random.choice(np.flatnonzero(~wall))), discount=1.0, step_cost=1.0)
+    walkers, solver = Behavior(LogSumExp(), 5.0), Ordered(tolerance=1e-10)
+    start = solve(closed_model, goal, walkers, solver=solver).start
+    cold = solve(open_model, goal, walkers, solver=solver)
+    warm = solve(open_model, goal, walkers, solver=solver, start=start)
+    assert warm.sweeps <= cold.sweeps + 13
+    np.testing.assert_allclose(warm.values, cold.values, rtol=1e-9)
 
 
 def test_backups_without_machine_code_are_refused():

@@ -1,6 +1,6 @@
 """Values, from where a task ends outwards, on the host: what to start from, and in which order.
 
-An earlier solve's values are taken on trust for 12 sweeps; if they have not converged by then, the solve starts from
+An earlier solve's values are taken on trust for some sweeps; if they have not converged by then, the solve starts from
 no values. An order is kept as long as few states want to go to a farther one.
 """
 
@@ -19,8 +19,11 @@ from sidestep.tabular.solvers.sweeping import Valuing, first_values_for
 
 _OUT_OF_ORDER = 0.05
 """The share of states that may want to go to a farther one, before states are put in order anew."""
-_TRUST = 12
-"""How many sweeps a solve may take that starts from an earlier one's values."""
+_TRUST = 1.2
+"""How many sweeps a solve that starts from an earlier one's values may take for each digit of the tolerance.
+
+On a large map those that get there at all need no more; the others run along a front that one order cannot follow.
+"""
 
 
 class _Asked(NamedTuple):
@@ -60,10 +63,11 @@ def find_values(
     nothing = number(lowest(start.dtype))
     outcome = Outcome(0, np.inf, False)
     if (start > nothing).any():
-        outcome = _start_from(start, order, asked, min(_TRUST, max_sweeps), found)
+        trusted = int(np.ceil(_TRUST * max(1.0, -np.log10(asked.tolerance))))
+        outcome = _start_from(start, order, asked, min(trusted, max_sweeps), found)
     if not outcome.converged and outcome.sweeps < max_sweeps:
-        # a start that led nowhere may have had a good order
-        cold, known_order = np.full_like(start, nothing), found.order if outcome.sweeps else order
+        # where values led astray, their order is no better
+        cold, known_order = np.full_like(start, nothing), np.full_like(order, -1) if outcome.sweeps else order
         again = _start_from(cold, known_order, asked, max_sweeps - outcome.sweeps, found)
         outcome = again._replace(sweeps=outcome.sweeps + again.sweeps)
     write(found, found.order, outcome)

@@ -134,6 +134,10 @@ class Rounds:
 
         residual = float(np.max(shared_out(solve, len(into))))
         np.copyto(self.values, into, where=~self.world.fixed)
+        # none saw what became of the others, whichever came first
+        marks, moved = self.marks, self.marks.changed == self.number
+        self.number += 1
+        marks.changed[moved] = marks.solved[moved] = self.number
         return residual
 
     def _sweep(self, which: np.ndarray, shifted: int) -> tuple[float, int]:
