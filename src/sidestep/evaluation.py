@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import csr_array
 
 from sidestep.replanning import lengths_with_bumps, world_of
 from sidestep.scoring import (
@@ -59,7 +60,7 @@ class Sample(NamedTuple):
 
 
 def sample_for(cells: int) -> Sample:
-    """As many as take minutes on a map of so many cells; a plan takes time in proportion to them, a start hardly any.
+    """How many on a map of so many cells: a plan takes time in proportion to them, a start hardly any.
 
     >>> sample_for(10_000)
     Sample(starts=150, goals=150, followed=200)
@@ -104,8 +105,9 @@ def evaluate(
     # nobody can plan to where the learned map is known to be occupied, whatever the truth says
     free = np.flatnonzero((truth.known == Cell.FREE) & (blocked < 1))
     random, sample = np.random.default_rng(seed), sample_for(truth.size)
-    pairs = _pairs_with_a_way(_some(free, sample.starts, random), _some(free, sample.goals, random), truth)
-    lengths = _planned_lengths(model, pairs, truth, reward, report)
+    graph = walkable_graph(truth)
+    pairs = _pairs_with_a_way(_some(free, sample.starts, random), _some(free, sample.goals, random), graph)
+    lengths = _planned_lengths(model, pairs, truth, graph, reward, report)
     return {
         **asdict(score_map(blocked, truth, scored, relevant)),
         **asdict(score_lengths(lengths, pairs.shortest)),
@@ -117,22 +119,22 @@ def _some(states: Int[np.ndarray, " states"], most: int, random: np.random.Gener
     return np.sort(random.choice(states, most, replace=False)) if len(states) > most else states
 
 
-def _pairs_with_a_way(starts: Int[np.ndarray, " starts"], goals: Int[np.ndarray, " goals"], truth: Grid) -> _Pairs:
-    """All pairs of a start and another place as the goal that the truth has a way between."""
+def _pairs_with_a_way(starts: Int[np.ndarray, " starts"], goals: Int[np.ndarray, " goals"], graph: csr_array) -> _Pairs:
+    """All pairs of a start and another place as the goal that the graph has a way between."""
     own_starts, own_goals = np.tile(starts, len(goals)), np.repeat(goals, len(starts))
-    shortest = shortest_lengths(walkable_graph(truth), own_starts, own_goals)
+    shortest = shortest_lengths(graph, own_starts, own_goals)
     kept = np.isfinite(shortest) & (own_starts != own_goals)
     return _Pairs(own_starts[kept], own_goals[kept], shortest[kept])
 
 
 def _planned_lengths(
-    model: ObstacleGrid, pairs: _Pairs, truth: Grid, reward: Reward, report: Report
+    model: ObstacleGrid, pairs: _Pairs, truth: Grid, graph: csr_array, reward: Reward, report: Report
 ) -> Float[np.ndarray, " pairs"]:
     """The lengths of the paths planned between pairs, infinite for those that are not legal.
 
     Only the paths to one goal are held at a time: all together may take gigabytes.
     """
-    graph, geometry, lengths = walkable_graph(truth), truth.forget(), np.full(len(pairs.goals), np.inf)
+    geometry, lengths = truth.forget(), np.full(len(pairs.goals), np.inf)
     goals = np.unique(pairs.goals)
     for done, goal in enumerate(goals):
         report(_PLANNING, done, len(goals))

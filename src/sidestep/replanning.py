@@ -9,6 +9,7 @@ action has a value above that of where it leads, the best of them depends on non
 from heapq import heappop, heappush
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -20,9 +21,6 @@ from sidestep.tabular.planning import plan
 from sidestep.tabular.solvers.compiled import compiled
 from sidestep.tabular.solvers.process import reachable
 from sidestep.tasks import Task
-
-_TIE = HardMax().tie
-"""Within which share of the best its ties lie."""
 
 
 class World(NamedTuple):
@@ -41,8 +39,8 @@ class _Mind(NamedTuple):
     """What a robot holds of the world and of its task, to reach the state `goal`.
 
     - `chances`: that each move succeeds; 0 for moves off the map and those that it knows to fail.
-    - `values`: of the states by these chances, the goal's own included; −∞ where there is no way.
-    - `reward`: of each action.
+    - `values`: of the states by these chances, the goal's own included; −∞ at discount 1 where there is no way.
+    - `reward`: of each action. `tie`: within which share of the best its ties lie.
     """
 
     chances: Float[np.ndarray, "states actions"]
@@ -50,6 +48,7 @@ class _Mind(NamedTuple):
     reward: Float[np.ndarray, " actions"]
     discount: float
     goal: int
+    tie: float
 
 
 def world_of(truth: Grid) -> World:
@@ -67,13 +66,14 @@ def lengths_with_bumps(
     `model`, not what others found out. Raises `NotConverged` if the first plan's values did not converge.
     """
     found = plan(model, task).solution.values
+    tie = max(HardMax().tie, 64 * float(jnp.finfo(found.dtype).eps))
     values = np.where(reachable(found), found, -np.inf).astype(np.float64)
     on_the_map = world.needed[..., 0] < len(values)
     chances = np.where(on_the_map, np.asarray(model.probabilities(), dtype=np.float64)[..., 0], 0.0)
     reward = np.array(np.broadcast_to(task.reward, (1, len(world.lengths)))[0], dtype=np.float64)
 
     def mind() -> _Mind:
-        return _Mind(chances.copy(), values.copy(), reward, float(task.discount), goal)
+        return _Mind(chances.copy(), values.copy(), reward, float(task.discount), goal, tie)
 
     return np.array([_walked(world, mind(), start) for start in starts.tolist()])
 
@@ -84,6 +84,7 @@ def _walked(world, mind, start):  # pragma: no cover
     here, length, since_a_bump = start, 0.0, 0
     stale = np.zeros(len(mind.values), np.bool_)
     while here != mind.goal:
+        # below discount 1 states without a way have values too: who walks on for so long will never arrive
         if mind.values[here] == -np.inf or since_a_bump > len(mind.values):
             return np.inf
         action = _chosen(mind, world.needed, here)
@@ -113,7 +114,7 @@ def _chosen(mind, needed, here):  # pragma: no cover
             gain = mind.chances[here, a] * (mind.values[needed[here, a, 0]] - own)
             worths[a] = mind.reward[a] + mind.discount * (own + gain)
     best = worths.max()
-    return np.argmax(worths >= best - _TIE * abs(best)) if best > -np.inf else -1
+    return np.argmax(worths >= best - mind.tie * abs(best)) if best > -np.inf else -1
 
 
 @compiled()
@@ -141,7 +142,7 @@ def _close(mind, needed, cell, stale):  # pragma: no cover
     while waiting:
         _, state = heappop(waiting)
         value = mind.values[state]
-        supported = state == mind.goal or _supported(mind, needed, state, stale) >= value - _TIE * abs(value)
+        supported = state == mind.goal or _supported(mind, needed, state, stale) >= value - mind.tie * abs(value)
         if stale[state] or supported:
             continue
         stale[state] = True

@@ -10,7 +10,7 @@ from sidestep.commands.learn import Settings, fit_map
 from sidestep.commands.simulate import Walkers, walk
 from sidestep.demonstrations import gather
 from sidestep.domains.offices import office
-from sidestep.inference import climb
+from sidestep.inference import batches, climb, objective
 from sidestep.inference.fit import fit
 from sidestep.inference.optimisers import LBFGS, Ascent, Resilient
 from sidestep.inference.priors import Normal
@@ -33,9 +33,10 @@ def demonstrations():
 
 @pytest.fixture
 def everything_is_large(monkeypatch):
-    """For the choice of the optimiser, and for solves that are only as exact as it needs."""
-    monkeypatch.setattr(learn, "LARGE", 1)
-    monkeypatch.setattr(climb, "_LARGE", 1)
+    """For the choice of the optimiser, for solves that are only as exact as it needs, and for a batch for each task."""
+    for module in (learn, climb, batches):
+        monkeypatch.setattr(module, "LARGE", 1)
+    monkeypatch.setattr(batches, "cores", lambda: 1)
 
 
 @pytest.mark.usefixtures("everything_is_large")
@@ -53,6 +54,42 @@ def test_a_large_map_is_learned(demonstrations):
     assert learned is not None
     assert by_visits is not None
     assert learned > 2 * by_visits
+
+
+def two_offices():
+    """An office that nobody knows beside one that is known, a wall between them, and walks in each to its own goals."""
+    offices, wall = [office(20, 24, seed).known for seed in (0, 1)], np.ones((20, 1), dtype=int)
+    unknown = Grid(np.hstack([np.full((20, 24), -1), wall, offices[1]]))
+    walks, goals = [], []
+    for side in (0, 1):
+        shown = [known if own == side else np.ones_like(known) for own, known in enumerate(offices)]
+        found, ends = walk(Grid(np.hstack([shown[0], wall, shown[1]])), Walkers(30, 3, discount=1.0, step_cost=1.0))
+        walks += [trajectory._replace(task=trajectory.task + len(goals)) for trajectory in found]
+        goals += ends
+    return unknown, gather(walks, [reach(unknown, goal, discount=1.0, step_cost=1.0) for goal in goals])
+
+
+@pytest.mark.usefixtures("everything_is_large")
+def test_taking_over_what_does_not_change_changes_nothing_but_the_work(monkeypatch):
+    solves, solve_batch = [], objective._of_actions
+
+    def counted(*given):
+        solves.append(given)
+        return solve_batch(*given)
+
+    monkeypatch.setattr(objective, "_of_actions", counted)
+    unknown, demonstrations = two_offices()
+    found = fit_map(ObstacleGrid(unknown, 0.5), demonstrations, SETTINGS)
+    once = len(solves)
+    solves.clear()
+    unchanged = objective._unchanged
+    monkeypatch.setattr(objective, "_unchanged", lambda part, parameters, _: unchanged(part, parameters, 0.0))
+    expected = fit_map(ObstacleGrid(unknown, 0.5), demonstrations, SETTINGS)
+    assert once < len(solves)
+    assert len(found.history) == len(expected.history)
+    for one, other in zip(found.history, expected.history, strict=True):
+        assert one.objective == pytest.approx(other.objective, rel=1e-5)
+    np.testing.assert_allclose(found.model.blocked, expected.model.blocked, atol=1e-3)
 
 
 def test_it_ends_where_a_search_along_the_gradient_does(demonstrations, monkeypatch):

@@ -96,7 +96,7 @@ def test_evaluating_adds_the_scores_to_the_summary(office, learned, tmp_path, ca
     assert {key: together[key] for key in before} == before
     for key in SCORES:
         assert apart[key] == together[key]
-    assert set(together["sample"]) == {"starts", "goals", "followed"}
+    assert set(together["planned_at_most"]) == {"starts", "goals", "followed"}
     assert together["auc"] == 1
     assert together["legal_share"] == 1
     assert together["mean_obstacle"] > 0.5 > 0.2 > together["mean_free"]

@@ -7,13 +7,15 @@ import pytest
 from spread import BENT, GOALS, demonstrations
 from walled import BLANK
 
+from sidestep.inference import batches
 from sidestep.inference.batches import planned
 from sidestep.inference.objective import MEMORY, Objective, Problem
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
+from sidestep.tabular.graph import grid_graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import ALL_TERMS, log_likelihood
-from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.models import ObstacleGrid, TabularModel
 from sidestep.tabular.solvers.host import cores
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.solvers.ordered import Ordered
@@ -70,7 +72,7 @@ def test_the_less_memory_the_more_batches():
 
 @pytest.mark.parametrize(("tasks", "devices", "expected"), [(5, 1, 5), (5, 4, 8), (8, 4, 8), (3, 4, 4)])
 def test_devices_share_tasks_equally(tasks, devices, expected):
-    assert planned(MODEL, Jacobi(), tasks, MEMORY, devices) == (expected, True)
+    assert planned(MODEL, Jacobi(), tasks, MEMORY, devices) == (expected, True, False)
 
 
 def test_memory_is_that_of_each_device():
@@ -80,13 +82,12 @@ def test_memory_is_that_of_each_device():
     assert planned(MODEL, Jacobi(), 6, memory, 2)[0] == 6
 
 
-def test_starts_and_parts_are_dropped_where_there_is_no_room():
+def test_starts_are_dropped_where_there_is_no_room():
     roomy, tight = Objective(problem_of(), MEMORY), Objective(problem_of(), 1.0)
-    assert (roomy.keeps, tight.keeps) == (True, False)
+    assert (roomy.planned.keeps_starts, tight.planned.keeps_starts) == (True, False)
     cold = tight.cold_starts()
-    found, left = tight.evaluate(POINT, cold)
+    _, left = tight.evaluate(POINT, cold)
     assert left is cold
-    assert found.parts == []
     _, left = roomy.evaluate(POINT, roomy.cold_starts())
     assert np.isfinite(left[0].adjoint).all()
     assert (np.asarray(left[0].adjoint) != 0).any()
@@ -102,15 +103,19 @@ def test_where_solves_start_makes_no_difference(name):
     np.testing.assert_allclose(warm.slope, cold.slope, rtol=1e-7, atol=1e-7 * np.abs(cold.slope).max())
 
 
-def a_task_a_batch():
-    """An objective with a batch for each of its five tasks, and one with all in one."""
-    objective, whole = Objective(problem_of(), 25 * ONE_TASK), Objective(problem_of(), MEMORY)
-    assert (len(objective.batches), objective.keeps, len(whole.batches)) == (5, True, 1)
+@pytest.fixture
+def a_task_a_batch(monkeypatch):
+    """An objective with a batch for each of its five tasks, whose parts are taken over, and one with all in one."""
+    monkeypatch.setattr(batches, "LARGE", 1)
+    monkeypatch.setattr(batches, "cores", lambda: 1)
+    problem = problem_of(SOLVERS["ordered"])
+    objective, whole = Objective(problem, MEMORY, takes_over=True), Objective(problem, MEMORY)
+    assert (len(objective.batches), objective.planned.takes_over, len(whole.batches)) == (5, True, 1)
     return objective, whole
 
 
-def test_what_a_batch_added_at_the_same_point_is_taken_over():
-    objective, _ = a_task_a_batch()
+def test_what_a_batch_added_at_the_same_point_is_taken_over(a_task_a_batch):
+    objective, _ = a_task_a_batch
     found, starts = objective.evaluate(POINT, objective.cold_starts())
     assert sum(part.actions for part in found.parts) == found.actions
     marked = [part._replace(actions=2.0**index) for index, part in enumerate(found.parts)]
@@ -122,9 +127,9 @@ def test_what_a_batch_added_at_the_same_point_is_taken_over():
     assert elsewhere.actions == pytest.approx(found.actions, rel=1e-6)
 
 
-def test_only_batches_that_a_change_concerns_are_solved_anew():
+def test_only_batches_that_a_change_concerns_are_solved_anew(a_task_a_batch):
     """One parameter is moved by as much as would change one task's part by a nat, and others hardly."""
-    objective, whole = a_task_a_batch()
+    objective, whole = a_task_a_batch
     found, starts = objective.evaluate(POINT, objective.cold_starts())
     slopes = np.abs([part.slope for part in found.parts])
     rest = slopes.sum(axis=0) - slopes.max(axis=0)
@@ -141,9 +146,9 @@ def test_only_batches_that_a_change_concerns_are_solved_anew():
     assert again.actions == pytest.approx(exact.actions, abs=0.1)
 
 
-def test_what_changed_since_is_counted_from_where_a_part_was_solved():
+def test_what_changed_since_is_counted_from_where_a_part_was_solved(a_task_a_batch):
     """A part that was taken over twice does not drift away by less than is negligible each time."""
-    objective, _ = a_task_a_batch()
+    objective, _ = a_task_a_batch
     found, starts = objective.evaluate(POINT, objective.cold_starts())
     first = found.parts[0]
     direction = 0.06 * np.sign(first.slope) / np.abs(first.slope).sum()
@@ -153,11 +158,25 @@ def test_what_changed_since_is_counted_from_where_a_part_was_solved():
     assert twice.parts[0] is not first
 
 
-def test_long_solves_come_in_batches_of_no_more_tasks_than_cores():
+def test_long_solves_to_take_over_come_in_batches_of_no_more_tasks_than_cores():
     large, small = (ObstacleGrid(Grid.unknown(100, columns), 0.0) for columns in (100, 99))
-    assert planned(large, Ordered(), 2 * cores(), MEMORY, 1) == (cores(), True)
-    for model, solver, devices in ((small, Ordered(), 1), (large, Jacobi(), 1), (large, Ordered(), 2)):
-        assert planned(model, solver, 2 * cores(), MEMORY, devices) == (2 * cores(), True)
+    tasks = 2 * cores()
+    assert planned(large, Ordered(), tasks, MEMORY, 1, takes_over=True) == (cores(), True, True)
+    for model, solver, devices, asked in (
+        (small, Ordered(), 1, True),
+        (large, Jacobi(), 1, True),
+        (large, Ordered(), 2, True),
+        (large, Ordered(), 1, False),
+    ):
+        assert planned(model, solver, tasks, MEMORY, devices, takes_over=asked) == (tasks, True, False)
+
+
+def test_where_memory_is_short_parts_go_before_starts():
+    """In a table, where every outcome has a parameter, they are larger than starts."""
+    graph = grid_graph(Grid.unknown(100, 100))
+    model = TabularModel(graph, jnp.zeros(graph.successors.shape))
+    kept = [planned(model, Ordered(), 100, memory, 1, takes_over=True)[1:] for memory in (2.0**32, 2.0**27, 2.0**22)]
+    assert kept == [(True, True), (True, False), (False, False)]
 
 
 def test_transitions_alone_need_no_batches():

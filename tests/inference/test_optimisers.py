@@ -190,6 +190,21 @@ def test_resilient_ascent_does_not_rely_on_rough_looks():
     assert roughly == [False, False, True, False, True, False]
 
 
+def test_resilient_ascent_looks_at_all_where_a_step_is_too_long():
+    """Beyond .5 is a plateau whose slope says nothing of it, so rough looks from there would not see it left."""
+    optimiser, beyond = Resilient(first=1.0), [False]
+    x = np.array([0.0])
+
+    def evaluate(x, rough=False):
+        if not rough:
+            beyond[0] = bool(x[0] > 0.5)
+        return float(1e3 * beyond[0] - x[0]), np.array([-1.0])
+
+    after = optimiser.step(evaluate, x, *evaluate(x), optimiser.init(x))
+    assert after is not None
+    np.testing.assert_array_equal(after[0], [0.25])
+
+
 def test_resilient_ascent_comes_back_up_quickly():
     """Where a slope becomes steeper on the way, the next step is four times as long."""
     optimiser = Resilient(first=0.01)

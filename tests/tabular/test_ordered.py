@@ -308,6 +308,15 @@ def test_what_is_no_number_is_never_a_solution(name, where):
 
 def test_the_last_sweep_leaves_nobody_out():
     """States that seem to have nothing to do, because nobody said that values changed, are still looked at."""
+    rounds, solved = settled_rounds()
+    rounds.values[1:] *= 0.5
+    rounds.marks.changed[:], rounds.marks.solved[:] = 0, rounds.number
+    assert rounds.until_still().converged
+    np.testing.assert_allclose(rounds.values, solved, rtol=1e-8)
+
+
+def settled_rounds():
+    """Rounds that have come to rest, and the values that they were at."""
     model = some_map()
     found = solve(model, reach(model.graph, 5, discount=0.99), people("Boltzmann", 1.0), solver=SOLVER)
     order = np.asarray(found.start.order)
@@ -322,10 +331,22 @@ def test_the_last_sweep_leaves_nobody_out():
     valuing = Valuing(KERNELS[BoltzmannAverage], one, 0 * one)
     rounds = Rounds(world, values, np.arange(420, dtype=np.int32), valuing, np.float64(1e-11), 1000)
     assert rounds.until_still().converged
-    values[1:] *= 0.5
-    rounds.marks.changed[:], rounds.marks.solved[:] = 0, rounds.number
-    assert rounds.until_still().converged
-    np.testing.assert_allclose(values, solved, rtol=1e-8)
+    return rounds, solved
+
+
+def test_after_the_last_sweep_all_that_saw_a_change_have_something_to_do():
+    """None of them saw what the others became, wherever they stand in the order."""
+    rounds, _ = settled_rounds()
+    rounds.values[1:] *= 0.5
+    rounds._once_more()
+    world, marks = rounds.world, rounds.marks
+    moved = marks.changed == rounds.number
+    near = moved | moved[world.successors].any(axis=(1, 2))
+    assert near.sum() > 0
+    before = rounds.values.copy()
+    rounds._sweep(np.flatnonzero(near).astype(np.int32), shifted=len(before))
+    assert (marks.solved[near & ~world.fixed] == rounds.number).all()
+    assert (rounds.values != before)[near & ~world.fixed].mean() > 0.9
 
 
 class Sharper(BoltzmannAverage):
@@ -352,12 +373,12 @@ def test_a_start_that_leads_astray_costs_no_more_than_it_was_trusted(seed):
     opened = np.where(np.isin(np.arange(truth.size), random.choice(np.flatnonzero(wall), 60)), -1.0, logits)
     closed_model, open_model = (ObstacleGrid(truth.forget(), jnp.asarray(made)) for made in (logits, opened))
     goal = reach(truth.forget(), int(random.choice(np.flatnonzero(~wall))), discount=1.0, step_cost=1.0)
-    walkers, solver = Behavior(LogSumExp(), 5.0), Ordered(tolerance=1e-10)
+    walkers, solver = Behavior(LogSumExp(), 5.0), Ordered(tolerance=1e-5)
     start = solve(closed_model, goal, walkers, solver=solver).start
     cold = solve(open_model, goal, walkers, solver=solver)
     warm = solve(open_model, goal, walkers, solver=solver, start=start)
-    assert warm.sweeps <= cold.sweeps + 13
-    np.testing.assert_allclose(warm.values, cold.values, rtol=1e-9)
+    assert warm.sweeps <= cold.sweeps + 7
+    np.testing.assert_allclose(warm.values, cold.values, rtol=1e-4)
 
 
 def test_backups_without_machine_code_are_refused():

@@ -17,9 +17,10 @@ def evaluate_map(
 ) -> Mapping[str, Any]:
     """Scores the learned map of `folder` against a true map and returns the scores (see `sidestep.scoring`).
 
-    They are written to `summary.json` in `out`; without `out`, added to the learned map's own; with `sample`, how many
-    starts and goals paths were planned between, and how many paths with bumps were followed, at most. `seed` draws
-    these on maps too large for paths between all pairs of free cells. Raises `InputError` for maps of another size.
+    They are written to `summary.json` in `out`; without `out`, added to the learned map's own. Beside them stands
+    `planned_at_most`: between how many starts and goals paths were planned, and how many of those with bumps were
+    followed. On maps too large for paths between all pairs of free cells `seed` draws them. Raises `InputError` for a
+    true map of another size, resolution or origin.
     """
     learned = read_learned_map(folder)
     truth = read_map(truth_file, connectivity=learned.grid.connectivity)
@@ -40,6 +41,6 @@ def evaluate_map(
             f"expected the learned map's {learned.grid.origin}, found {truth.origin}", source=truth_file, field="origin"
         )
     scores = evaluate(learned.model(), truth, learned.unknown, learned.visited, learned.reward, seed, report)
-    sample = sample_for(truth.size)._asdict()
-    add_to_summary(folder, out or folder, None, {"truth": str(truth_file), "sample": sample, **scores})
+    limits = {"planned_at_most": sample_for(truth.size)._asdict()}
+    add_to_summary(folder, out or folder, None, {"truth": str(truth_file), **limits, **scores})
     return scores

@@ -13,6 +13,7 @@ import numpy as np
 from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError
 from sidestep.evaluation import Reward
+from sidestep.inference.batches import LARGE
 from sidestep.inference.climb import Progress
 from sidestep.inference.fit import Fit, fit
 from sidestep.inference.objective import MEMORY
@@ -153,8 +154,6 @@ def fit_map(
     )
 
 
-LARGE = 10_000
-"""From how many cells on a map is large; smaller ones are learned by L-BFGS (`docs/design.md` says why)."""
 _CLOSED = 8.0
 """The logit of a cell that is taken as blocked: some 3,000 tries, longer than most ways round."""
 _A_MOVE = 1e-3
@@ -162,7 +161,10 @@ _A_MOVE = 1e-3
 
 
 def optimiser_of(settings: Settings, cells: int, moves: int) -> Optimiser:
-    """L-BFGS for the exact gradient, `Resilient` for what people do on large maps; ascent for the fixed-policy one."""
+    """L-BFGS for the exact gradient, `Resilient` for what people do on large maps; ascent for the fixed-policy one.
+
+    `docs/design.md` says why. A map is large where solves are loose at first and tasks come in small batches.
+    """
     if settings.iterations is not None and settings.iterations < 1:
         raise InputError(f"expected at least 1, found {settings.iterations}", field="iterations")
     limit = {} if settings.iterations is None else {"iterations": settings.iterations}

@@ -32,28 +32,41 @@ class Batch(NamedTuple):
     choices: Choices
 
 
-def planned(model: TransitionModel, solver: Solver, tasks: int, memory: float, devices: int) -> tuple[int, bool]:
-    """How many tasks a batch has, a multiple of the devices; and whether there is room to keep starts and parts.
+class Planned(NamedTuple):
+    """How tasks are batched: how many are together in a batch, and what there is room for.
 
-    Batches are as equal as can be, and as few as fit into `memory` bytes on each device; one of a task a device always
-    is possible. On one device, where a solve takes long, a batch has no more tasks than there are cores: the fewer, the
-    more often an evaluation can take over what a batch added to an earlier one.
+    - `keeps_starts`: to keep where solves start, from evaluation to evaluation.
+    - `takes_over`: to keep what each batch added, for the next evaluation to take over.
+    """
+
+    together: int
+    keeps_starts: bool
+    takes_over: bool
+
+
+def planned(
+    model: TransitionModel, solver: Solver, tasks: int, memory: float, devices: int, takes_over: bool = False
+) -> Planned:
+    """The batches of so many tasks: as few and as equal as can be, of a multiple of the devices.
+
+    They fit into `memory` bytes on each device; one of a task a device always is possible. If evaluations are to take
+    over what batches added to earlier ones (`takes_over`), and solves take long, a batch on a single device has no more
+    tasks than there are cores: the fewer, the more often it can.
     """
     probabilities, parameters = jax.eval_shape(model.probabilities), jax.eval_shape(lambda: model.parameters)
     item = probabilities.dtype.itemsize
     size = probabilities.size * item
     share = math.ceil(tasks / devices)
     starts = share * model.graph.states * (2 * item + 4)
-    slope = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(parameters))
-    alone = devices == 1 and isinstance(solver, Ordered) and model.graph.states >= LARGE
-    most_useful = cores() if alone else share
-    for keeps in (True, False):
-        free = memory - _FIXED * size - (starts if keeps else 0)
-        most = max(1, min(most_useful, int(free / (_WORKSPACE.get(type(solver), 3) * size))))
-        rounds = math.ceil(share / most)
-        if starts + rounds * slope <= memory / 2:
-            break
-    return devices * math.ceil(share / rounds), keeps
+    keeps_starts = starts <= memory / 2
+    free = memory - _FIXED * size - (starts if keeps_starts else 0)
+    # of each batch a slope and the parameters that it belongs to
+    parts = 2 * share * sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(parameters))
+    long = isinstance(solver, Ordered) and model.graph.states >= LARGE
+    takes_over = takes_over and long and devices == 1 and keeps_starts and parts <= free / 2
+    most = max(1, int((free - (parts if takes_over else 0)) / (_WORKSPACE.get(type(solver), 3) * size)))
+    rounds = math.ceil(share / (min(most, cores()) if takes_over else most))
+    return Planned(devices * math.ceil(share / rounds), keeps_starts, takes_over)
 
 
 def batches_of(demonstrations: Demonstrations, together: int) -> list[Batch]:

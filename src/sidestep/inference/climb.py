@@ -67,6 +67,7 @@ class Climb:
         self.last = _Point(np.full_like(self.start, np.nan), np.zeros(4), np.zeros_like(self.start))
         self.solved: list[Solved] = []
         self.known: list[Part] = []
+        self.negligible = 0.0
         self.tolerances = _tolerances(objective.problem, optimiser)
 
     def run(self, report: Callable[[Progress], None] | None, resume: bool) -> Summit:
@@ -80,6 +81,7 @@ class Climb:
             steepest = float(np.abs(point.slope).max())
             progress = Progress(len(history), objective, actions, transitions, prior, steepest)
             self._check(progress)
+            self.negligible = _NEGLIGIBLE * abs(objective) / max(1, len(self.objective.batches))
             history.append(progress)
             if report:
                 report(progress)
@@ -101,10 +103,13 @@ class Climb:
         """The objective at x; a rough look takes over what seems to be as it was when last looked at."""
         if np.array_equal(x, self.last.x):
             return self.last
-        negligible = _NEGLIGIBLE * abs(self.last.parts[0]) if rough else 0.0
-        parameters = self.to_parameters(jnp.asarray(x))
+        rough = rough and bool(self.known)
         found, self.starts = self.objective.evaluate(
-            parameters, self.starts, self.tolerances[0], self.known, negligible
+            self.to_parameters(jnp.asarray(x)),
+            self.starts,
+            self.tolerances[0],
+            self.known,
+            self.negligible if rough else 0.0,
         )
         parts = np.array([found.objective, found.actions, found.transitions, found.prior])
         point, self.known = _Point(x, parts, np.asarray(ravel_pytree(found.slope)[0])), found.parts
@@ -152,7 +157,7 @@ class Climb:
 
     def _kept(self) -> list[Start]:
         """Where solves start, for a checkpoint: nothing where that is never changed, or is spread over processes."""
-        return self.starts if self.objective.keeps and len(self.objective.processes) == 1 else []
+        return self.starts if self.objective.planned.keeps_starts and len(self.objective.processes) == 1 else []
 
     def _check(self, progress: Progress) -> None:
         """Raises if what was found at a point cannot be used."""
@@ -165,8 +170,8 @@ class Climb:
             )
 
 
-_NEGLIGIBLE = 1e-6
-"""What makes a smaller difference, as a share of the objective, is left out of rough looks."""
+_NEGLIGIBLE = 2e-5
+"""What may be left out of a rough look, all batches of tasks together, as a share of the objective."""
 
 
 def _tolerances(problem: Problem, optimiser: Optimiser) -> list[float | None]:

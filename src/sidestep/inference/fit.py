@@ -88,8 +88,8 @@ def fit(
       devices of several processes, each process calls `fit` with the same arguments and gets the same model.
     - `report`: called with a `Progress` before the first and after every iteration, in every process.
     - `checkpoint`: a file that is kept up to date while the fit runs; with `resume`, the fit goes on from there and
-      ends exactly as if it had not been interrupted. With other devices or another `memory` than before, or with
-      several processes (the first one writes, all must see the file), it ends there up to the tolerances.
+      ends exactly as if it had not been interrupted. With other devices, cores or `memory` than before, or with several
+      processes (the first one writes, all must see the file), it ends there up to the tolerances.
 
     Raises `InputError` for arguments that do not go together, visited states from which a goal cannot be reached, or a
     checkpoint of another fit; `ImproperTask` for tasks without values; `NotConverged` if values do not converge at the
@@ -102,7 +102,7 @@ def fit(
     problem = Problem(model, demonstrations, behavior, prior or Normal(), terms, horizon, gradient, solver)
     _check_moves(problem)
     saver = Saver(checkpoint, fingerprint((problem, optimiser.key)) if checkpoint is not None else "")
-    climb = Climb(Objective(problem, memory, mesh), optimiser, saver)
+    climb = Climb(Objective(problem, memory, mesh, optimiser.looks_roughly), optimiser, saver)
     found = climb.run(report, resume)
     solved = _of_all_tasks(found.solved, len(demonstrations.tasks.terminal))
     return Fit(

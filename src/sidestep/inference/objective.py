@@ -75,7 +75,7 @@ class Part(NamedTuple):
 class Evaluation(NamedTuple):
     """The objective and its parts at some θ, the slope of the loss (minus the objective), and how its solves went.
 
-    `parts` are what the batches added, for a next evaluation to take over; none where there is no room to keep them.
+    `parts` are what the batches added, for a next evaluation to take over; none where it is not to.
     """
 
     objective: float
@@ -92,18 +92,19 @@ class Objective:
 
     - `memory`: about how many bytes the arrays may take on a device.
     - `mesh`: devices to spread tasks over (`tasks_mesh`); None for one device.
+    - `takes_over`: whether evaluations are to take over parts of earlier ones, where that pays (see `planned`).
 
     With a mesh over several processes, each must make it from the same problem and call the same methods with the same
     arguments; `InputError` says where they do not.
     """
 
-    def __init__(self, problem: Problem, memory: float, mesh: Mesh | None = None):
+    def __init__(self, problem: Problem, memory: float, mesh: Mesh | None = None, takes_over: bool = False):
         self.problem, self.mesh = problem, mesh
         tasks = len(problem.demonstrations.tasks.terminal)
         devices = 1 if mesh is None else mesh.size
-        together, self.keeps = planned(problem.model, problem.solver, tasks, memory, devices)
+        self.planned = planned(problem.model, problem.solver, tasks, memory, devices, takes_over)
         _check_same(problem, mesh)
-        batches = batches_of(problem.demonstrations, together) if "actions" in problem.terms else []
+        batches = batches_of(problem.demonstrations, self.planned.together) if "actions" in problem.terms else []
         self.batches = [_shared_out(batch, mesh) for batch in batches]
         # devices need not hold what only the transitions depend on
         self.solving = _on_all(eqx.tree_at(lambda problem: problem.demonstrations, problem, None), mesh)
@@ -158,11 +159,11 @@ class Objective:
             actions += part.actions
             slope = jax.tree.map(np.add, slope, part.slope)
             solved.append(part.solved)
-            if self.keeps:
+            if self.planned.takes_over:
                 parts.append(part)
             left.append(after)
         terms = (actions, float(transitions), float(prior))
-        return Evaluation(sum(terms), *terms, slope, solved, parts), left if self.keeps else starts
+        return Evaluation(sum(terms), *terms, slope, solved, parts), left if self.planned.keeps_starts else starts
 
 
 def tasks_mesh(devices: Sequence[Any] | None = None) -> Mesh:

@@ -2,7 +2,7 @@
 
 An optimiser is three pure functions over vectors: `init` makes what it carries from step to step, `step` takes one, and
 `settled` says why it has converged, if it has. It is given the loss (minus the objective) as a function, `Evaluate`.
-Its `exactness` says how exact solves have to be until it has converged.
+Its `exactness` says how exact solves have to be until it has converged, `looks_roughly` whether it takes rough looks.
 """
 
 import warnings
@@ -39,6 +39,7 @@ class LBFGS(eqx.Module):
     tolerance: float = eqx.field(default=1e-4, static=True)
     memory: int = eqx.field(default=20, static=True)
     exactness: ClassVar[float] = 1e-7
+    looks_roughly: ClassVar[bool] = False
 
     @property
     def key(self) -> str:
@@ -80,6 +81,7 @@ class Ascent(eqx.Module):
     learning_rate: float = eqx.field(default=0.2, static=True)
     tolerance: float = eqx.field(default=1e-2, static=True)
     exactness: ClassVar[float] = 1e-7
+    looks_roughly: ClassVar[bool] = False
 
     @property
     def key(self) -> str:
@@ -132,6 +134,7 @@ class Resilient(eqx.Module):
     first: float = eqx.field(default=0.7, static=True)
     longest: float = eqx.field(default=1.5, static=True)
     exactness: ClassVar[float] = 1e-5
+    looks_roughly: ClassVar[bool] = True
 
     @property
     def key(self) -> str:
@@ -146,18 +149,15 @@ class Resilient(eqx.Module):
         self, evaluate: Evaluate, x: Vector, value: float, slope: Vector, state: Vector
     ) -> tuple[Vector, Vector] | None:
         """The next point; None where none that was tried gains anything."""
-        lengths, free, share = state, slope != 0, 1.0
-        for trial in range(_TRIALS):
+        lengths, free, share, rough = state, slope != 0, 1.0, False
+        for _ in range(_TRIALS):
             step = np.where(free, -share * lengths * np.sign(slope), 0).astype(x.dtype)
-            # few people have to do with what was put back: look at all only before relying on it
-            after, new_slope = evaluate(x + step, rough=trial > 0)
-            if trial > 0 and _gains(step, value, slope, after, new_slope):
+            promised = -slope * step
+            after, new_slope = evaluate(x + step, rough=rough)
+            if rough and _gains(value, promised, after, _pushed_back(step, after, new_slope)):
                 after, new_slope = evaluate(x + step)
-            if not np.isfinite(after):
-                share *= _CUT
-                continue
-            promised, pushed_back = -slope * step, np.maximum(new_slope * step, 0)
-            if _gains(step, value, slope, after, new_slope):
+            pushed_back = _pushed_back(step, after, new_slope)
+            if _gains(value, promised, after, pushed_back):
                 growth = np.where(np.abs(new_slope) >= np.abs(slope), _STEEPER, _GROWTH)
                 grown = np.where(free, np.minimum(growth * lengths, self.longest), lengths)
                 return x + step, np.where(pushed_back > 0, _CUT * lengths, grown).astype(x.dtype)
@@ -167,6 +167,8 @@ class Resilient(eqx.Module):
             else:
                 share *= _CUT
             free = free if free.any() else slope != 0
+            # few people have to do with parameters that are put back, and many with a shorter step
+            rough = bool(too_far.any())
         return None
 
     def settled(self, slope: Vector, state: Vector) -> str:
@@ -183,10 +185,14 @@ _TRIALS = 40
 """How often a step of `Resilient` is tried, with fewer and fewer parameters or shorter, before it is given up."""
 
 
-def _gains(step: Vector, value: float, slope: Vector, after: float, new_slope: Vector) -> bool:
+def _pushed_back(step: Vector, after: float, new_slope: Vector) -> Vector:
+    """What each parameter pushes back at the end of a step: nothing where the loss still falls, or is not known."""
+    return np.maximum(new_slope * step, 0) if np.isfinite(after) else np.zeros_like(step)
+
+
+def _gains(value: float, promised: Vector, after: float, pushed_back: Vector) -> bool:
     """Whether the loss falls along a step, and little of what the slope promised is pushed back at its end."""
-    pushed_back = np.maximum(new_slope * step, 0).sum()
-    return bool(after < value and pushed_back <= _PUSHED_BACK * (-slope * step).sum())
+    return bool(after < value and pushed_back.sum() <= _PUSHED_BACK * promised.sum())
 
 
 def _why_flat(slope: Vector, tolerance: float) -> str:

@@ -1,7 +1,7 @@
 """Values, from where a task ends outwards, on the host: what to start from, and in which order.
 
 An earlier solve's values are taken on trust for some sweeps; if they have not converged by then, the solve starts from
-no values. An order is kept as long as few states want to go to a farther one.
+no values and in a new order. An order is kept as long as few states want to go to a farther one.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,7 @@ _OUT_OF_ORDER = 0.05
 _TRUST = 1.2
 """How many sweeps a solve that starts from an earlier one's values may take for each digit of the tolerance.
 
-On a large map those that get there at all need no more; the others run along a front that one order cannot follow.
+A start that leads astray makes changes run along a front that the old order cannot follow, a stretch a round.
 """
 
 
