@@ -2,8 +2,8 @@
 
     python benchmarks/plots.py scaling.json --out docs/images/scaling.png
 
-A line is a method and its backup; solid from nothing, dashed after an optimiser's step. Where records have it, a dotted
-line shows one shortest-path search on the same map, the unit.
+A panel of times for each backup, a line for each method; solid from nothing, dashed after an optimiser's step. Where
+records have it, a dotted line shows one shortest-path search on the same map, the unit. The last panel shows memory.
 """
 
 import argparse
@@ -18,49 +18,44 @@ import numpy as np
 from matplotlib.axes import Axes
 
 Record = Mapping[str, Any]
-MARKERS = "os^Dv<>PX*"
-
-
-def label_of(record: Record) -> str:
-    """What a line is called."""
-    return f"{record['name']}, {record['backup']}"
+Styles = Mapping[str, Mapping[str, Any]]
+MARKERS = "os^Dv<>PX*hpd8"
 
 
 def lines(records: Sequence[Record], field: str) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Label, cells and values of each method that has values in a field, in the order of the records."""
-    for label in dict.fromkeys(map(label_of, records)):
-        own = [record for record in records if label_of(record) == label and record.get(field) is not None]
-        found = sorted((record["cells"], record[field]) for record in own)
+    """Name, cells and values of each method and backup that has values in a field, in the order of the records."""
+    for kind in dict.fromkeys((record["name"], record["backup"]) for record in records):
+        own = [record for record in records if (record["name"], record["backup"]) == kind]
+        found = sorted((record["cells"], record[field]) for record in own if record.get(field) is not None)
         if found:
             cells, values = np.array(found, dtype=float).T
-            yield label, cells, values
+            yield kind[0], cells, values
 
 
-def styles(records: Sequence[Record]) -> dict[str, dict[str, Any]]:
+def styles(records: Sequence[Record]) -> Styles:
     """A colour and a marker for each method, the same in all panels."""
-    labels = dict.fromkeys(map(label_of, records))
+    names = dict.fromkeys(record["name"] for record in records)
     return {
-        label: {"color": f"C{number}", "marker": MARKERS[number % len(MARKERS)]} for number, label in enumerate(labels)
+        name: {"color": f"C{number}", "marker": MARKERS[number % len(MARKERS)]} for number, name in enumerate(names)
     }
 
 
-def draw_times(axes: Axes, records: Sequence[Record]) -> None:
-    """Seconds from nothing and after a step, and those of the unit."""
-    style = styles(records)
-    for label, cells, seconds in lines(records, "cold_seconds"):
-        axes.plot(cells, seconds, label=label, **style[label])
-    for label, cells, seconds in lines(records, "warm_seconds"):
-        axes.plot(cells, seconds, "--", markerfacecolor="white", **style[label])
+def draw_times(axes: Axes, records: Sequence[Record], style: Styles) -> None:
+    """Seconds from nothing and after a step, and those of the unit; all records of one backup."""
+    for name, cells, seconds in lines(records, "cold_seconds"):
+        axes.plot(cells, seconds, label=name, **style[name])
+    for name, cells, seconds in lines(records, "warm_seconds"):
+        axes.plot(cells, seconds, "--", markerfacecolor="white", **style[name])
     for _, cells, seconds in list(lines(records, "dijkstra_seconds"))[:1]:
         axes.plot(cells, seconds, "k:", label="one shortest-path search")
     axes.set(xscale="log", yscale="log", xlabel="cells", ylabel="seconds (dashed: after a step)")
+    axes.set_title(records[0]["backup"], fontsize="medium")
 
 
-def draw_memory(axes: Axes, records: Sequence[Record]) -> None:
+def draw_memory(axes: Axes, records: Sequence[Record], style: Styles) -> None:
     """The processes' peaks."""
-    style = styles(records)
-    for label, cells, peak in lines(records, "peak_bytes"):
-        axes.plot(cells, peak / 2**20, label=label, **style[label])
+    for name, cells, peak in lines(records, "peak_bytes"):
+        axes.plot(cells, peak / 2**20, **style[name])
     axes.set(xscale="log", ylim=(0, None), xlabel="cells", ylabel="peak memory of the process (MiB)")
 
 
@@ -71,14 +66,19 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, metavar="PICTURE.png")
     arguments = parser.parse_args()
     records = json.loads(arguments.records.read_text())["records"]
-    figure, (times, memory) = plt.subplots(1, 2, figsize=(10, 4.5), layout="constrained")
-    draw_times(times, records)
-    draw_memory(memory, records)
-    times.legend(fontsize="small", frameon=False)
-    for axes in (times, memory):
+    backups, style = list(dict.fromkeys(record["backup"] for record in records)), styles(records)
+    figure, panels = plt.subplots(1, len(backups) + 1, figsize=(4.2 * (len(backups) + 1), 5), layout="constrained")
+    for axes, backup in zip(panels, backups, strict=False):
+        draw_times(axes, [record for record in records if record["backup"] == backup], style)
+    draw_memory(panels[-1], records, style)
+    for axes in panels:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.3)
-    figure.savefig(arguments.out, dpi=150)
+    handles = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside lower center", ncols=5, fontsize="small", frameon=False
+    )
+    figure.savefig(arguments.out, dpi=120)
     return 0
 
 
