@@ -187,7 +187,7 @@ def test_the_figure_of_learned_maps_has_one_colour_bar():
         plotting.Panel(str(index), GRID.forget(), BLOCKED, GRID, [np.array([0, 3, 4])], (0,), (4,))
         for index in range(3)
     ]
-    figure = plotting.figure_learned(panels, columns=2, title="learned")
+    figure = plotting.figure_learned(panels, columns=2)
     *maps, bar = figure.axes
     assert [axes.get_title() for axes in maps] == ["0", "1", "2"]
     assert bar.get_ylabel() == "P(blocked)"
@@ -203,7 +203,7 @@ def test_the_figure_of_learned_maps_has_one_colour_bar():
 
 def test_the_figure_of_a_fit():
     objective = np.array([-9.0, -4.0, -3.0])
-    figure = plotting.figure_fit(GRID.forget(), [np.array([0, 3])], BLOCKED, objective, GRID)
+    figure = plotting.figure_fit(GRID.forget(), [np.array([0, 3])], BLOCKED, objective)
     before, after, progress, bar = figure.axes
     np.testing.assert_array_equal(before.images[0].get_array(), np.full((2, 3), -1))
     assert len(segments(before, "walk")) == 1
@@ -243,6 +243,6 @@ def test_a_figure_that_cannot_be_drawn_leaves_the_old_one(tmp_path):
 
 def test_large_maps_can_be_drawn(tmp_path):
     grid = office(150, 300, seed=0)
-    figure = plotting.figure_fit(grid, [np.flatnonzero(grid.known == 0)[:20]], np.zeros(grid.shape), np.zeros(2), grid)
+    figure = plotting.figure_fit(grid, [np.flatnonzero(grid.known == 0)[:20]], np.zeros(grid.shape), np.zeros(2))
     plotting.save(figure, tmp_path / "large.png")
     assert (tmp_path / "large.png").stat().st_size > 10_000

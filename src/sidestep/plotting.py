@@ -110,7 +110,7 @@ def figure_environments(worlds: Sequence[World]) -> Figure:
     return figure_learned([Panel(world.name, world.truth, starts=world.starts, goals=world.goals) for world in worlds])
 
 
-def figure_learned(panels: Sequence[Panel], columns: int | None = None, title: str | None = None) -> Figure:
+def figure_learned(panels: Sequence[Panel], columns: int | None = None) -> Figure:
     """A figure of several maps in rows of `columns` (default: all in one row), with one colour bar."""
     columns = min(columns or len(panels), len(panels))
     rows = -(-len(panels) // columns)
@@ -124,8 +124,6 @@ def figure_learned(panels: Sequence[Panel], columns: int | None = None, title: s
     learned = [image for image in images if image is not None]
     if learned:
         _colour_bar(figure, learned[0], list(all_axes[: len(panels)]))
-    if title:
-        figure.suptitle(title)
     _legend(figure, list(all_axes[: len(panels)]))
     return figure
 
@@ -135,7 +133,6 @@ def figure_fit(
     paths: Sequence[Integer[np.ndarray, " _"]],
     blocked: Float[np.ndarray, "rows columns"],
     objective: Float[np.ndarray, " iterations"],
-    truth: Grid | None = None,
 ) -> Figure:
     """A figure of a fit: the walks that went in, the P(blocked) that came out, and the objective."""
     width, height = _size(grid, 4.2)
@@ -144,7 +141,7 @@ def figure_fit(
     draw_map(before, grid)
     draw_walks(before, paths, grid)
     before.set_title(f"What was known, and {len(paths)} walks")
-    _colour_bar(figure, draw_blocked(after, blocked, grid, truth), [after])
+    _colour_bar(figure, draw_blocked(after, blocked, grid), [after])
     after.set_title("What was learned")
     marker = "." if len(objective) < 30 else ""
     progress.plot(np.arange(len(objective)), objective, color=_WALK, marker=marker)
@@ -155,17 +152,12 @@ def figure_fit(
     return figure
 
 
-def figure_plan(
-    grid: Grid,
-    blocked: Float[np.ndarray, "rows columns"],
-    path: Integer[np.ndarray, " steps"],
-    truth: Grid | None = None,
-) -> Figure:
+def figure_plan(grid: Grid, blocked: Float[np.ndarray, "rows columns"], path: Integer[np.ndarray, " steps"]) -> Figure:
     """A figure of one path (states) planned in a learned map."""
     width, height = _size(grid, 5.5)
     figure = Figure(figsize=(width + 1.7, height + 1.3), layout="compressed")
     axes = figure.subplots()
-    _colour_bar(figure, draw_blocked(axes, blocked, grid, truth), [axes])
+    _colour_bar(figure, draw_blocked(axes, blocked, grid), [axes])
     draw_path(axes, path, grid)
     axes.set_title("Planned path")
     _legend(figure, [axes])
