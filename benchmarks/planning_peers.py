@@ -28,43 +28,28 @@ means slower than ours), `difference` (largest, relative to each value), `tolera
 
 import argparse
 import json
-import os
-import select
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float
-from scipy.sparse import coo_array, csr_array, eye_array
 from scipy.sparse.csgraph import dijkstra
-from scipy.sparse.linalg import spsolve
 
 import measuring
-from sidestep.errors import InputError, NotConverged, SidestepError
-from sidestep.tabular.backups import Behavior, LogSumExp
-from sidestep.tabular.models import ObstacleGrid
-from sidestep.tabular.planning import plan
-from sidestep.tabular.solve import solve
-from sidestep.tabular.solvers.jacobi import Jacobi
-from sidestep.tabular.solvers.ordered import Ordered
-from sidestep.tabular.solvers.process import Solver
-from sidestep.tasks import Task
-from worlds import World, expected_costs, half_learned_office, load
+from peer_process import Peers
+from planning_problem import Problem, difference, exact_hard, exact_soft, own_call
+from sidestep.errors import InputError, SidestepError
+from worlds import expected_costs, half_learned_office, load
 
 HERE = Path(__file__).parent
 PROJECTS = ("quantecon", "mdpsolver", "imitation")
 HOW_TO = "python -m venv peers && peers/bin/pip install quantecon mdpsolver imitation"
-BUILDING = 300.0
-"""Seconds that a library may take to be imported and to build its matrices, which are not timed."""
 TOLERANCES = tuple(10.0**-power for power in range(2, 14))
 HARD_PEERS = (
     "quantecon policies",
@@ -82,182 +67,7 @@ SOFT_OURS = ("sidestep ordered", "sidestep jacobi", "sidestep finite horizon")
 WITHOUT_TOLERANCE = ("quantecon policies", "imitation finite horizon", "sidestep finite horizon")
 
 
-# ---------------------------------------------------------------------------------------------------- the problem
-
-
-@dataclass(frozen=True)
-class Problem:
-    """A world and one task in it, as this project and as others want it."""
-
-    world: World
-    discount: float
-    beta: float
-
-    @cached_property
-    def model(self) -> ObstacleGrid:
-        """The half-learned model."""
-        return self.world.model
-
-    @cached_property
-    def task(self) -> Task:
-        """Reaching the goal at a step cost of 1."""
-        return self.world.tasks(self.discount, 1.0)[0]
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Transitions (state, action, after, chance), no two alike; the goal leads to itself and costs nothing."""
-        model, goal = self.model, int(self.world.goals[0])
-        successors, chances = np.array(model.graph.successors), np.array(model.probabilities())
-        states, actions, outcomes = successors.shape
-        successors[goal] = goal
-        rows = np.repeat(np.arange(states * actions), outcomes)
-        moves = coo_array((chances.reshape(-1), (rows, successors.reshape(-1))), shape=(states * actions, states))
-        moves.sum_duplicates()
-        pairs, after = moves.coords
-        reward = np.full((states, actions), -1.0)
-        reward[goal] = 0
-        return {
-            "state": pairs // actions,
-            "action": pairs % actions,
-            "after": after,
-            "chance": moves.data,
-            "reward": reward,
-            "terminal": np.arange(states) == goal,
-            "discount": np.asarray(self.discount),
-            "beta": np.asarray(self.beta),
-        }
-
-
-@eqx.filter_jit
-def soft_values(
-    model: ObstacleGrid, task: Task, behavior: Behavior, solver: Solver | None, horizon: int | None
-) -> tuple[Array, Array]:
-    """Soft values and whether they converged."""
-    found = solve(model, task, behavior, solver=solver, horizon=horizon)
-    return found.values, found.converged
-
-
-def own_call(problem: Problem, name: str, soft: bool, tolerance: float, horizon: int) -> Callable[[], np.ndarray]:
-    """This project's call by its name; raises `NotConverged` if it fails."""
-    model, task = problem.model, problem.task
-    solvers = {"sidestep ordered": Ordered(tolerance=tolerance), "sidestep jacobi": Jacobi(tolerance=tolerance)}
-    solver = solvers.get(name)
-    if not soft:
-        return lambda: np.asarray(jax.block_until_ready(plan(model, task, solver=solver)).solution.values)
-
-    def call() -> np.ndarray:
-        people = Behavior(LogSumExp(), problem.beta)
-        values, converged = soft_values(model, task, people, solver, horizon if solver is None else None)
-        if not bool(converged):
-            raise NotConverged("soft values did not converge")
-        return np.asarray(values)
-
-    return call
-
-
-def exact_hard(problem: Problem) -> Float[np.ndarray, " states"]:
-    """The values of the best policy by a linear solve; raises `NotConverged` unless no action is better."""
-    given = problem.arrays()
-    states, actions = given["reward"].shape
-    pairs = given["state"] * actions + given["action"]
-    moves = csr_array((given["chance"], (pairs, given["after"])), shape=(states * actions, states))
-    policy = np.asarray(plan(problem.model, problem.task).policy).argmax(axis=1)
-    for _ in range(20):
-        chosen = np.arange(states) * actions + policy
-        system = (eye_array(states) - problem.discount * moves[chosen]).tocsc()
-        values = np.asarray(spsolve(system, given["reward"].reshape(-1)[chosen]))
-        q = given["reward"] + problem.discount * (moves @ values).reshape(states, actions)
-        if np.abs(q.max(axis=1) - values).max() <= 1e-9 * (1 - problem.discount) * np.abs(values).max():
-            return values
-        policy = q.argmax(axis=1)
-    raise NotConverged("the exact values were not found")
-
-
-def exact_soft(problem: Problem) -> Float[np.ndarray, " states"]:
-    """The soft values, iterated by plain backups in NumPy from those of the solver until rounding."""
-    given = problem.arrays()
-    states, actions = given["reward"].shape
-    pairs = given["state"] * actions + given["action"]
-    moves = csr_array((given["chance"], (pairs, given["after"])), shape=(states * actions, states))
-    values = own_call(problem, "sidestep ordered", True, 1e-12, 0)()
-    for _ in range(100_000):
-        q = problem.beta * (given["reward"] + problem.discount * (moves @ values).reshape(states, actions))
-        best = q.max(axis=1)
-        new = (best + np.log(np.exp(q - best[:, None]).sum(axis=1))) / problem.beta
-        new[given["terminal"]] = 0
-        change, values = np.abs(new - values).max(), new
-        if change <= 1e-10 * (1 - problem.discount) * np.abs(values).max():
-            return values
-    raise NotConverged("the exact soft values were not found")
-
-
-def difference(found: np.ndarray, exact: np.ndarray) -> float:
-    """The largest difference, relative to each value (to 1, where that is smaller, such as at the goal)."""
-    return float(np.max(np.abs(found - exact) / np.maximum(np.abs(exact), 1.0)))
-
-
-# ---------------------------------------------------------------------------------------------------- the others
-
-
-class Peers:
-    """The process in which the others run; one that takes longer than `patience` seconds to answer is replaced."""
-
-    def __init__(self, python: str, patience: float):
-        self._python, self._patience = python, patience
-        self._folder = tempfile.TemporaryDirectory()
-        self._values = Path(self._folder.name) / "values.npy"
-        self._problem: Path | None = None
-        self._process = self._begin()
-
-    def _begin(self) -> subprocess.Popen:
-        # threads that spin while they wait would slow themselves down on a machine that is shared
-        surroundings = {**os.environ, "OMP_WAIT_POLICY": "passive"}
-        return subprocess.Popen(
-            [self._python, str(HERE / "peer_planners.py")],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=surroundings,
-        )
-
-    def ask(self, patience: float | None = None, **request: Any) -> dict[str, Any]:
-        """The answer; raises `SidestepError` for one that says what failed, or if there is none in time."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        try:
-            self._process.stdin.write(json.dumps(request).encode() + b"\n")
-            self._process.stdin.flush()
-        except BrokenPipeError as error:
-            raise SidestepError("the process of the others ended") from error
-        if not select.select([self._process.stdout], [], [], patience or self._patience)[0]:
-            self._process.kill()
-            self._process.wait()
-            self._process = self._begin()
-            if self._problem:
-                self.load(self._problem)
-            raise SidestepError(f"over {patience or self._patience:g} s")
-        line = self._process.stdout.readline()
-        found = json.loads(line) if line else {"error": "the process of the others ended"}
-        if "error" in found:
-            raise SidestepError(found["error"])
-        return found
-
-    def load(self, problem: Path) -> None:
-        """Has a problem read."""
-        self._problem = problem
-        self.ask(do="load", problem=str(problem))
-
-    def solve(self, method: str, tolerance: float, horizon: int) -> tuple[float, np.ndarray]:
-        """The seconds of a solve, and its values."""
-        self.ask(patience=BUILDING, do="build", method=method)
-        found = self.ask(do="solve", method=method, tolerance=tolerance, horizon=horizon, into=str(self._values))
-        return found["seconds"], np.load(self._values)
-
-    def close(self) -> None:
-        """Ends the process."""
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait(60)
-        self._folder.cleanup()
+# ---------------------------------------------------------------------------------------------------- the methods
 
 
 @dataclass

@@ -63,8 +63,8 @@ def test_a_world_comes_back_as_it_was_written(script, tmp_path):
 
 
 def test_the_problem_for_other_planners_is_the_same(script):
-    worlds, peers = script("worlds"), script("planning_peers")
-    problem = peers.Problem(worlds.half_learned_office(12, seed=0), 0.9, 5.0)
+    worlds, planning = script("worlds"), script("planning_problem")
+    problem = planning.Problem(worlds.half_learned_office(12, seed=0), 0.9, 5.0)
     given = problem.arrays()
     states, actions = given["reward"].shape
     totals = np.zeros((states, actions))
