@@ -364,7 +364,8 @@ def test_values_that_move_each_other_come_to_rest():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_start_that_leads_astray_costs_no_more_than_it_was_trusted(seed):
+@pytest.mark.parametrize(("tolerance", "trusted"), [(1e-5, 6), (1e-10, 12)])
+def test_a_start_that_leads_astray_costs_no_more_than_it_was_trusted(seed, tolerance, trusted):
     """Where walls have opened everywhere neither old values nor their order serve, and all is as from no start."""
     random = np.random.default_rng(seed)
     truth = office(60, 60, seed)
@@ -373,12 +374,12 @@ def test_a_start_that_leads_astray_costs_no_more_than_it_was_trusted(seed):
     opened = np.where(np.isin(np.arange(truth.size), random.choice(np.flatnonzero(wall), 60)), -1.0, logits)
     closed_model, open_model = (ObstacleGrid(truth.forget(), jnp.asarray(made)) for made in (logits, opened))
     goal = reach(truth.forget(), int(random.choice(np.flatnonzero(~wall))), discount=1.0, step_cost=1.0)
-    walkers, solver = Behavior(LogSumExp(), 5.0), Ordered(tolerance=1e-5)
+    walkers, solver = Behavior(LogSumExp(), 5.0), Ordered(tolerance=tolerance)
     start = solve(closed_model, goal, walkers, solver=solver).start
     cold = solve(open_model, goal, walkers, solver=solver)
     warm = solve(open_model, goal, walkers, solver=solver, start=start)
-    assert warm.sweeps <= cold.sweeps + 7
-    np.testing.assert_allclose(warm.values, cold.values, rtol=1e-4)
+    assert warm.sweeps <= cold.sweeps + trusted + 1
+    np.testing.assert_allclose(warm.values, cold.values, rtol=10 * tolerance)
 
 
 def test_backups_without_machine_code_are_refused():
