@@ -382,6 +382,14 @@ def test_a_start_that_leads_astray_costs_no_more_than_it_was_trusted(seed, toler
     np.testing.assert_allclose(warm.values, cold.values, rtol=10 * tolerance)
 
 
+def test_a_start_is_trusted_for_a_while_even_if_no_tolerance_is_left():
+    model = some_map()
+    goal = reach(model.graph, 5, discount=0.99)
+    first = solve(model, goal, people("Boltzmann"), solver=SOLVER)
+    again = solve(model, goal, people("Boltzmann"), solver=Ordered(tolerance=0.0, max_sweeps=50), start=first.start)
+    np.testing.assert_allclose(again.values, first.values, rtol=1e-9)
+
+
 def test_backups_without_machine_code_are_refused():
     model = some_map(4, 5)
     with pytest.raises(InputError, match="Jacobi"):

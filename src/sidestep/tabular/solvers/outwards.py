@@ -63,7 +63,8 @@ def find_values(
     nothing = number(lowest(start.dtype))
     outcome = Outcome(0, np.inf, False)
     if (start > nothing).any():
-        trusted = int(np.ceil(_TRUST * max(1.0, -np.log10(asked.tolerance))))
+        digits = -np.log10(max(asked.tolerance, np.finfo(start.dtype).eps))
+        trusted = int(np.ceil(_TRUST * max(1.0, digits)))
         outcome = _start_from(start, order, asked, min(trusted, max_sweeps), found)
     if not outcome.converged and outcome.sweeps < max_sweeps:
         # where values led astray, their order is no better
