@@ -1,39 +1,46 @@
 """Demonstrations: what people did, as flat arrays over all their moves, and the tasks that they pursued."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, Shaped
 
 from sidestep.errors import InputError
 from sidestep.tasks import Task, stack_tasks
 
+Tasks = TypeVar("Tasks", bound=eqx.Module)
+"""What tasks are: arrays in discrete worlds (`Task`), functions in continuous ones (`ContinuousTask`)."""
+
 
 class Trajectory(NamedTuple):
-    """One walk through a discrete world: s₁, a₁, …, s_{τ+1}, and the index of its task."""
+    """One walk: s₁, a₁, …, s_{τ+1}, and the index of its task.
 
-    states: Int[np.ndarray, " moves+1"]
-    actions: Int[np.ndarray, " moves"]
+    States are whole numbers in discrete worlds and vectors in continuous ones. An action is its index where there are
+    finitely many, and a vector otherwise.
+    """
+
+    states: Shaped[np.ndarray, "moves+1 *state"]
+    actions: Shaped[np.ndarray, "moves *action"]
     task: int
 
 
-class Demonstrations(eqx.Module):
+class Demonstrations(eqx.Module, Generic[Tasks]):
     """Moves (s, a, s′) of many trajectories on many tasks, one after another.
 
-    - `states`, `actions`, `next_states`: the moves.
+    - `states`, `actions`, `next_states`: the moves; whole numbers in discrete worlds, in continuous ones vectors.
     - `task`, `trajectory`: which task (index into `tasks`) and which trajectory each move belongs to.
     - `tasks`: all tasks, stacked.
     """
 
-    states: Int[Array, " moves"]
-    actions: Int[Array, " moves"]
-    next_states: Int[Array, " moves"]
+    states: Shaped[Array, "moves *state"]
+    actions: Shaped[Array, "moves *action"]
+    next_states: Shaped[Array, "moves *state"]
     task: Int[Array, " moves"]
     trajectory: Int[Array, " moves"]
-    tasks: Task
+    tasks: Tasks
 
     def __len__(self) -> int:
         """The number of moves."""
@@ -51,13 +58,13 @@ class Demonstrations(eqx.Module):
         pieces = zip(np.split(states, starts), np.split(ends, starts), strict=True)
         return [np.append(piece, end[-1]) for piece, end in pieces]
 
-    def visited(self) -> Int[np.ndarray, "visits 2"]:
+    def visited(self: "Demonstrations[Task]") -> Int[np.ndarray, "visits 2"]:
         """The different (state, goal) pairs of all moves; the goal is the first terminal state of the task."""
         goals = np.asarray(self.tasks.terminal).argmax(axis=-1)[np.asarray(self.task)]
         return np.unique(np.stack([np.asarray(self.states), goals], axis=1), axis=0)
 
 
-def gather(trajectories: Sequence[Trajectory], tasks: Sequence[Task]) -> Demonstrations:
+def gather(trajectories: Sequence[Trajectory], tasks: Sequence[Task]) -> Demonstrations[Task]:
     """Demonstrations from trajectories in any discrete world.
 
     Raises `InputError` for an empty trajectory, lengths that do not fit, a task that is not there, or a trajectory

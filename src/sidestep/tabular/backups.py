@@ -52,6 +52,14 @@ class Backup(eqx.Module):
         """The weights of the average under a policy that is held fixed: π for the soft backups (eq. 9)."""
         return jax.nn.softmax(beta * _below_best(q), axis=-1)
 
+    def bonus(self, entropy: Values, actions: int | None, beta: Float[Scalar, ""]) -> Values:
+        """What V has beyond Σ_a π(a) Q(a), by the policy's entropy: nothing, unless a backup says otherwise.
+
+        `actions` is how many there are, `None` where an action is a vector.
+        """
+        del actions, beta
+        return jnp.zeros_like(entropy)
+
 
 class HardMax(Backup):
     """V = max_a Q(a): people who follow an optimal policy (eq. 2).
@@ -114,6 +122,11 @@ class LogSumExp(Backup):
         """π, so that eq. 9 is exact here."""
         return self.fixed_policy_weights(q, beta)
 
+    def bonus(self, entropy: Values, actions: int | None, beta: Float[Scalar, ""]) -> Values:
+        """The entropy over β."""
+        del actions
+        return entropy / beta
+
 
 class Mellowmax(Backup):
     """V = (1/β) log mean_a exp βQ(a): the log-sum-exp without its bonus of log(actions)/β a step."""
@@ -128,6 +141,12 @@ class Mellowmax(Backup):
     def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
         """π, as for the log-sum-exp."""
         return self.fixed_policy_weights(q, beta)
+
+    def bonus(self, entropy: Values, actions: int | None, beta: Float[Scalar, ""]) -> Values:
+        """By how much the policy's entropy is below that of acting at random, over −β."""
+        if actions is None:
+            raise InputError("the mellowmax needs a finite number of actions: expected another", field="backup")
+        return (entropy - jnp.log(actions)) / beta
 
 
 BACKUPS: Mapping[str, Callable[[], Backup]] = MappingProxyType(

@@ -1,0 +1,65 @@
+"""Demonstrations in continuous worlds: the same record as in discrete ones, with vectors for states."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from sidestep.continuous.policies import FinitePolicy, Policy
+from sidestep.continuous.tasks import ContinuousTask, check_tasks, stack
+from sidestep.demonstrations import Demonstrations, Trajectory
+from sidestep.errors import InputError
+
+
+def gather(trajectories: Sequence[Trajectory], tasks: Sequence[ContinuousTask]) -> Demonstrations:
+    """Demonstrations from trajectories in a continuous world.
+
+    Raises `InputError` for an empty one, lengths or shapes that do not fit, numbers that are not finite, and a task
+    that is not there.
+    """
+    stacked = stack(tasks)
+    check_tasks(stacked)
+    if not trajectories:
+        raise InputError("expected at least one trajectory", field="trajectories")
+    shape = np.shape(trajectories[0].states)[1:]
+    for index, (states, actions, task) in enumerate(trajectories, start=1):
+        if len(actions) == 0 or len(states) != len(actions) + 1 or np.shape(states)[1:] != shape:
+            raise InputError(
+                f"expected moves and one state of shape {shape} more, found {len(actions)} and {np.shape(states)}",
+                source="trajectory",
+                row=index,
+            )
+        for field, numbers in (("states", states), ("actions", actions)):
+            if not np.isfinite(numbers).all():
+                raise InputError("expected finite numbers", source="trajectory", row=index, field=field)
+        if not 0 <= task < len(tasks):
+            raise InputError(f"expected a task in 0…{len(tasks) - 1}, found {task}", source="trajectory", row=index)
+    lengths = [len(each.actions) for each in trajectories]
+    return Demonstrations(
+        states=jnp.asarray(np.concatenate([each.states[:-1] for each in trajectories])),
+        actions=jnp.asarray(np.concatenate([each.actions for each in trajectories])),
+        next_states=jnp.asarray(np.concatenate([each.states[1:] for each in trajectories])),
+        task=jnp.asarray(np.repeat([each.task for each in trajectories], lengths), dtype=jnp.int32),
+        trajectory=jnp.asarray(np.repeat(np.arange(len(lengths)), lengths), dtype=jnp.int32),
+        tasks=stacked,
+    )
+
+
+def check_choices(demonstrations: Demonstrations, policy: Policy) -> None:
+    """Raises `InputError` for actions that are none of the policy's."""
+    chosen = np.asarray(demonstrations.actions)
+    if not isinstance(policy, FinitePolicy):
+        if not np.issubdtype(chosen.dtype, np.floating):
+            raise InputError("expected vectors, as the policy's actions are", field="actions")
+        return
+    most = len(policy.actions) - 1
+    wrong = np.ones(len(chosen), bool)
+    if chosen.ndim == 1 and np.issubdtype(chosen.dtype, np.integer):
+        wrong = (chosen < 0) | (chosen > most)
+    if wrong.any():
+        move = int(wrong.argmax())
+        raise InputError(
+            f"expected the index of an action, 0…{most}, found {chosen[move]}",
+            source=f"trajectory {int(demonstrations.trajectory[move]) + 1}",
+            field="actions",
+        )

@@ -1,0 +1,190 @@
+"""Dynamics of continuous worlds: T_θ(s, a, s′) as a density that can be sampled.
+
+A family says two things: how to draw a next state, and how probable a next state is,
+
+    s′ ~ T_θ(s, a, ·),        ln T_θ(s, a, s′).
+
+States and actions are arrays of any shape; most are vectors. Most families need only say where an action may lead, with
+which probabilities, for noise is Gaussian around each outcome k:
+
+    T_θ(s, a, s′) = Σ_k p_k N(s′; m_k, diag(noise²)),      p = p_θ(s, a),  m = m_θ(s, a).
+
+With one outcome, s′ = m_θ(s, a) + noise · ε, so that the noise can be held fixed while θ moves: such dynamics are
+*reparameterised*, and gradients may pass along the path.
+"""
+
+import abc
+from typing import NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.scipy.stats import norm
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree, Scalar, Shaped
+
+from sidestep.errors import InputError
+from sidestep.tabular.models import TransitionModel
+
+State = Shaped[Array, "*state"]
+Action = Shaped[Array, "*action"]
+
+_Family = TypeVar("_Family", bound="Dynamics")
+
+
+class Dynamics(eqx.Module):
+    """A density T_θ(s, a, ·) over next states.
+
+    - `parameters`: θ, a pytree of floating-point arrays, all of which are learned.
+    - `reparameterised`: whether `sample` moves smoothly with θ and the state while the key is held fixed.
+
+    A new family is a subclass with `sample` and `log_prob`, or of `GaussianDynamics` with `outcomes`. Both take one
+    state and one action; `jax.vmap` makes many of them.
+    """
+
+    parameters: eqx.AbstractVar[PyTree[Float[Array, "..."]]]
+
+    @property
+    @abc.abstractmethod
+    def reparameterised(self) -> bool:
+        """Whether gradients may pass along a sampled path."""
+
+    @abc.abstractmethod
+    def sample(self, key: PRNGKeyArray, state: State, action: Action) -> State:
+        """A next state s′ ~ T_θ(s, a, ·)."""
+
+    @abc.abstractmethod
+    def log_prob(self, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
+        """ln T_θ(s, a, s′), in nats."""
+
+    def with_parameters(self: _Family, parameters: PyTree[Float[Array, "..."]]) -> _Family:
+        """The same family at another θ."""
+        return eqx.tree_at(lambda dynamics: dynamics.parameters, self, parameters)
+
+
+class Outcomes(NamedTuple):
+    """Where an action may lead: ln p_k, and the mean next state m_k, of every outcome k."""
+
+    log_probabilities: Float[Array, " outcomes"]
+    means: Float[Array, "outcomes dimensions"]
+
+
+class GaussianDynamics(Dynamics):
+    """Gaussian noise around one or several outcomes.
+
+    - `noise`: the standard deviation of every component of the state, above 0; it is not learned.
+
+    A new family is a subclass with `outcomes`.
+    """
+
+    noise: eqx.AbstractVar[Float[Array, " dimensions"]]
+
+    @abc.abstractmethod
+    def outcomes(self, state: Float[Array, " dimensions"], action: Float[Array, " inputs"]) -> Outcomes:
+        """Where the action may lead."""
+
+    @property
+    def reparameterised(self) -> bool:
+        """With a single outcome, the path moves with θ; which of several happens, jumps."""
+        example = jnp.zeros_like(self.noise)
+        return jax.eval_shape(self.outcomes, example, self._example_action()).means.shape[0] == 1
+
+    def _example_action(self) -> Float[Array, " inputs"]:
+        """An action of the right shape; as many components as the state has, unless a family says otherwise."""
+        return jnp.zeros_like(self.noise)
+
+    def sample(self, key: PRNGKeyArray, state: State, action: Action) -> State:
+        """An outcome drawn by its probability, and the noise around it."""
+        choosing, shaking = jax.random.split(key)
+        log_probabilities, means = self.outcomes(state, action)
+        chosen = 0 if len(means) == 1 else jax.random.categorical(choosing, log_probabilities)
+        return means[chosen] + self.noise * jax.random.normal(shaking, self.noise.shape, self.noise.dtype)
+
+    def log_prob(self, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
+        """The logarithm of the mixture's density."""
+        log_probabilities, means = self.outcomes(state, action)
+        each = norm.logpdf(next_state, means, self.noise).sum(axis=-1)
+        return jax.nn.logsumexp(log_probabilities + each)
+
+
+class LinearGaussian(GaussianDynamics):
+    """s′ = A s + B a + noise · ε.
+
+    - `parameters`: {"state": A, "action": B}, both learned.
+    """
+
+    parameters: dict[str, Float[Array, "dimensions _"]]
+    noise: Float[Array, " dimensions"]
+
+    def __init__(
+        self,
+        state: Float[Array, "dimensions dimensions"],
+        action: Float[Array, "dimensions inputs"],
+        noise: Float[Array, " dimensions"],
+    ):
+        """Raises `InputError` for numbers that are not finite or noise that is not above 0."""
+        self.noise = checked_noise(noise)
+        self.parameters = {"state": jnp.asarray(state), "action": jnp.asarray(action)}
+        check_finite(self.parameters)
+
+    def _example_action(self) -> Float[Array, " inputs"]:
+        return jnp.zeros_like(self.parameters["action"][0])
+
+    def outcomes(self, state: Float[Array, " dimensions"], action: Float[Array, " inputs"]) -> Outcomes:
+        """A s + B a, surely."""
+        return certain(self.parameters["state"] @ state + self.parameters["action"] @ action)
+
+
+class TableDynamics(Dynamics):
+    """A discrete world seen as dynamics: states and actions are whole numbers, T_θ that of a transition model.
+
+    What is built for densities can so be checked where exact answers are known.
+
+    - `model`: any `TransitionModel` in which no two outcomes of an action are the same state.
+    """
+
+    model: TransitionModel
+    parameters: PyTree[Float[Array, "..."]]
+
+    def __init__(self, model: TransitionModel):
+        self.model, self.parameters = model, model.parameters
+
+    @property
+    def reparameterised(self) -> bool:
+        """Never: states jump."""
+        return False
+
+    def _log_probabilities(self, state: State, action: Action) -> Float[Array, " outcomes"]:
+        return jnp.log(self.model.with_parameters(self.parameters).probabilities()[state, action])
+
+    def sample(self, key: PRNGKeyArray, state: State, action: Action) -> State:
+        """An outcome drawn by its probability."""
+        outcome = jax.random.categorical(key, self._log_probabilities(state, action))
+        return self.model.graph.successors[state, action, outcome].astype(state.dtype)
+
+    def log_prob(self, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
+        """The logarithm of the probabilities of all outcomes that are the next state."""
+        same = self.model.graph.successors[state, action] == next_state
+        log_probabilities = self._log_probabilities(state, action)
+        return jax.nn.logsumexp(jnp.where(same, log_probabilities, -jnp.inf))
+
+
+def certain(mean: Float[Array, " dimensions"]) -> Outcomes:
+    """The only outcome."""
+    return Outcomes(jnp.zeros(1, mean.dtype), mean[None])
+
+
+def checked_noise(noise: Float[Array, " dimensions"] | np.ndarray) -> Float[Array, " dimensions"]:
+    """The standard deviations as floating-point numbers; raises `InputError` unless they are finite and above 0."""
+    noise = jnp.atleast_1d(jnp.asarray(noise, jnp.result_type(float)))
+    if not isinstance(noise, Tracer) and not (np.isfinite(noise).all() and (np.asarray(noise) > 0).all()):
+        raise InputError(f"expected finite numbers above 0, found {noise}", field="noise")
+    return noise
+
+
+def check_finite(parameters: PyTree[Float[Array, "..."]]) -> None:
+    """Raises `InputError` unless all parameters are finite; inside `jit` nothing is checked."""
+    for leaf in jax.tree.leaves(parameters):
+        if not isinstance(leaf, Tracer) and not np.isfinite(leaf).all():
+            raise InputError("expected finite numbers", field="parameters")

@@ -1,0 +1,341 @@
+"""Policies by gradients: for people who act optimally (Q*), and for those who act softly (Q≈, eq. 12).
+
+People who act softly have π ∝ exp βQ^π. With q_λ the policy's advantages and Q̂_i what a roll-out says of Q^π(s_i, a_i),
+the divergence between what they do and what π_λ does falls along
+
+    −∇_λ = E [ Σ_i ∇_λ ln π_λ(a_i | s_i) γ^i ( Q̂_i − E_i − q_λ(s_i, a_i)/β ) ],
+
+which is eq. 12 over −β with a control variate E_i, any function of s_i, here V_w(s_i) − b_i of a critic. It vanishes
+where q_λ/β are the advantages of Q^π. What Q^π is depends on the backup: as printed, eq. 12 counts rewards only, and
+leads to the **Boltzmann average** (eqs. 3–5). The divergence to Ziebart's trajectory distribution also counts the
+entropies to come, E[−Σ_{j>i} ln π_λ(a_j | s_j)]; with these in Q̂_i (`Backup.bonus`) the same equation leads to the
+**log-sum-exp**. For the **hard maximum** 1/β is 0, and what is left is the ordinary policy gradient.
+
+At the first state of a roll-out all actions are tried (or several that the policy draws), and the sum over them is
+taken exactly, with their probabilities.
+"""
+
+from collections.abc import Callable
+from typing import Generic, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, Shaped
+
+from sidestep.continuous.critics import Critic, critic
+from sidestep.continuous.dynamics import Dynamics
+from sidestep.continuous.estimators import advantages, everywhere, said, temperature, values_expected
+from sidestep.continuous.policies import FinitePolicy, Policy
+from sidestep.continuous.rollouts import RollOut, returns, roll_outs, spread_over, to_come
+from sidestep.continuous.tasks import ContinuousTask, check_tasks, task_at
+from sidestep.errors import InputError, NotConverged
+from sidestep.tabular.backups import Behavior, HardMax
+
+SomePolicy = TypeVar("SomePolicy", bound=Policy)
+
+
+class PlanProgress(NamedTuple):
+    """How good a policy is.
+
+    - `expected_return`: Σ γ^i R_i from the places it was tried at, on average.
+    - `gradient`: the norm of the policy's gradient, in reward units.
+    - `entropy`: at these places, in nats.
+    - `lag`: by how much it falls short of acting on what its own roll-outs say. For soft people the divergence from
+      exp βQ̂ in nats, to second order; for optimal ones what the best action would gain, in reward units. Unbiased, and
+      so below 0 at times; near 0 for a policy that has been found.
+    """
+
+    iteration: int
+    expected_return: float
+    gradient: float
+    entropy: float
+    lag: float
+
+
+class Planning(eqx.Module, Generic[SomePolicy]):
+    """A policy on its way: what planning carries from step to step, and over to a changed model (a warm start)."""
+
+    policy: SomePolicy
+    critic: Critic
+    policy_moments: PyTree
+    critic_moments: PyTree
+
+
+class Planner(eqx.Module):
+    """How a policy is found.
+
+    - `horizon`: how many moves a roll-out has at most.
+    - `places`, `samples`: how many places are tried a step, and how many roll-outs each of their options gets.
+    - `options`: how many choices are tried at a place where actions are vectors; from a finite set, all are.
+    - `learning_rate`, `critic_rate`: of Adam.
+    """
+
+    horizon: int = eqx.field(static=True)
+    places: int = eqx.field(default=32, static=True)
+    samples: int = eqx.field(default=4, static=True)
+    options: int = eqx.field(default=8, static=True)
+    learning_rate: float = eqx.field(default=3e-3, static=True)
+    critic_rate: float = eqx.field(default=3e-3, static=True)
+
+    def begin(
+        self,
+        key: PRNGKeyArray,
+        dynamics: Dynamics,
+        policy: SomePolicy,
+        tasks: ContinuousTask,
+        behavior: Behavior,
+        states: Shaped[Array, "places *state"],
+    ) -> Planning[SomePolicy]:
+        """Planning at its start, with a critic made from roll-outs of the first policy.
+
+        `tasks` are those of each of the states.
+        """
+        check_planner(self)
+        rolling, drawing, making = jax.random.split(key, 3)
+        choices, _ = self.tried(drawing, policy, tasks, states)
+        rolled = _rolled(self, dynamics, policy, tasks, behavior, rolling, states, choices)
+        over = spread_over(tasks, rolled)
+        worths = to_come(rolled, over.discount)[..., :-1]
+        seen = everywhere(lambda task, state: task.features(state), tasks, rolled)
+        acting = np.asarray(rolled.acting)
+        if not acting.any():
+            raise InputError("expected places where a task has not ended", field="states")
+        guess = critic(making, seen[acting], worths[acting])
+        return Planning(
+            policy,
+            guess,
+            self._adam(self.learning_rate).init(_learned(policy)),
+            self._adam(self.critic_rate).init(_learned(guess)),
+        )
+
+    def tried(
+        self, key: PRNGKeyArray, policy: Policy, tasks: ContinuousTask, states: Shaped[Array, "places *state"]
+    ) -> tuple[Shaped[Array, "places options *choice"], Float[Array, "places options"]]:
+        """The options of every place, and the probabilities by which a sum over them is an average by the policy."""
+        seen = jax.vmap(lambda task, state: task.features(state))(tasks, states)
+        if isinstance(policy, FinitePolicy):
+            every = jnp.arange(len(policy.actions))
+            choices = jnp.broadcast_to(every, (len(states), len(every)))
+            return choices, jnp.exp(jax.vmap(policy.log_probs)(seen))
+        keys = jax.random.split(key, (len(states), self.options))
+        choices = jax.vmap(jax.vmap(policy.sample, (0, None)))(keys, seen)
+        return choices, jnp.full(choices.shape[:2], 1 / self.options, seen.dtype)
+
+    def improve(
+        self,
+        planning: Planning[SomePolicy],
+        tasks: ContinuousTask,
+        behavior: Behavior,
+        rolled: RollOut,
+        shares: Float[Array, "places options"],
+    ) -> tuple[Planning[SomePolicy], PlanProgress]:
+        """A step of the policy and of its critic, by roll-outs from (places, options, samples)."""
+        policy, guess = planning.policy, planning.critic
+        gradient = _policy_gradient(policy, guess, tasks, behavior, rolled, shares)
+        step, policy_moments = self._adam(self.learning_rate).update(gradient, planning.policy_moments)
+        slope = eqx.filter_grad(_critic_loss)(guess, tasks, rolled)
+        critic_step, critic_moments = self._adam(self.critic_rate).update(slope, planning.critic_moments)
+        progress = _progress(policy, tasks, behavior, rolled, shares, optax.tree.norm(gradient))
+        improved = Planning(
+            eqx.apply_updates(policy, step), eqx.apply_updates(guess, critic_step), policy_moments, critic_moments
+        )
+        return improved, progress
+
+    def _adam(self, rate: float) -> optax.GradientTransformation:
+        return optax.adam(rate)
+
+
+class Plan(eqx.Module, Generic[SomePolicy]):
+    """A policy that was found, and how: `history` has one `PlanProgress` a step."""
+
+    planning: Planning[SomePolicy]
+    history: tuple[PlanProgress, ...] = eqx.field(static=True)
+
+    @property
+    def policy(self) -> SomePolicy:
+        """The policy."""
+        return self.planning.policy
+
+    def lately(self, steps: int = 50) -> PlanProgress:
+        """The mean of the last steps' figures, which are noisy one by one."""
+        last = np.asarray(self.history[-steps:])
+        return PlanProgress(int(last[-1, 0]), *last[:, 1:].mean(axis=0).tolist())
+
+
+def plan(
+    dynamics: Dynamics,
+    tasks: ContinuousTask,
+    behavior: Behavior,
+    policy: SomePolicy,
+    states: Shaped[Array, "starts *state"],
+    task: Int[Array, " starts"],
+    planner: Planner,
+    *,
+    steps: int,
+    seed: int = 0,
+    warm: Planning[SomePolicy] | None = None,
+    report: Callable[[PlanProgress], None] | None = None,
+) -> Plan[SomePolicy]:
+    """The policy of people who know `dynamics`, found by gradients from the places `states`.
+
+    - `tasks`: all tasks, stacked; `task`: which of them each place belongs to.
+    - `policy`: where to begin; or `warm`, the planning of an earlier call (its policy, critic and moments).
+    - `steps`: how many steps are taken.
+    - `report`: called after each of them.
+
+    Raises `InputError` for places that are not finite, tasks that are not there, settings below 1 and mellowmax people
+    whose actions are vectors; `NotConverged` if numbers cease to be finite.
+    """
+    check_tasks(tasks)
+    check_places(states, task, tasks)
+    if steps < 1:
+        raise InputError(f"expected at least 1, found {steps}", field="steps")
+    beginning, key = jax.random.split(jax.random.key(seed))
+    all_tasks = task_at(tasks, task)
+    planning = warm or planner.begin(beginning, dynamics, policy, all_tasks, behavior, states)
+    history = []
+    for iteration in range(steps):
+        planning, progress = _plan_step(
+            planner, planning, dynamics, all_tasks, behavior, jax.random.fold_in(key, iteration), states
+        )
+        history.append(PlanProgress(iteration, *(float(number) for number in progress[1:])))
+        if not np.isfinite(history[-1]).all():
+            raise NotConverged(f"the policy's figures ceased to be finite at step {iteration}: a lower rate may help")
+        if report:
+            report(history[-1])
+    return Plan(planning, tuple(history))
+
+
+@eqx.filter_jit
+def _plan_step(
+    planner: Planner,
+    planning: Planning[SomePolicy],
+    dynamics: Dynamics,
+    tasks: ContinuousTask,
+    behavior: Behavior,
+    key: PRNGKeyArray,
+    states: Shaped[Array, "starts *state"],
+) -> tuple[Planning[SomePolicy], PlanProgress]:
+    choosing, drawing, rolling = jax.random.split(key, 3)
+    places = jax.random.choice(choosing, len(states), (planner.places,), replace=len(states) < planner.places)
+    own, here = task_at(tasks, places), states[places]
+    choices, shares = planner.tried(drawing, planning.policy, own, here)
+    rolled = _rolled(planner, dynamics, planning.policy, own, behavior, rolling, here, choices)
+    return planner.improve(planning, own, behavior, rolled, shares)
+
+
+@eqx.filter_jit
+def _rolled(
+    planner: Planner,
+    dynamics: Dynamics,
+    policy: Policy,
+    tasks: ContinuousTask,
+    behavior: Behavior,
+    key: PRNGKeyArray,
+    states: Shaped[Array, "places *state"],
+    choices: Shaped[Array, "places options *choice"],
+) -> RollOut:
+    return roll_outs(dynamics, policy, tasks, behavior, key, states, planner.horizon, choices, planner.samples)
+
+
+def _policy_gradient(
+    policy: Policy,
+    guess: Critic,
+    tasks: ContinuousTask,
+    behavior: Behavior,
+    rolled: RollOut,
+    shares: Float[Array, "places options"],
+) -> PyTree:
+    """The mean of eq. 12 over −β, per roll-out; what it points away from is better."""
+    discount = spread_over(tasks, rolled).discount
+    beyond = said(rolled, discount) - values_expected(guess, tasks, rolled)
+    beyond = beyond - temperature(behavior) * advantages(policy, tasks, rolled)
+    # of the first move all options were tried, whatever their probability
+    first = jnp.broadcast_to((shares * shares.shape[1])[..., None, None], (*rolled.acting.shape[:-1], 1))
+    counts = jnp.concatenate([first, jnp.ones_like(beyond[..., 1:])], axis=-1)
+    powers = discount[..., None] ** jnp.arange(beyond.shape[-1])
+    credit = jax.lax.stop_gradient(jnp.where(rolled.acting, counts * powers * beyond, 0.0))
+
+    def loss(policy: Policy) -> Array:
+        def log_prob(task: ContinuousTask, state: Array, choice: Array) -> Array:
+            return policy.log_prob(task.features(state), choice)
+
+        log_probs = everywhere(log_prob, tasks, rolled, rolled.choices)
+        return -jnp.sum(credit * log_probs) / credit[..., 0].size
+
+    return eqx.filter_grad(loss)(policy)
+
+
+def _critic_loss(guess: Critic, tasks: ContinuousTask, rolled: RollOut) -> Float[Array, ""]:
+    """The mean squared error over all moves but the first, whose choice was not the policy's."""
+    worths = to_come(rolled, spread_over(tasks, rolled).discount)[..., 1:-1]
+    guesses = everywhere(lambda task, state: guess(task.features(state)), tasks, rolled)[..., 1:]
+    acting = rolled.acting[..., 1:]
+    squares = jnp.where(acting, (guesses - worths) ** 2, 0.0) / jax.lax.stop_gradient(guess.spread) ** 2
+    return squares.sum() / jnp.maximum(acting.sum(), 1)
+
+
+def _progress(
+    policy: Policy,
+    tasks: ContinuousTask,
+    behavior: Behavior,
+    rolled: RollOut,
+    shares: Float[Array, "places options"],
+    gradient: Float[Array, ""],
+) -> PlanProgress:
+    discount = spread_over(tasks, rolled).discount
+    earned = jnp.sum(shares * returns(rolled, discount).mean(axis=-1), axis=1).mean()
+    states = rolled.states[:, 0, 0, 0]
+    entropy = jax.vmap(lambda task, state: policy.entropy(task.features(state)))(tasks, states).mean()
+    q = said(rolled, discount)[..., 0]
+    own = advantages(policy, tasks, rolled)[..., 0, 0]
+    return PlanProgress(0, earned, gradient, entropy, _lag(behavior, own, q, shares))  # pyright: ignore[reportArgumentType]
+
+
+def _lag(
+    behavior: Behavior,
+    own: Float[Array, "places options"],
+    q: Float[Array, "places options samples"],
+    shares: Float[Array, "places options"],
+) -> Float[Array, ""]:
+    """By how much a policy falls short of what two independent halves of its roll-outs say."""
+    half = max(1, q.shape[-1] // 2)
+    halves = q[..., :half].mean(axis=-1), q[..., -half:].mean(axis=-1)
+    if isinstance(behavior.backup, HardMax):
+        best = jnp.take_along_axis(halves[1], halves[0].argmax(axis=1)[:, None], axis=1)[:, 0]
+        return (best - jnp.sum(shares * halves[1], axis=1)).mean()
+
+    def apart(values: Array) -> Array:
+        away = own - behavior.beta * values
+        return away - jnp.sum(shares * away, axis=1, keepdims=True)
+
+    return 0.5 * jnp.sum(shares * apart(halves[0]) * apart(halves[1]), axis=1).mean()
+
+
+def check_planner(planner: Planner) -> None:
+    """Raises `InputError` for settings below 1, or rates not above 0."""
+    for name in ("horizon", "places", "samples", "options"):
+        if getattr(planner, name) < 1:
+            raise InputError(f"expected at least 1, found {getattr(planner, name)}", field=name)
+    for name in ("learning_rate", "critic_rate"):
+        if not getattr(planner, name) > 0:
+            raise InputError(f"expected a number above 0, found {getattr(planner, name)}", field=name)
+
+
+def check_places(states: Shaped[Array, "places *state"], task: Int[Array, " places"], tasks: ContinuousTask) -> None:
+    """Raises `InputError` unless there are places, all finite, with tasks that exist."""
+    count = len(tasks.discount)
+    if len(states) == 0 or len(task) != len(states):
+        raise InputError(f"expected places and a task for each, found {len(states)} and {len(task)}", field="states")
+    wrong = ~np.isfinite(states).reshape(len(states), -1).all(axis=1)
+    if wrong.any():
+        raise InputError("expected finite numbers", source="states", row=int(wrong.argmax()) + 1)
+    if int(task.min()) < 0 or int(task.max()) >= count:
+        raise InputError(f"expected tasks in 0…{count - 1}", field="task")
+
+
+def _learned(module: eqx.Module) -> PyTree:
+    return eqx.filter(module, eqx.is_inexact_array)

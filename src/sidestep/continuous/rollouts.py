@@ -1,0 +1,150 @@
+"""Roll-outs: what happens when a policy acts in a world, τ moves far, and what it was worth.
+
+Move i = 0…τ−1 takes action a_i in state s_i, pays R(s_i, a_i) and leads to s_{i+1}; a terminal state pays its final
+reward once and nothing happens after. The worth of what is *to come* from state s_i is
+
+    W_i = R_i + b_i + γ W_{i+1},        W_τ = R_τ (a final reward, if s_τ is the first terminal state),
+
+where b_i is what the people's backup adds to the mean of its actions' values (`Backup.bonus`: the entropy over β for
+the log-sum-exp, nothing for the Boltzmann average and the hard maximum). Then E[R_0 + γ W_1] is Q^π(s_0, a_0), and
+E[W_0] = V^π(s_0), of people who look τ moves ahead.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, Shaped
+
+from sidestep.continuous.dynamics import Dynamics, State
+from sidestep.continuous.policies import Choice, FinitePolicy, Policy
+from sidestep.continuous.tasks import ContinuousTask
+from sidestep.tabular.backups import Behavior
+
+
+class RollOut(eqx.Module):
+    """One roll-out, or (with leading axes) many.
+
+    - `states`: s_0…s_τ; after the end they go on as if it had not come, and count for nothing.
+    - `choices`: those of the policy; `choices[0]` may have been given.
+    - `rewards`: R_0…R_τ, 0 after the end.
+    - `bonuses`: b_0…b_{τ−1}, 0 after the end.
+    - `acting`: whether an action was taken in s_i.
+    """
+
+    states: Shaped[Array, "..."]
+    choices: Shaped[Array, "..."]
+    rewards: Float[Array, "*batch moves+1"]
+    bonuses: Float[Array, "*batch moves"]
+    acting: Bool[Array, "*batch moves"]
+
+    @property
+    def leaving(self) -> Shaped[Array, "..."]:
+        """s_0…s_{τ−1}, the states that moves leave."""
+        return jax.lax.slice_in_dim(self.states, 0, self.acting.shape[-1], axis=self.acting.ndim - 1)
+
+    @property
+    def following(self) -> Shaped[Array, "..."]:
+        """s_1…s_τ, the states that moves lead to."""
+        return jax.lax.slice_in_dim(self.states, 1, None, axis=self.acting.ndim - 1)
+
+
+def roll_out(
+    dynamics: Dynamics,
+    policy: Policy,
+    task: ContinuousTask,
+    behavior: Behavior,
+    key: PRNGKeyArray,
+    state: State,
+    horizon: int,
+    choice: Choice | None = None,
+) -> RollOut:
+    """What happens from `state` within `horizon` moves; the first choice is the policy's, unless it is given.
+
+    Differentiable along the path by θ, by λ, or both, where dynamics and policy are reparameterised.
+    """
+
+    def move(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, tuple]:
+        state, choice, over = carry
+        moving, choosing = jax.random.split(key)
+        terminal = task.terminal(state)
+        acting = ~(over | terminal)
+        action = policy.action(choice)
+        pays = jnp.where(acting, task.reward(state, action), jnp.where(over, 0.0, task.final_reward(state)))
+        entropy = policy.entropy(task.features(state))
+        bonus = jnp.where(acting, behavior.backup.bonus(entropy, actions, behavior.beta), 0.0)
+        following = dynamics.sample(moving, state, action)
+        next_choice = policy.sample(choosing, task.features(following))
+        return (following, next_choice, over | terminal), (state, choice, pays, bonus, acting)
+
+    actions = len(policy.actions) if isinstance(policy, FinitePolicy) else None
+    first, key = jax.random.split(key)
+    choice = policy.sample(first, task.features(state)) if choice is None else choice
+    last, passed = jax.lax.scan(move, (state, choice, jnp.zeros((), bool)), jax.random.split(key, horizon))
+    states, choices, rewards, bonuses, acting = passed
+    end, _, over = last
+    pays = jnp.where(task.terminal(end) & ~over, task.final_reward(end), 0.0).astype(rewards.dtype)
+    return RollOut(
+        jnp.concatenate([states, end[None]]), choices, jnp.append(rewards, pays), bonuses.astype(rewards.dtype), acting
+    )
+
+
+def roll_outs(
+    dynamics: Dynamics,
+    policy: Policy,
+    tasks: ContinuousTask,
+    behavior: Behavior,
+    key: PRNGKeyArray,
+    states: Shaped[Array, "places *state"],
+    horizon: int,
+    choices: Shaped[Array, "places options *choice"],
+    samples: int,
+) -> RollOut:
+    """Many roll-outs: `samples` from every place with every one of its first choices.
+
+    - `tasks`: the task of each place (a leading axis of places).
+    - The result has leading axes (places, options, samples). The options of a place share their random numbers, so that
+      differences between them are less noisy than they are.
+    """
+    keys = jax.random.split(key, (len(states), samples))
+
+    def one(task: ContinuousTask, state: State, choice: Choice, key: PRNGKeyArray) -> RollOut:
+        return roll_out(dynamics, policy, task, behavior, key, state, horizon, choice)
+
+    over_samples = jax.vmap(one, (None, None, None, 0))
+    over_options = jax.vmap(over_samples, (None, None, 0, None))
+    return jax.vmap(over_options)(tasks, states, choices, keys)
+
+
+def to_come(rolled: RollOut, discount: Float[Array, "*#batch"]) -> Float[Array, "*batch moves+1"]:
+    """W_0…W_τ; `discount` broadcasts against the leading axes of the roll-outs."""
+
+    def earlier(after: Array, now: Array) -> tuple[Array, Array]:
+        worth = now + discount * after
+        return worth, worth
+
+    gains = rolled.rewards[..., :-1] + rolled.bonuses
+    last = rolled.rewards[..., -1]
+    _, worths = jax.lax.scan(earlier, last, jnp.moveaxis(gains, -1, 0), reverse=True)
+    return jnp.concatenate([jnp.moveaxis(worths, 0, -1), last[..., None]], axis=-1)
+
+
+def action_values(rolled: RollOut, discount: Float[Array, "*#batch"]) -> Float[Array, "*batch"]:
+    """What each roll-out says of Q(s_0, a_0): R_0 + γ W_1."""
+    return rolled.rewards[..., 0] + discount * to_come(rolled, discount)[..., 1]
+
+
+def returns(rolled: RollOut, discount: Float[Array, "*#batch"]) -> Float[Array, "*batch"]:
+    """Σ γ^i R_i, without bonuses."""
+    powers = discount[..., None] ** jnp.arange(rolled.rewards.shape[-1])
+    return jnp.sum(powers * rolled.rewards, axis=-1)
+
+
+def spread_over(tasks: ContinuousTask, rolled: RollOut) -> ContinuousTask:
+    """The tasks of roll-outs with the same leading axes as these, from tasks with an axis of places."""
+    leading = rolled.acting.shape[:-1]
+
+    def over(leaf: Array) -> Array:
+        inner = leaf.reshape(leaf.shape[0], *(1,) * (len(leading) - 1), *leaf.shape[1:])
+        return jnp.broadcast_to(inner, (*leading, *leaf.shape[1:]))
+
+    return jax.tree.map(over, tasks)
