@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from PIL import Image
 
-from sidestep import plotting
 from sidestep.domains.grids import block, wall
 from sidestep.domains.offices import office
 from sidestep.errors import InputError
+from sidestep.plotting import maps as plotting
 from sidestep.tabular.grid import Grid
 
 KNOWN = np.array([[0, 1, -1], [0, 0, 0]])

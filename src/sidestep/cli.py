@@ -27,6 +27,7 @@ from sidestep.commands.learn import Settings, Terms, learn, most_iterations
 from sidestep.commands.plan import plan_path
 from sidestep.commands.simulate import Walkers, simulate_walks
 from sidestep.errors import SidestepError
+from sidestep.experiments import pendulum, representations, room
 from sidestep.experiments.demo import demo
 from sidestep.experiments.reproduce import reproduce
 from sidestep.inference.climb import Progress as FitProgress
@@ -42,6 +43,7 @@ console = Console(highlight=False, width=None if sys.stdout.isatty() else 140)
 errors = Console(stderr=True, highlight=False)
 
 BackupName = Literal["boltzmann", "max", "logsumexp", "mellowmax"]
+EXPERIMENTS = {"room": room.run, "pendulum": pendulum.run, "representations": representations.run}
 Folder = Annotated[Path, typer.Option("--out", help="The folder to write to.", metavar="DIR")]
 Seed = Annotated[int, typer.Option(help="Draws everything that is random.", min=0)]
 Connected = Annotated[Literal["4", "8"], typer.Option(help="Moves: 4 directions, or 8 with diagonals.")]
@@ -74,6 +76,25 @@ def reproduce_command(out: Folder = Path("sidestep-reproduce"), seed: Seed = 0) 
     }
     _print_scores(rows)
     console.print(f"figures and numbers in {out}")
+
+
+@app.command(name="experiment", epilog="Example: sidestep experiment room --out room")
+def experiment_command(
+    name: Annotated[
+        Literal["room", "pendulum", "representations"],
+        typer.Argument(help="A wall nobody touches; gravity from actions alone; three ways to say where walls are."),
+    ],
+    out: Annotated[Path | None, typer.Option("--out", help="The folder to write to.", metavar="DIR")] = None,
+    seed: Seed = 0,
+) -> None:
+    """Experiments in continuous worlds: a picture and summary.json."""
+    out = out or Path(f"sidestep-{name}")
+    with _working("starting") as say:
+        summary = EXPERIMENTS[name](out, seed, say)
+    for key, value in summary.items():
+        if isinstance(value, int | float | str) and key != "command":
+            console.print(f"{key.replace('_', ' ')}: {value:.4g}" if isinstance(value, float) else f"{key}: {value}")
+    console.print(f"picture and numbers in {out}")
 
 
 @app.command(name="learn", epilog="Example: sidestep learn walks.csv --map office.yaml --out learned")

@@ -23,7 +23,7 @@ from sidestep.io.demonstrations import demonstrations_of_moves
 from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map
 from sidestep.io.walks import Walks, read_walks
-from sidestep.plotting import figure_fit, save
+from sidestep.plotting.maps import figure_fit, save
 from sidestep.runs import LearnedMap, write_learned_map
 from sidestep.tabular.backups import BACKUPS, Behavior, Gradient
 from sidestep.tabular.grid import Cell, Connectivity

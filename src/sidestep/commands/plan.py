@@ -8,7 +8,7 @@ import pyarrow as pa
 
 from sidestep.errors import InputError
 from sidestep.io.tables import write_table
-from sidestep.plotting import figure_plan, save
+from sidestep.plotting.maps import figure_plan, save
 from sidestep.runs import add_to_summary, read_learned_map
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.planning import plan

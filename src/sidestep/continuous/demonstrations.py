@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from sidestep.continuous.policies import FinitePolicy, Policy
+from sidestep.continuous.policies import FinitePolicy, GaussianPolicy, Policy
 from sidestep.continuous.tasks import ContinuousTask, check_tasks, stack
 from sidestep.demonstrations import Demonstrations, Trajectory
 from sidestep.errors import InputError
@@ -21,13 +21,20 @@ def gather(trajectories: Sequence[Trajectory], tasks: Sequence[ContinuousTask]) 
     check_tasks(stacked)
     if not trajectories:
         raise InputError("expected at least one trajectory", field="trajectories")
-    shape = np.shape(trajectories[0].states)[1:]
+    shape, action = np.shape(trajectories[0].states)[1:], np.shape(trajectories[0].actions)[1:]
     for index, (states, actions, task) in enumerate(trajectories, start=1):
         if len(actions) == 0 or len(states) != len(actions) + 1 or np.shape(states)[1:] != shape:
             raise InputError(
                 f"expected moves and one state of shape {shape} more, found {len(actions)} and {np.shape(states)}",
                 source="trajectory",
                 row=index,
+            )
+        if np.shape(actions)[1:] != action:
+            raise InputError(
+                f"expected actions of shape {action}, found {np.shape(actions)[1:]}",
+                source="trajectory",
+                row=index,
+                field="actions",
             )
         for field, numbers in (("states", states), ("actions", actions)):
             if not np.isfinite(numbers).all():
@@ -51,6 +58,10 @@ def check_choices(demonstrations: Demonstrations, policy: Policy) -> None:
     if not isinstance(policy, FinitePolicy):
         if not np.issubdtype(chosen.dtype, np.floating):
             raise InputError("expected vectors, as the policy's actions are", field="actions")
+        if isinstance(policy, GaussianPolicy) and chosen.shape[1:] != policy.log_spread.shape:
+            raise InputError(
+                f"expected vectors of {len(policy.log_spread)}, found shape {chosen.shape[1:]}", field="actions"
+            )
         return
     most = len(policy.actions) - 1
     wrong = np.ones(len(chosen), bool)

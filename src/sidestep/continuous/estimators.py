@@ -6,7 +6,7 @@ With Q̂_i = R_i + γ W_{i+1}, what a roll-out says of Q^π(s_i, a_i) (see `roll
 
 It is eq. 11 without the terms that average to nothing: rewards that were paid before a transition do not depend on it.
 E_i may be any function of s_i and a_i, for ∇_θ ln T_θ averages to nothing given these; here it is the critic's guess of
-Q^π, that is V_w(s_i) − b_i + q_λ(s_i, a_i)/β with the policy's own advantages.
+Q^π, that is V_w(s_i) − b_i.
 
 The **pathwise** estimate is the derivative of Q̂_0 along the path, with the random numbers held fixed. It needs dynamics
 that are reparameterised and smooth rewards, and is far less noisy then. Where the policy draws from a finite set, its
@@ -28,17 +28,12 @@ from sidestep.continuous.policies import Policy
 from sidestep.continuous.rollouts import RollOut, roll_outs, spread_over, to_come
 from sidestep.continuous.tasks import ContinuousTask
 from sidestep.errors import InputError
-from sidestep.tabular.backups import Behavior, HardMax
+from sidestep.tabular.backups import Behavior
 
 Estimator = Literal["score", "pathwise"]
 
 Weigh = Callable[[Float[Array, "places options"]], Float[Array, "places options"]]
 """What ∇Q of every option counts, by estimates of Q."""
-
-
-def temperature(behavior: Behavior) -> Float[Array, ""]:
-    """1/β, or 0 for people who act optimally (`HardMax`)."""
-    return jnp.zeros_like(behavior.beta) if isinstance(behavior.backup, HardMax) else 1 / behavior.beta
 
 
 def said(rolled: RollOut, discount: Float[Array, "*#batch"]) -> Float[Array, "*batch moves"]:
@@ -58,10 +53,25 @@ def everywhere(function: Callable, tasks: ContinuousTask, rolled: RollOut, *more
 
 
 def values_expected(critic: Critic | None, tasks: ContinuousTask, rolled: RollOut) -> Float[Array, "*batch moves"]:
-    """V_w(s_i) − b_i, what the critic expects of the policy's choices in s_i; nothing without a critic."""
+    """V_w(s_i) − b_i, what is expected of the choice in s_i; V_w is 0 without a critic."""
     if critic is None:
-        return jnp.zeros_like(rolled.bonuses)
-    return everywhere(lambda task, state: critic(task.features(state)), tasks, rolled) - rolled.bonuses
+        return -rolled.bonuses
+    return guesses(critic, tasks, rolled) - rolled.bonuses
+
+
+def guesses(critic: Critic, tasks: ContinuousTask, rolled: RollOut) -> Float[Array, "*batch moves"]:
+    """V_w of every state that a move leaves."""
+
+    def guess(task: ContinuousTask, state: Array, left: Array) -> Array:
+        return critic(task.features(state), left)
+
+    return everywhere(guess, tasks, rolled, shares_left(rolled))
+
+
+def shares_left(rolled: RollOut) -> Float[Array, "*batch moves"]:
+    """1 − i/τ for every move."""
+    moves = rolled.acting.shape[-1]
+    return jnp.broadcast_to(1 - jnp.arange(moves) / moves, rolled.acting.shape).astype(rolled.rewards.dtype)
 
 
 def advantages(policy: Policy, tasks: ContinuousTask, rolled: RollOut) -> Float[Array, "*batch moves"]:
@@ -78,15 +88,12 @@ def score_surrogate(
     dynamics: Dynamics,
     policy: Policy,
     tasks: ContinuousTask,
-    behavior: Behavior,
     rolled: RollOut,
     critic: Critic | None = None,
 ) -> Float[Array, "*batch"]:
     """Numbers whose derivative by θ is the score estimate of each roll-out."""
     discount = spread_over(tasks, rolled).discount
     expected = values_expected(critic, tasks, rolled)
-    if critic is not None:
-        expected = expected + temperature(behavior) * advantages(policy, tasks, rolled)
     credit = _powers(discount, rolled) * jnp.where(rolled.acting, said(rolled, discount) - expected, 0.0)
 
     def log_prob(task: ContinuousTask, state: Array, choice: Array, following: Array) -> Array:
@@ -144,7 +151,7 @@ def value_gradient(
         if estimator == "pathwise":
             surrogates = path_surrogate(policy, tasks, rolled, critic)
         else:
-            surrogates = score_surrogate(moved, policy, tasks, behavior, rolled, critic)
+            surrogates = score_surrogate(moved, policy, tasks, rolled, critic)
         rolled = jax.lax.stop_gradient(rolled)
         weights = jax.lax.stop_gradient(_weights(said(rolled, spread_over(tasks, rolled).discount)[..., 0], weigh))
         return jnp.sum(weights * surrogates) / samples, rolled

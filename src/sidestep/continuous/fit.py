@@ -11,6 +11,7 @@ the policy, of its critic and of the model. The policy is so always a little beh
 Over vectors of actions the sum over a′ is the mean over choices that the policy draws.
 """
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
@@ -21,12 +22,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, Shaped
 
 from sidestep.continuous.demonstrations import check_choices
 from sidestep.continuous.dynamics import Dynamics, check_finite
 from sidestep.continuous.estimators import Estimator, check_estimator, said, value_gradient
-from sidestep.continuous.planning import Planner, Planning, check_places, check_planner, plan
+from sidestep.continuous.planning import Planner, Planning, PlanProgress, check_places, check_planner, plan
 from sidestep.continuous.policies import FinitePolicy, Policy
 from sidestep.continuous.rollouts import spread_over
 from sidestep.continuous.tasks import ContinuousTask, check_tasks, task_at
@@ -46,7 +47,8 @@ class FitProgress(NamedTuple):
 
     - `objective`: the sum of its parts `actions`, `transitions` (both scaled up to all moves) and `prior`, in nats.
     - `gradient`: the norm of the objective's gradient.
-    - `expected_return`, `entropy`, `lag`: of the policy, see `PlanProgress`.
+    - `expected_return`, `entropy`, `lag`: of the policy, see `PlanProgress`; 0 without the actions' term, which alone
+      needs one.
     """
 
     iteration: int
@@ -99,8 +101,8 @@ class Schedule(eqx.Module):
     lag: float = eqx.field(default=0.1, static=True)
 
     def adam(self) -> optax.GradientTransformation:
-        """The model's optimiser."""
-        return optax.adam(optax.cosine_decay_schedule(self.learning_rate, self.iterations, alpha=0.05))
+        """The model's optimiser; it forgets rare large gradients, which roll-outs give, within a hundred steps."""
+        return optax.adam(optax.cosine_decay_schedule(self.learning_rate, self.iterations, alpha=0.05), b2=0.99)
 
 
 class _Fitting(eqx.Module):
@@ -124,6 +126,7 @@ class _Given(eqx.Module):
     prior: Normal
     planner: Planner
     schedule: Schedule
+    taken: Shaped[Array, "moves *action"]
     terms: tuple[Term, ...] = eqx.field(static=True)
     estimator: Estimator = eqx.field(static=True)
 
@@ -140,7 +143,7 @@ def fit(
     estimator: Estimator = "score",
     schedule: Schedule | None = None,
     seed: int = 0,
-    report: Callable[[FitProgress], None] | None = None,
+    report: Callable[[FitProgress, Family], None] | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
 ) -> ContinuousFit[Family, SomePolicy]:
@@ -150,17 +153,19 @@ def fit(
     - `planner`: how roll-outs are made and the policy is improved; its `samples` count here too.
     - `prior`: over all parameters, the paper's N(−2, 4) by default. `terms`: "actions", "transitions" or both.
     - `estimator`: "score" (eq. 11), or "pathwise" for reparameterised dynamics and smooth rewards.
-    - `report`: called with a `FitProgress` after every iteration.
+    - `report`: called with a `FitProgress` and the dynamics as they are then, after every iteration.
     - `checkpoint`: a file that is kept up to date; with `resume` the fit goes on from there and ends exactly as if it
       had not been interrupted.
 
     Raises `InputError` for data or settings that cannot be used, `NotConverged` if numbers cease to be finite.
     """
     schedule = schedule or Schedule()
-    given = _Given(dynamics, demonstrations, behavior, prior or Normal(), planner, schedule, terms, estimator)
+    check_choices(demonstrations, policy)
+    taken = jax.vmap(policy.action)(demonstrations.actions)
+    given = _Given(dynamics, demonstrations, behavior, prior or Normal(), planner, schedule, taken, terms, estimator)
     _check(given, policy)
     rehearsing, key = jax.random.split(jax.random.key(seed))
-    saver = Saver(checkpoint, fingerprint((given, policy, seed)) if checkpoint is not None else "")
+    saver = Saver(checkpoint, fingerprint(_identity((given, policy, seed))) if checkpoint is not None else "")
     begun = _rehearsed(given, policy, rehearsing)
     carried, fixed = eqx.partition(begun, eqx.is_array)
     history: list[FitProgress] = []
@@ -173,8 +178,15 @@ def fit(
         _check_numbers(history[-1])
         saver.save(carried, history)
         if report:
-            report(history[-1])
+            report(history[-1], dynamics.with_parameters(eqx.combine(carried, fixed).parameters))
     return _ended(given, eqx.combine(carried, fixed), history)
+
+
+def _identity(problem: PyTree) -> tuple[list, str]:
+    """All of a problem, as numbers and text: functions by their names, for their addresses change between processes."""
+    numbers, rest = eqx.partition(problem, eqx.is_array_like)
+    text = f"{jax.tree.structure(problem)} {jax.tree.leaves(rest)}"
+    return jax.tree.leaves(numbers), re.sub(r" at 0x[0-9a-f]+", "", text)
 
 
 def _rehearsed(given: _Given, policy: Policy, key: PRNGKeyArray) -> _Fitting:
@@ -182,7 +194,7 @@ def _rehearsed(given: _Given, policy: Policy, key: PRNGKeyArray) -> _Fitting:
     demos, planner = given.demonstrations, given.planner
     own = task_at(demos.tasks, demos.task)
     planning = planner.begin(key, given.dynamics, policy, own, given.behavior, demos.states)
-    if given.schedule.rehearsals:
+    if given.schedule.rehearsals and "actions" in given.terms:
         planning = plan(
             given.dynamics,
             demos.tasks,
@@ -207,17 +219,21 @@ def _step(
     """One step of the policy, its critic and the model."""
     fitting: _Fitting = eqx.combine(carried, fixed)
     looking, *rehearsing = jax.random.split(key, 1 + given.schedule.policy_steps)
-    for again in rehearsing[1:]:
-        planning, _, _ = _looked(given, fitting, again, learning=False)
-        fitting = eqx.tree_at(lambda whole: whole.planning, fitting, planning)
-    planning, slope, progress = _looked(given, fitting, looking, learning=True)
+    slope, numbers = _rest(given, fitting.parameters, looking)
+    planning = fitting.planning
+    if "actions" in given.terms:
+        for again in rehearsing[1:]:
+            planning, _, _ = _actions(given, fitting.parameters, planning, again, learning=False)
+        planning, of_actions, progress = _actions(given, fitting.parameters, planning, looking, learning=True)
+        slope = jax.tree.map(jnp.add, slope, of_actions)
+        numbers = _together(numbers, progress)
     step, moments = given.schedule.adam().update(slope, fitting.moments)
     parameters = optax.apply_updates(fitting.parameters, step)
     late = jnp.stack([iteration >= first for first in _windows(given.schedule)[:2]])
     late = late & jnp.stack([iteration < end for end in _windows(given.schedule)[1:]])
     sums = fitting.sums + late[:, None] * ravel_pytree(parameters)[0]
     after = _Fitting(parameters, moments, planning, sums)
-    return eqx.filter(after, eqx.is_array), progress._replace(gradient=optax.tree.norm(slope))
+    return eqx.filter(after, eqx.is_array), numbers._replace(gradient=optax.tree.norm(slope))
 
 
 def _windows(schedule: Schedule) -> tuple[int, int, int]:
@@ -226,52 +242,74 @@ def _windows(schedule: Schedule) -> tuple[int, int, int]:
     return max(0, schedule.iterations - 2 * eighth), schedule.iterations - eighth, schedule.iterations
 
 
-def _looked(
-    given: _Given, fitting: _Fitting, key: PRNGKeyArray, learning: bool
-) -> tuple[Planning, PyTree, FitProgress]:
-    """What a batch of moves says: the improved planning, and (if it is to learn) the slope of minus the objective."""
+def _drawn(given: _Given, key: PRNGKeyArray) -> tuple[Int[Array, " some"], float]:
+    """Some of the moves, and by how much sums over them have to be scaled up."""
+    count, all_moves = min(given.schedule.moves, len(given.demonstrations)), len(given.demonstrations)
+    return jax.random.choice(key, all_moves, (count,), replace=False), all_moves / count
+
+
+def _rest(given: _Given, parameters: PyTree, key: PRNGKeyArray) -> tuple[PyTree, FitProgress]:
+    """The slope of minus what needs no roll-outs, the transitions' term (if it counts) and the prior, and the two."""
+    demos = given.demonstrations
+    moves, scale = _drawn(given, key)
+
+    def parts(parameters: PyTree) -> tuple[Array, tuple[Array, Array]]:
+        dynamics, prior = given.dynamics.with_parameters(parameters), given.prior.log_density(parameters)
+        passed = jnp.zeros_like(prior)
+        if "transitions" in given.terms:
+            densities = jax.vmap(dynamics.log_prob)(demos.states[moves], given.taken[moves], demos.next_states[moves])
+            passed = scale * densities.sum()
+        return -(passed + prior), (passed, prior)
+
+    slope, (passed, prior) = jax.grad(parts, has_aux=True)(parameters)
+    none = jnp.zeros_like(prior)
+    return slope, FitProgress(0, passed + prior, none, passed, prior, none, none, none, none)  # pyright: ignore[reportArgumentType]
+
+
+def _together(rest: FitProgress, progress: tuple[Array, PlanProgress]) -> FitProgress:
+    """The figures of all terms, those of the actions added."""
+    actions, plan = progress
+    return rest._replace(
+        objective=rest.objective + actions,  # pyright: ignore[reportArgumentType]
+        actions=actions,  # pyright: ignore[reportArgumentType]
+        expected_return=plan.expected_return,
+        entropy=plan.entropy,
+        lag=plan.lag,
+    )
+
+
+def _actions(
+    given: _Given, parameters: PyTree, planning: Planning, key: PRNGKeyArray, learning: bool
+) -> tuple[Planning, PyTree, tuple[Array, PlanProgress]]:
+    """What roll-outs from some demonstrated moves say.
+
+    That is the improved planning, the slope of minus the actions' log-likelihood (nothing, unless it is to be learned
+    from), the log-likelihood itself, and how good the policy is.
+    """
     demos, planner, behavior = given.demonstrations, given.planner, given.behavior
     choosing, drawing, rolling = jax.random.split(key, 3)
-    count = min(given.schedule.moves, len(demos))
-    moves = jax.random.choice(choosing, len(demos), (count,), replace=False)
-    dynamics = given.dynamics.with_parameters(fitting.parameters)
+    moves, scale = _drawn(given, choosing)
     tasks, states, chosen = task_at(demos.tasks, demos.task[moves]), demos.states[moves], demos.actions[moves]
-    choices, shares = planner.tried(drawing, fitting.planning.policy, tasks, states)
-    people = _People(behavior, fitting.planning.policy, tasks, states, chosen)
-    tried, shares = people.options(choices, shares)
-    acting = learning and "actions" in given.terms
-    slope, rolled = value_gradient(
-        dynamics,
-        fitting.planning.policy,
+    people = _People(behavior, planning.policy, tasks, states, chosen)
+    tried, shares = people.options(*planner.tried(drawing, planning.policy, tasks, states))
+    gradient, rolled = value_gradient(
+        given.dynamics.with_parameters(parameters),
+        planning.policy,
         tasks,
         behavior,
         rolling,
         states,
         tried,
-        people.weights if acting else jnp.zeros_like,
+        people.weights if learning else jnp.zeros_like,
         horizon=planner.horizon,
         samples=planner.samples,
-        critic=fitting.planning.critic,
+        critic=planning.critic,
         estimator=given.estimator,
     )
-    planning, progress = planner.improve(fitting.planning, tasks, behavior, rolled, shares)
-    scale = len(demos) / count
+    improved, progress = planner.improve(planning, tasks, behavior, rolled, shares)
     q = said(rolled, spread_over(tasks, rolled).discount)[..., 0].mean(axis=-1)
-    actions = scale * people.log_probs(q).sum() if "actions" in given.terms else jnp.zeros(())
-
-    def rest(parameters: PyTree) -> tuple[Array, Array]:
-        moved = given.dynamics.with_parameters(parameters)
-        passed = jnp.zeros(())
-        if "transitions" in given.terms:
-            taken = jax.vmap(fitting.planning.policy.action)(chosen)
-            passed = scale * jax.vmap(moved.log_prob)(states, taken, demos.next_states[moves]).sum()
-        return passed + given.prior.log_density(parameters), passed
-
-    (total, passed), gradient = jax.value_and_grad(rest, has_aux=True)(fitting.parameters)
-    slope = jax.tree.map(lambda of_actions, of_rest: -scale * of_actions - of_rest, slope, gradient)
-    parts = (actions + total, actions, passed, total - passed)
-    numbers = FitProgress(0, *parts, jnp.zeros(()), progress.expected_return, progress.entropy, progress.lag)  # pyright: ignore[reportArgumentType]
-    return planning, slope, numbers
+    slope = jax.tree.map(lambda leaf: -scale * leaf, gradient)
+    return improved, slope, (scale * people.log_probs(q).sum(), progress)
 
 
 class _People(NamedTuple):
@@ -312,8 +350,8 @@ class _People(NamedTuple):
 def _ended(given: _Given, fitting: _Fitting, history: list[FitProgress]) -> ContinuousFit:
     begin, middle, end = _windows(given.schedule)
     flat, to_parameters = ravel_pytree(given.dynamics.parameters)
-    former, latter = fitting.sums / jnp.asarray([[max(1, middle - begin)], [end - middle]], flat.dtype)
-    drift = float(jnp.abs(latter - former).max()) if len(flat) else 0.0
+    former, latter = fitting.sums / jnp.asarray([[middle - begin], [end - middle]], flat.dtype)
+    drift = float(jnp.abs(latter - former).max())
     lag = float(np.mean([progress.lag for progress in history[begin:]]))
     schedule = given.schedule
     return ContinuousFit(
@@ -334,23 +372,24 @@ def _check(given: _Given, policy: Policy) -> None:
     if not given.terms or not set(given.terms) <= set(ALL_TERMS):
         raise InputError(f"expected one or both of {ALL_TERMS}, found {given.terms}", field="terms")
     for name in ("iterations", "moves", "policy_steps"):
-        if getattr(given.schedule, name) < 1:
-            raise InputError(f"expected at least 1, found {getattr(given.schedule, name)}", field=name)
+        least = 2 if name == "iterations" else 1  # the drift is from one half of the last quarter to the other
+        if getattr(given.schedule, name) < least:
+            raise InputError(f"expected at least {least}, found {getattr(given.schedule, name)}", field=name)
     if not given.schedule.learning_rate > 0:
         raise InputError(f"expected a number above 0, found {given.schedule.learning_rate}", field="learning_rate")
     check_planner(given.planner)
+    if not jax.tree.leaves(given.dynamics.parameters):
+        raise InputError("expected parameters to learn, found none", field="dynamics")
     check_finite(given.dynamics.parameters)
     check_tasks(demos.tasks)
     check_places(demos.states, demos.task, demos.tasks)
-    check_choices(demos, policy)
     check_estimator(given.estimator, given.dynamics, demos.tasks)
     if not isinstance(policy, FinitePolicy) and not isinstance(given.behavior.backup, LogSumExp):
         raise InputError(
             "over vectors of actions people's policy is known for the log-sum-exp only: expected that, or a finite set",
             field="behavior",
         )
-    taken = jax.vmap(policy.action)(demos.actions)
-    densities = np.asarray(jax.vmap(given.dynamics.log_prob)(demos.states, taken, demos.next_states))
+    densities = np.asarray(jax.vmap(given.dynamics.log_prob)(demos.states, given.taken, demos.next_states))
     wrong = np.isnan(densities) | ((densities == -np.inf) & ("transitions" in given.terms))
     if wrong.any():
         move = int(wrong.argmax())

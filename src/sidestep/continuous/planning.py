@@ -5,11 +5,12 @@ the divergence between what they do and what π_λ does falls along
 
     −∇_λ = E [ Σ_i ∇_λ ln π_λ(a_i | s_i) γ^i ( Q̂_i − E_i − q_λ(s_i, a_i)/β ) ],
 
-which is eq. 12 over −β with a control variate E_i, any function of s_i, here V_w(s_i) − b_i of a critic. It vanishes
-where q_λ/β are the advantages of Q^π. What Q^π is depends on the backup: as printed, eq. 12 counts rewards only, and
-leads to the **Boltzmann average** (eqs. 3–5). The divergence to Ziebart's trajectory distribution also counts the
-entropies to come, E[−Σ_{j>i} ln π_λ(a_j | s_j)]; with these in Q̂_i (`Backup.bonus`) the same equation leads to the
-**log-sum-exp**. For the **hard maximum** 1/β is 0, and what is left is the ordinary policy gradient.
+which is eq. 12 over −β with a control variate E_i, any function of s_i; what is taken off altogether is V_w(s_i) − b_i,
+a critic's guess, for the b_i of roll-outs hold q_λ/β. It vanishes where q_λ/β are the advantages of Q^π. What Q^π is
+depends on the backup: as printed, eq. 12 counts rewards only, and leads to the **Boltzmann average** (eqs. 3–5). The
+divergence to Ziebart's trajectory distribution also counts the entropies to come, E[−Σ_{j>i} ln π_λ(a_j | s_j)]; with
+these in Q̂_i (`Backup.bonus`) the same equation leads to the **log-sum-exp**. For the **hard maximum** 1/β is 0, and
+what is left is the ordinary policy gradient.
 
 At the first state of a roll-out all actions are tried (or several that the policy draws), and the sum over them is
 taken exactly, with their probabilities.
@@ -27,7 +28,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, Shaped
 
 from sidestep.continuous.critics import Critic, critic
 from sidestep.continuous.dynamics import Dynamics
-from sidestep.continuous.estimators import advantages, everywhere, said, temperature, values_expected
+from sidestep.continuous.estimators import advantages, everywhere, guesses, said, shares_left, values_expected
 from sidestep.continuous.policies import FinitePolicy, Policy
 from sidestep.continuous.rollouts import RollOut, returns, roll_outs, spread_over, to_come
 from sidestep.continuous.tasks import ContinuousTask, check_tasks, task_at
@@ -44,8 +45,8 @@ class PlanProgress(NamedTuple):
     - `gradient`: the norm of the policy's gradient, in reward units.
     - `entropy`: at these places, in nats.
     - `lag`: by how much it falls short of acting on what its own roll-outs say. For soft people the divergence from
-      exp βQ̂ in nats, to second order; for optimal ones what the best action would gain, in reward units. Unbiased, and
-      so below 0 at times; near 0 for a policy that has been found.
+      exp βQ̂ in nats; for optimal ones what the best action would gain, in reward units. The share of noise is taken
+      off, so that it is below 0 at times; near 0 for a policy that has been found.
     """
 
     iteration: int
@@ -68,9 +69,11 @@ class Planner(eqx.Module):
     """How a policy is found.
 
     - `horizon`: how many moves a roll-out has at most.
-    - `places`, `samples`: how many places are tried a step, and how many roll-outs each of their options gets.
+    - `places`, `samples`: how many places are tried a step, and how many roll-outs each of their options gets; of
+      these at least 2, for `PlanProgress.lag` compares halves of them.
     - `options`: how many choices are tried at a place where actions are vectors; from a finite set, all are.
     - `learning_rate`, `critic_rate`: of Adam.
+    - `critic_width`: how many units each hidden layer of the critic has.
     """
 
     horizon: int = eqx.field(static=True)
@@ -79,6 +82,7 @@ class Planner(eqx.Module):
     options: int = eqx.field(default=8, static=True)
     learning_rate: float = eqx.field(default=3e-3, static=True)
     critic_rate: float = eqx.field(default=3e-3, static=True)
+    critic_width: int = eqx.field(default=64, static=True)
 
     def begin(
         self,
@@ -103,7 +107,7 @@ class Planner(eqx.Module):
         acting = np.asarray(rolled.acting)
         if not acting.any():
             raise InputError("expected places where a task has not ended", field="states")
-        guess = critic(making, seen[acting], worths[acting])
+        guess = critic(making, seen[acting], shares_left(rolled)[acting], worths[acting], width=self.critic_width)
         return Planning(
             policy,
             guess,
@@ -134,7 +138,7 @@ class Planner(eqx.Module):
     ) -> tuple[Planning[SomePolicy], PlanProgress]:
         """A step of the policy and of its critic, by roll-outs from (places, options, samples)."""
         policy, guess = planning.policy, planning.critic
-        gradient = _policy_gradient(policy, guess, tasks, behavior, rolled, shares)
+        gradient = _policy_gradient(policy, guess, tasks, rolled, shares)
         step, policy_moments = self._adam(self.learning_rate).update(gradient, planning.policy_moments)
         slope = eqx.filter_grad(_critic_loss)(guess, tasks, rolled)
         critic_step, critic_moments = self._adam(self.critic_rate).update(slope, planning.critic_moments)
@@ -189,6 +193,7 @@ def plan(
     Raises `InputError` for places that are not finite, tasks that are not there, settings below 1 and mellowmax people
     whose actions are vectors; `NotConverged` if numbers cease to be finite.
     """
+    check_planner(planner)
     check_tasks(tasks)
     check_places(states, task, tasks)
     if steps < 1:
@@ -245,14 +250,12 @@ def _policy_gradient(
     policy: Policy,
     guess: Critic,
     tasks: ContinuousTask,
-    behavior: Behavior,
     rolled: RollOut,
     shares: Float[Array, "places options"],
 ) -> PyTree:
     """The mean of eq. 12 over −β, per roll-out; what it points away from is better."""
     discount = spread_over(tasks, rolled).discount
     beyond = said(rolled, discount) - values_expected(guess, tasks, rolled)
-    beyond = beyond - temperature(behavior) * advantages(policy, tasks, rolled)
     # of the first move all options were tried, whatever their probability
     first = jnp.broadcast_to((shares * shares.shape[1])[..., None, None], (*rolled.acting.shape[:-1], 1))
     counts = jnp.concatenate([first, jnp.ones_like(beyond[..., 1:])], axis=-1)
@@ -272,9 +275,9 @@ def _policy_gradient(
 def _critic_loss(guess: Critic, tasks: ContinuousTask, rolled: RollOut) -> Float[Array, ""]:
     """The mean squared error over all moves but the first, whose choice was not the policy's."""
     worths = to_come(rolled, spread_over(tasks, rolled).discount)[..., 1:-1]
-    guesses = everywhere(lambda task, state: guess(task.features(state)), tasks, rolled)[..., 1:]
+    guessed = guesses(guess, tasks, rolled)[..., 1:]
     acting = rolled.acting[..., 1:]
-    squares = jnp.where(acting, (guesses - worths) ** 2, 0.0) / jax.lax.stop_gradient(guess.spread) ** 2
+    squares = jnp.where(acting, (guessed - worths) ** 2, 0.0) / jax.lax.stop_gradient(guess.spread) ** 2
     return squares.sum() / jnp.maximum(acting.sum(), 1)
 
 
@@ -301,25 +304,28 @@ def _lag(
     q: Float[Array, "places options samples"],
     shares: Float[Array, "places options"],
 ) -> Float[Array, ""]:
-    """By how much a policy falls short of what two independent halves of its roll-outs say."""
-    half = max(1, q.shape[-1] // 2)
+    """By how much a policy falls short of what its roll-outs say; two independent halves tell how noisy they are."""
+    half = q.shape[-1] // 2
     halves = q[..., :half].mean(axis=-1), q[..., -half:].mean(axis=-1)
     if isinstance(behavior.backup, HardMax):
         best = jnp.take_along_axis(halves[1], halves[0].argmax(axis=1)[:, None], axis=1)[:, 0]
         return (best - jnp.sum(shares * halves[1], axis=1)).mean()
 
-    def apart(values: Array) -> Array:
-        away = own - behavior.beta * values
-        return away - jnp.sum(shares * away, axis=1, keepdims=True)
-
-    return 0.5 * jnp.sum(shares * apart(halves[0]) * apart(halves[1]), axis=1).mean()
+    away = own - behavior.beta * (halves[0] + halves[1]) / 2
+    # the divergence of π from exp βQ̂: with d = q_λ − βQ̂ it is E d + ln E exp(−d)
+    far = jnp.sum(shares * away, axis=1) + jax.nn.logsumexp(-away, axis=1, b=shares)
+    # noise in Q̂ adds half its variance under π, which the halves tell
+    noise = behavior.beta * (halves[0] - halves[1]) / 2
+    noise = noise - jnp.sum(shares * noise, axis=1, keepdims=True)
+    return (far - 0.5 * jnp.sum(shares * noise**2, axis=1)).mean()
 
 
 def check_planner(planner: Planner) -> None:
-    """Raises `InputError` for settings below 1, or rates not above 0."""
-    for name in ("horizon", "places", "samples", "options"):
-        if getattr(planner, name) < 1:
-            raise InputError(f"expected at least 1, found {getattr(planner, name)}", field=name)
+    """Raises `InputError` for settings below 1, fewer than 2 samples (halves are compared), or rates not above 0."""
+    for name in ("horizon", "places", "samples", "options", "critic_width"):
+        least = 2 if name == "samples" else 1
+        if getattr(planner, name) < least:
+            raise InputError(f"expected at least {least}, found {getattr(planner, name)}", field=name)
     for name in ("learning_rate", "critic_rate"):
         if not getattr(planner, name) > 0:
             raise InputError(f"expected a number above 0, found {getattr(planner, name)}", field=name)

@@ -6,8 +6,10 @@ reward once and nothing happens after. The worth of what is *to come* from state
     W_i = R_i + b_i + γ W_{i+1},        W_τ = R_τ (a final reward, if s_τ is the first terminal state),
 
 where b_i is what the people's backup adds to the mean of its actions' values (`Backup.bonus`: the entropy over β for
-the log-sum-exp, nothing for the Boltzmann average and the hard maximum). Then E[R_0 + γ W_1] is Q^π(s_0, a_0), and
-E[W_0] = V^π(s_0), of people who look τ moves ahead.
+the log-sum-exp, nothing for the Boltzmann average and the hard maximum), less q_λ(s_i, a_i)/β, what the policy's own
+advantages expect of this choice beyond the mean. The latter averages to nothing, whatever the policy, and takes off
+most of the noise of drawing choices where the policy is near π ∝ exp βQ^π. (For the log-sum-exp, b_i is so
+−ln π(a_i | s_i)/β.) Then E[R_0 + γ W_1] is Q^π(s_0, a_0), and E[W_0] = V^π(s_0), of people who look τ moves ahead.
 """
 
 import equinox as eqx
@@ -18,7 +20,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, Shaped
 from sidestep.continuous.dynamics import Dynamics, State
 from sidestep.continuous.policies import Choice, FinitePolicy, Policy
 from sidestep.continuous.tasks import ContinuousTask
-from sidestep.tabular.backups import Behavior
+from sidestep.tabular.backups import Behavior, HardMax
 
 
 class RollOut(eqx.Module):
@@ -33,7 +35,7 @@ class RollOut(eqx.Module):
 
     states: Shaped[Array, "..."]
     choices: Shaped[Array, "..."]
-    rewards: Float[Array, "*batch moves+1"]
+    rewards: Float[Array, "*batch payments"]
     bonuses: Float[Array, "*batch moves"]
     acting: Bool[Array, "*batch moves"]
 
@@ -46,6 +48,11 @@ class RollOut(eqx.Module):
     def following(self) -> Shaped[Array, "..."]:
         """s_1…s_τ, the states that moves lead to."""
         return jax.lax.slice_in_dim(self.states, 1, None, axis=self.acting.ndim - 1)
+
+
+def temperature(behavior: Behavior) -> Float[Array, ""]:
+    """1/β, or 0 for people who act optimally (`HardMax`)."""
+    return jnp.zeros_like(behavior.beta) if isinstance(behavior.backup, HardMax) else 1 / behavior.beta
 
 
 def roll_out(
@@ -70,8 +77,10 @@ def roll_out(
         acting = ~(over | terminal)
         action = policy.action(choice)
         pays = jnp.where(acting, task.reward(state, action), jnp.where(over, 0.0, task.final_reward(state)))
-        entropy = policy.entropy(task.features(state))
-        bonus = jnp.where(acting, behavior.backup.bonus(entropy, actions, behavior.beta), 0.0)
+        seen = task.features(state)
+        entropy = policy.entropy(seen)
+        beyond_mean = temperature(behavior) * (policy.log_prob(seen, choice) + entropy)
+        bonus = jnp.where(acting, behavior.backup.bonus(entropy, actions, behavior.beta) - beyond_mean, 0.0)
         following = dynamics.sample(moving, state, action)
         next_choice = policy.sample(choosing, task.features(following))
         return (following, next_choice, over | terminal), (state, choice, pays, bonus, acting)
@@ -115,7 +124,7 @@ def roll_outs(
     return jax.vmap(over_options)(tasks, states, choices, keys)
 
 
-def to_come(rolled: RollOut, discount: Float[Array, "*#batch"]) -> Float[Array, "*batch moves+1"]:
+def to_come(rolled: RollOut, discount: Float[Array, "*#batch"]) -> Float[Array, "*batch payments"]:
     """W_0…W_τ; `discount` broadcasts against the leading axes of the roll-outs."""
 
     def earlier(after: Array, now: Array) -> tuple[Array, Array]:

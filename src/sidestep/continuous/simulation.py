@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from sidestep.continuous.dynamics import GaussianDynamics
 from sidestep.continuous.lattice import Lattice, action_values, tabular, tabular_task
@@ -18,7 +18,7 @@ from sidestep.continuous.tasks import ContinuousTask
 from sidestep.demonstrations import Trajectory
 from sidestep.errors import InputError, NotConverged
 from sidestep.tabular.backups import Behavior
-from sidestep.tabular.solve import solve
+from sidestep.tabular.solve import check_proper, solve
 
 
 def simulate(
@@ -37,14 +37,17 @@ def simulate(
     - `tasks`, `starts`: for each task, where its walkers start; those who start at the end of their task do not walk.
     - `behavior`: how they choose. `lattice`: where their values are found.
 
-    Raises `InputError` for starts that are not finite, `NotConverged` if their values cannot be found.
+    Raises `InputError` for starts that are not finite, `ImproperTask` for a task without values, `NotConverged` if
+    these cannot be found.
     """
     model = tabular(believed, lattice, actions)
     trajectories = []
     for index, (task, own) in enumerate(zip(tasks, starts, strict=True)):
         if not np.isfinite(own).all():
             raise InputError("expected finite numbers", source=f"starts of task {index}")
-        solution = solve(model, tabular_task(task, lattice, actions), behavior)
+        table = tabular_task(task, lattice, actions)
+        check_proper(table, behavior, len(actions))
+        solution = solve(model, table, behavior)
         if not solution.converged:
             raise NotConverged(f"values did not converge for task {index}: a finer lattice or a smaller β may help")
         keys = jax.random.split(jax.random.fold_in(key, index), len(own))
@@ -70,7 +73,7 @@ class _World(eqx.Module):
 
 
 @eqx.filter_jit
-def _walked(world: _World, starts: Array, keys: PRNGKeyArray, moves: int) -> tuple[Array, Array, Array]:
+def _walked(world: _World, starts: Array, keys: Key[Array, " walkers"], moves: int) -> tuple[Array, Array, Array]:
     """States, choices, and whether a walker was still going, of all walkers."""
 
     def move(carry: tuple[Array, Array], key: PRNGKeyArray) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:

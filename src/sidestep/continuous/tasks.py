@@ -191,7 +191,8 @@ def table_tasks(tasks: Task, states: int, actions: int) -> TableTask:
 
 def stack(tasks: Sequence[_Task]) -> _Task:
     """Several tasks of a kind as one with a leading axis; raises `InputError` for none, or tasks of different kinds."""
-    if not tasks or len({jax.tree.structure(task) for task in tasks}) > 1:
+    kinds = {(jax.tree.structure(task), *map(np.shape, jax.tree.leaves(task))) for task in tasks}
+    if len(kinds) != 1:
         raise InputError("expected at least one task, all of a kind", field="tasks")
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *tasks)
 

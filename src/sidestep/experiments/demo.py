@@ -20,7 +20,7 @@ from sidestep.io.files import write_json
 from sidestep.io.maps import write_map
 from sidestep.io.trajectories import walks_of_trajectories
 from sidestep.io.walks import write_walks
-from sidestep.plotting import Panel, figure_learned, save
+from sidestep.plotting.maps import Panel, figure_learned, save
 from sidestep.runs import LearnedMap, write_learned_map
 from sidestep.tabular.models import ObstacleGrid
 

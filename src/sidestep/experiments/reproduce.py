@@ -25,7 +25,7 @@ from sidestep.inference.fit import Fit, fit
 from sidestep.inference.optimisers import LBFGS, Ascent, Optimiser
 from sidestep.inference.priors import Normal
 from sidestep.io.files import write_json
-from sidestep.plotting import Panel, figure_environments, figure_learned, save
+from sidestep.plotting.maps import Panel, figure_environments, figure_learned, save
 from sidestep.simulation import simulate
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, Gradient
 from sidestep.tabular.likelihood import ALL_TERMS, Term

@@ -37,22 +37,26 @@ _PANEL = 2.9
 _DOTS_PER_INCH = 150
 
 
+Places = Integer[np.ndarray, " places"] | Float[np.ndarray, "places 2"]
+"""States, or positions in metres."""
+
+
 @dataclass(frozen=True, eq=False)
 class Panel:
     """One map of a figure with several.
 
     - `blocked`: P(blocked); `None` draws the map `grid` as it is.
     - `truth`: the true map, whose obstacles are outlined.
-    - `paths`: the states along each path; `starts`, `goals`: states.
+    - `paths`: the places along each path; `starts`, `goals`: places. A place is a state, or a position in metres.
     """
 
     title: str
     grid: Grid
     blocked: Float[np.ndarray, "rows columns"] | None = None
     truth: Grid | None = None
-    paths: Sequence[Integer[np.ndarray, " _"]] = ()
-    starts: Sequence[int] = ()
-    goals: Sequence[int] = ()
+    paths: Sequence[Places] = ()
+    starts: Sequence[int] | Places = ()
+    goals: Sequence[int] | Places = ()
 
 
 def draw_map(axes: Axes, grid: Grid) -> AxesImage:
@@ -74,15 +78,15 @@ def draw_blocked(
     return image
 
 
-def draw_walks(axes: Axes, paths: Sequence[Integer[np.ndarray, " _"]], grid: Grid, label: str = "walk") -> None:
-    """Draw walks (states) as thin lines, each shifted by a little of its own so that bundles can be seen.
+def draw_walks(axes: Axes, paths: Sequence[Places], grid: Grid, label: str = "walk") -> None:
+    """Draw walks as thin lines; those of states are each shifted by a little of their own so that bundles can be seen.
 
     `label` names them in the legend.
     """
     if not len(paths):
         return
     shift = _shifts(len(paths)) * grid.resolution
-    lines = [grid.centres(path) + own for path, own in zip(paths, shift, strict=True)]
+    lines = [_metres(path, grid) + own * (path.ndim == 1) for path, own in zip(paths, shift, strict=True)]
     opacity = float(np.clip(12 / len(paths), 0.2, 0.7))
     few = len(paths) <= 6
     width = _width(grid, 1.2, 1.8) if few else _width(grid, 0.6, 0.9)
@@ -99,8 +103,8 @@ def draw_path(axes: Axes, states: Integer[np.ndarray, " steps"], grid: Grid) -> 
     _draw_markers(axes, states[-1:], grid, marker="*", colour=_GOAL, label="goal", scale=1.7)
 
 
-def draw_places(axes: Axes, starts: Sequence[int], goals: Sequence[int], grid: Grid) -> None:
-    """Draw starts (states) as red squares and goals as green diamonds."""
+def draw_places(axes: Axes, starts: Sequence[int] | Places, goals: Sequence[int] | Places, grid: Grid) -> None:
+    """Draw starts as red squares and goals as green diamonds."""
     _draw_markers(axes, starts, grid, marker="s", colour=_START, label="start")
     _draw_markers(axes, goals, grid, marker="D", colour=_GOAL, label="goal")
 
@@ -228,7 +232,7 @@ def _shifts(count: int) -> Float[np.ndarray, "walks 2"]:
 
 def _draw_markers(
     axes: Axes,
-    states: Sequence[int] | Integer[np.ndarray, " states"],
+    places: Sequence[int] | Places,
     grid: Grid,
     *,
     marker: str,
@@ -236,12 +240,17 @@ def _draw_markers(
     label: str,
     scale: float = 1.0,
 ) -> None:
-    if not len(states):
+    if not len(places):
         return
-    x, y = grid.centres(np.asarray(states)).T
+    x, y = _metres(np.asarray(places), grid).T
     size = scale * _width(grid, 7.0, 9.0)
     edge = {"markeredgecolor": "white", "markeredgewidth": 0.8}
     axes.plot(x, y, marker, color=colour, markersize=size, zorder=5, label=label, **edge)
+
+
+def _metres(places: Places, grid: Grid) -> Float[np.ndarray, "places 2"]:
+    """Where states or positions are."""
+    return places if places.ndim == 2 else grid.centres(places)
 
 
 def _halo(width: float) -> list[Stroke | Normal]:

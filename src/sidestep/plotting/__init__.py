@@ -1,0 +1,1 @@
+"""Every picture: of maps (`maps`), and of continuous worlds (`fields`)."""

@@ -1,0 +1,349 @@
+"""Dynamics: what is drawn has the density that is claimed, and each family moves as its equations say."""
+
+from functools import cache
+from typing import NamedTuple
+
+import equinox as eqx
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from families import (
+    EVERY,
+    GAUSSIAN,
+    HIGH,
+    LINEAR,
+    LOW,
+    NETWORK,
+    NOISE,
+    PLACE,
+    STEP,
+    TABLE,
+    WALLS,
+    Gusts,
+    radial,
+    vector,
+)
+from jax.flatten_util import ravel_pytree
+from scipy import stats
+
+from sidestep.continuous.dynamics import LinearGaussian
+from sidestep.continuous.obstacles import ObstacleMotion, RadialField, Walls, network_field, radial_field
+from sidestep.continuous.physical import Pendulum, PointMass
+from sidestep.continuous.tasks import Hold
+from sidestep.errors import InputError
+
+pytestmark = pytest.mark.usefixtures("unoptimised")
+
+outcomes = eqx.filter_jit(lambda dynamics, state, action: dynamics.outcomes(state, action))
+log_prob = eqx.filter_jit(lambda dynamics, *move: dynamics.log_prob(*move))
+
+JUMPING = {"stopping", "network, stopping", "walls", "gusts", "table"}
+SAMPLES = 20_000
+gaussian = pytest.mark.parametrize("name", GAUSSIAN)
+every = pytest.mark.parametrize("name", EVERY)
+
+
+class Look(NamedTuple):
+    """What there is to see of a family at one state and action; together, so that it is compiled but once.
+
+    - `samples`: next states. `log_probs`: of `points`.
+    - `slope`, `differences`: the gradient by all parameters of a sample's log-probability, and by differences.
+    - `moved`: by how much a sample moves with the parameters while its key is held.
+    """
+
+    samples: np.ndarray
+    points: np.ndarray
+    log_probs: np.ndarray
+    slope: np.ndarray
+    differences: np.ndarray
+    moved: np.ndarray
+
+
+@cache
+def look(name) -> Look:
+    dynamics, state, action = EVERY[name]
+    points = np.arange(4) if name == "table" else np.zeros((1, 1)) if name == "Laplace" else around(*EVERY[name])
+    flat, to_parameters = ravel_pytree(dynamics.parameters)
+    steps = 1e-5 * jnp.eye(len(flat))
+
+    def at(flat):
+        return dynamics.with_parameters(to_parameters(flat))
+
+    @jax.jit
+    def seen(keys, points, steps):
+        samples = jax.vmap(dynamics.sample, (0, None, None))(keys, state, action)
+        log_probs = jax.vmap(dynamics.log_prob, (None, None, 0))(state, action, points)
+        slope = jax.grad(lambda flat: at(flat).log_prob(state, action, samples[0]))(flat)
+        beside = jax.vmap(lambda flat: at(flat).log_prob(state, action, samples[0]))(flat + steps)
+        moved = at(flat + 0.1).sample(keys[0], state, action) - samples[0]
+        return samples, log_probs, slope, beside, moved
+
+    keys = jax.random.split(jax.random.key(0, impl="unsafe_rbg"), SAMPLES)  # random enough, and compiles in no time
+    samples, log_probs, slope, beside, moved = seen(keys, jnp.asarray(points), jnp.concatenate([steps, -steps]))
+    differences = (beside[: len(flat)] - beside[len(flat) :]) / 2e-5
+    return Look(*map(np.asarray, (samples, points, log_probs, slope, differences, moved)))
+
+
+def around(dynamics, state, action):
+    """A lattice of next states around all outcomes, its points as far apart as the noise."""
+    means, noise = np.asarray(outcomes(dynamics, state, action).means), np.asarray(dynamics.noise)
+    sides = zip(means.min(axis=0) - 6 * noise, means.max(axis=0) + 6 * noise, noise, strict=True)
+    return np.stack(np.meshgrid(*(np.arange(*side) for side in sides), indexing="ij"), axis=-1).reshape(-1, len(noise))
+
+
+# What holds for every family
+
+
+@gaussian
+def test_densities_add_up_to_one_and_samples_have_their_moments(name):
+    """Sums over a lattice as wide as the noise are exact to 1e-7 for Gaussians."""
+    found = look(name)
+    shares = np.exp(found.log_probs) * np.asarray(GAUSSIAN[name].dynamics.noise).prod()
+    assert shares.sum() == pytest.approx(1, abs=1e-7)
+    mean = shares @ found.points
+    covariance = (found.points - mean).T @ (shares[:, None] * (found.points - mean))
+    spread, away = np.sqrt(np.diag(covariance)), found.samples - mean
+    np.testing.assert_allclose(away.mean(axis=0) / spread, 0, atol=0.03)
+    np.testing.assert_allclose((away.T @ away / SAMPLES - covariance) / np.outer(spread, spread), 0, atol=0.05)
+
+
+def test_a_table_is_drawn_as_often_as_it_says():
+    dynamics, state, action = TABLE
+    expected = np.zeros(4)
+    expected[np.asarray(dynamics.model.graph.successors[state, action])] = dynamics.model.probabilities()[state, action]
+    np.testing.assert_allclose(np.exp(look("table").log_probs), expected, atol=1e-15)
+    assert expected.sum() == pytest.approx(1, abs=1e-12)
+    np.testing.assert_allclose(np.bincount(look("table").samples, minlength=4) / SAMPLES, expected, atol=0.015)
+
+
+@every
+def test_gradients_by_parameters_agree_with_differences(name):
+    slope = look(name).slope
+    np.testing.assert_allclose(slope, look(name).differences, rtol=1e-5, atol=1e-7)
+    assert (np.abs(slope).max() > 1e-3) if name != "walls" else len(slope) == 0
+
+
+@every
+def test_only_one_outcome_can_be_reparameterised(name):
+    assert EVERY[name].dynamics.reparameterised == (name not in JUMPING)
+
+
+@pytest.mark.parametrize("name", sorted(GAUSSIAN.keys() - JUMPING))
+def test_with_the_key_held_samples_move_as_means_do(name):
+    dynamics, state, action = GAUSSIAN[name]
+    moved = dynamics.with_parameters(jax.tree.map(lambda leaf: leaf + 0.1, dynamics.parameters))
+    expected = outcomes(moved, state, action).means[0] - outcomes(dynamics, state, action).means[0]
+    assert np.abs(expected).max() > 1e-4
+    np.testing.assert_allclose(look(name).moved, expected, atol=1e-12)
+
+
+@every
+def test_other_parameters_same_family(name):
+    dynamics = EVERY[name].dynamics
+    before = jax.tree.map(np.asarray, dynamics.parameters)
+    moved = dynamics.with_parameters(jax.tree.map(lambda leaf: leaf + 0.25, dynamics.parameters))
+    assert jax.tree.structure(moved) == jax.tree.structure(dynamics)
+    for held, old, new in zip(*map(jax.tree.leaves, (dynamics.parameters, before, moved.parameters)), strict=True):
+        np.testing.assert_array_equal(held, old)
+        np.testing.assert_allclose(new, old + 0.25)
+
+
+# Linear dynamics
+
+
+def test_linear_dynamics_are_a_normal_distribution():
+    state, action, following = vector(1, -2), vector(0.5), vector(0.3, -1.1)
+    mean = np.array([0.9 * 1 + 0.2 * -2, -0.1 * 1 + 0.8 * -2 + 0.5 * 0.5])
+    expected = stats.norm.logpdf(following, mean, NOISE).sum()
+    assert float(log_prob(LINEAR, state, action, following)) == pytest.approx(float(expected), abs=1e-12)
+
+
+# Physical systems
+
+
+def gymnasium_pendulum(gravity, mass, length):
+    environment = gymnasium.make("Pendulum-v1", g=gravity).unwrapped
+    environment.m, environment.l = mass, length  # pyright: ignore[reportAttributeAccessIssue]
+    return environment
+
+
+@pytest.mark.parametrize("constants", [(10.0, 1.0, 1.0), (9.81, 0.7, 1.3)])
+def test_the_pendulum_is_that_of_gymnasium(constants):
+    random, environment = np.random.default_rng(0), gymnasium_pendulum(*constants)
+    states = np.concatenate([random.uniform([-7, -8], [7, 8], (40, 2)), [[1.5, 7.99], [-1.5, -7.99]]])
+    torques = random.uniform(-2, 2, (42, 1))
+    pendulum, task = Pendulum(*constants), Hold(goal=jnp.zeros(()), discount=jnp.asarray(0.9))
+    means = jax.jit(jax.vmap(lambda *of: pendulum.outcomes(*of).means[0]))(jnp.asarray(states), jnp.asarray(torques))
+    rewards = jax.jit(jax.vmap(task.reward))(jnp.asarray(states), jnp.asarray(torques))
+    for state, torque, mean, reward in zip(states, torques, means, rewards, strict=True):
+        environment.state = state  # pyright: ignore[reportAttributeAccessIssue]
+        _, expected, *_ = environment.step(torque)
+        np.testing.assert_allclose(mean, environment.state, atol=1e-9)  # pyright: ignore[reportAttributeAccessIssue]
+        assert float(reward) == pytest.approx(float(expected), abs=1e-9)
+
+
+def test_torques_beyond_the_motors_are_cut_off_as_in_gymnasium():
+    environment, pendulum = gymnasium_pendulum(10.0, 1.0, 1.0), Pendulum()
+    for torque in (-5.0, 3.0):
+        environment.state = np.array([0.3, -0.2])  # pyright: ignore[reportAttributeAccessIssue]
+        environment.step(np.array([torque]))
+        mean = outcomes(pendulum, vector(0.3, -0.2), vector(torque)).means[0]
+        np.testing.assert_allclose(mean, environment.state, atol=1e-9)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_constants_are_told_in_their_own_units_and_learned_as_logarithms():
+    pendulum = Pendulum(9.0, 2.0, 0.5, unknown=("mass",))
+    assert [float(pendulum.constant(name)) for name in ("gravity", "mass", "length")] == [9, pytest.approx(2), 0.5]
+    assert {name: float(value) for name, value in pendulum.parameters.items()} == {"mass": pytest.approx(np.log(2))}
+
+
+def test_a_point_mass_steps_as_its_equations_say():
+    mass = PointMass(0.5, (0.3, -0.2), time_step=0.1)
+    speed = np.array([-0.5, 1.5]) + 0.1 * (np.array([0.4 + 0.3, -1 - 0.2]) - 0.5 * np.array([-0.5, 1.5]))
+    expected = np.concatenate([np.array([1, 2]) + 0.1 * speed, speed])
+    log_probabilities, means = outcomes(mass, vector(1, 2, -0.5, 1.5), vector(0.4, -1))
+    np.testing.assert_allclose(means, expected[None], atol=1e-12)
+    np.testing.assert_array_equal(log_probabilities, [0])
+
+
+def test_a_point_mass_that_is_left_alone_is_carried_along_by_the_wind():
+    """At the end v = wind/friction."""
+    mass = PointMass(0.5, (0.3, -0.2))
+    last, _ = jax.lax.scan(lambda s, _: (mass.outcomes(s, jnp.zeros(2)).means[0], None), jnp.zeros(4), length=400)
+    np.testing.assert_allclose(last[2:], [0.6, -0.4], atol=1e-6)
+
+
+# Obstacles
+
+
+def test_obstacles_stop_moves_or_slow_them():
+    """At the logit ln 3, a place is blocked with probability 3/4."""
+    field = RadialField(jnp.full(2, np.log(3.0)), jnp.asarray([[0.0, 0.0], [4.0, 4.0]]), 1.0)
+    stopping, slowing = (ObstacleMotion(field, LOW, HIGH, NOISE, stops=stops) for stops in (True, False))
+    assert float(stopping.blocked(PLACE)) == pytest.approx(0.75)
+    following = vector(1.4, 0.9)
+    moved, stayed = (stats.norm.pdf(following, mean, NOISE).prod() for mean in (PLACE + STEP, PLACE))
+    expected = np.log(0.25 * moved + 0.75 * stayed)
+    assert float(log_prob(stopping, PLACE, STEP, following)) == pytest.approx(expected, abs=1e-12)
+    slowed = stats.norm.logpdf(following, PLACE + 0.25 * STEP, NOISE).sum()
+    assert float(log_prob(slowing, PLACE, STEP, following)) == pytest.approx(slowed, abs=1e-12)
+
+
+@pytest.mark.parametrize("stops", [True, False])
+def test_obstacles_count_where_a_move_aims(stops):
+    """Walls block at their border too, nobody is held for standing in one, and moves end at the room's border."""
+    motion = ObstacleMotion(WALLS, LOW, HIGH, NOISE, stops=stops)
+
+    def mean(place, step):
+        log_probabilities, means = outcomes(motion, vector(*place), vector(*step))
+        return jnp.exp(log_probabilities) @ means
+
+    np.testing.assert_allclose(mean((1, 1), (1, 1)), [1, 1], atol=1e-4)
+    np.testing.assert_allclose(mean((1, 1), (0.5, 1)), [1.5, 2], atol=1e-4)
+    np.testing.assert_allclose(mean((2.5, 1), (1, 0)), [3.5, 1], atol=1e-4)
+    np.testing.assert_allclose(mean((3.5, 3.5), (1, -9)), [4, 0], atol=1e-4)
+
+
+def test_walls_are_boxes():
+    walls = Walls(low=jnp.asarray([[0.0, 0.0], [2.0, 2.0]]), high=jnp.asarray([[1.0, 1.0], [3.0, 3.0]]))
+    places = jnp.asarray([[0.5, 0.5], [1.0, 1.0], [1.5, 1.5], [2.5, 0.5], [2.5, 2.9]])
+    assert jax.vmap(walls.inside)(places).tolist() == [True, True, False, False, True]
+    assert jax.vmap(walls.logit)(places).tolist() == [12, 12, -12, -12, 12]
+
+
+def test_radial_functions_are_weighted_means_of_the_logits_around():
+    field = radial_field(LOW, HIGH, (3, 2), logit=-1.5)
+    np.testing.assert_allclose(field.centres, [[x, y] for x in (0, 2, 4) for y in (0, 4)])
+    assert float(field.logit(vector(1.3, 9), field.parameters)) == pytest.approx(-1.5)
+    narrow = RadialField(jnp.arange(6.0), field.centres, 0.1)
+    for index, centre in enumerate(narrow.centres):
+        assert float(narrow.logit(centre, narrow.parameters)) == pytest.approx(index)
+    assert float(narrow.logit(vector(0, 2), narrow.parameters)) == pytest.approx(0.5)
+    place, weights = vector(1, 1), np.exp(-np.sum((np.asarray(field.centres) - 1) ** 2, axis=1) / 2 / field.width**2)
+    expected = np.arange(6) @ weights / weights.sum()
+    assert float(field.logit(place, jnp.arange(6.0))) == pytest.approx(expected)
+
+
+def test_a_network_begins_near_its_logit_and_can_learn_any_place():
+    places = jnp.asarray(np.random.default_rng(0).uniform(0, 4, (50, 2)))
+    logits = jax.jit(jax.vmap(lambda place: NETWORK.logit(place, NETWORK.parameters)))(places)
+    np.testing.assert_allclose(logits, 0.5, atol=1)
+    assert (np.abs(look("network, stopping").slope) > 0).all()
+
+
+def test_rooms_and_centres_are_not_learned():
+    """Gradients by anything but the parameters are nothing, so that no optimiser could move the room."""
+    motion = radial(True)
+    slopes = jax.jit(jax.grad(lambda motion: motion.log_prob(PLACE, vector(5, 5), PLACE)))(motion)
+    assert all(np.abs(leaf).max() == 0 for leaf in (slopes.low, slopes.high, slopes.field.centres))
+    assert np.abs(slopes.parameters).max() > 0
+
+
+# Families of one's own
+
+
+def test_a_new_family_is_one_class_with_outcomes():
+    """All of the above holds for it as well; and there is one with a density, which is fitted elsewhere."""
+    gusts = Gusts(jnp.log(vector(0.5, 0.3, 0.2)))
+    found = [float(log_prob(gusts, vector(1), vector(2), vector(x))) for x in (3.1, 4.0, 1.9)]
+    winds, shares = np.array([0, 1, -1]), np.array([0.5, 0.3, 0.2])
+    expected = stats.norm.pdf(np.array([3.1, 4.0, 1.9])[:, None], 3 + winds, 0.3) @ shares
+    np.testing.assert_allclose(np.exp(found), expected, atol=1e-12)
+
+
+# Refusals
+
+
+def refused(make, *, match):
+    with pytest.raises(InputError, match=match):
+        make()
+
+
+@pytest.mark.parametrize("noise", [vector(0.1, 0), vector(-1, 1), vector(np.nan, 1), vector(np.inf, 1)])
+def test_noise_is_above_nothing(noise):
+    match = "field 'noise': expected finite numbers above 0"
+    refused(lambda: LinearGaussian(jnp.eye(2), jnp.eye(2), noise), match=match)
+    refused(lambda: ObstacleMotion(WALLS, LOW, HIGH, noise), match=match)
+    refused(lambda: Pendulum(noise=tuple(noise.tolist())), match=match)
+    refused(lambda: PointMass(noise=(*noise.tolist(), 1.0, 1.0)), match=match)
+
+
+@pytest.mark.parametrize("wrong", [0.0, -1.0, np.nan, np.inf])
+@pytest.mark.parametrize("name", ["gravity", "mass", "length", "time_step"])
+def test_pendulums_refuse(name, wrong):
+    refused(lambda: Pendulum(**{name: wrong}), match=f"field '{name}': expected a finite number above 0, found {wrong}")
+
+
+def test_unknown_constants_are_known_by_name():
+    refused(lambda: Pendulum(unknown=("colour",)), match=r"'unknown': expected some of .*'length'.*, found .*colour")
+
+
+def test_point_masses_refuse():
+    refused(lambda: PointMass(friction=0.0), match="'friction': expected a finite number above 0, found 0")
+    refused(lambda: PointMass(time_step=-0.1), match="'time_step': expected a finite number above 0")
+    refused(lambda: PointMass(wind=(np.nan, 0.0)), match="'parameters': expected finite numbers")
+
+
+def test_linear_dynamics_refuse_what_is_not_finite():
+    refused(lambda: LinearGaussian(jnp.eye(2) * jnp.inf, jnp.eye(2), NOISE), match="'parameters': expected finite")
+
+
+@pytest.mark.parametrize(("low", "high"), [((0, 0), (1, 0)), ((2, 0), (1, 1)), ((0, np.nan), (1, 1))])
+def test_rooms_have_their_corners_in_order(low, high):
+    low, high = vector(*low), vector(*high)
+    match = "field 'low, high': expected corners in order"
+    refused(lambda: ObstacleMotion(WALLS, low, high, NOISE), match=match)
+    refused(lambda: radial_field(low, high, (2, 2)), match=match)
+    refused(lambda: network_field(jax.random.key(0), low, high), match=match)
+
+
+@pytest.mark.parametrize("counts", [(2,), (1, 3), (2, 2, 2), (0, 2)])
+def test_radial_functions_need_two_centres_a_side(counts):
+    refused(lambda: radial_field(LOW, HIGH, counts), match="'counts': expected 2 numbers of at least 2")
+
+
+def test_obstacles_refuse_logits_that_are_not_finite():
+    field = radial_field(LOW, HIGH, (2, 2), logit=np.nan)
+    refused(lambda: ObstacleMotion(field, LOW, HIGH, NOISE), match="'parameters': expected finite numbers")
