@@ -73,3 +73,20 @@ def test_the_problem_for_other_planners_is_the_same(script):
     goal = int(problem.world.goals[0])
     assert set(given["after"][given["state"] == goal]) == {goal}
     assert (given["reward"][goal] == 0).all()
+
+
+def test_noise_is_told_from_the_gradient(script):
+    """Two places whose gradients are (3, 4) and (5, 0), under noise of 1 and 2 a component."""
+    gradients = np.array([[3.0, 4.0], [5.0, 0.0]])[:, None] + np.random.default_rng(0).normal(
+        0, [[[1.0]], [[2.0]]], size=(2, 20_000, 2)
+    )
+    noise = script("rollout_noise").noise_of(gradients, 1.0)
+    assert noise.mean == pytest.approx([4.0, 2.0], abs=5 * noise.error.max())
+    assert noise.error == pytest.approx(np.sqrt(2.5 / 40_000), rel=0.05)
+    assert noise.deviation**2 == pytest.approx(5.0, rel=0.05)
+    assert noise.square == pytest.approx(25.0, rel=0.05)
+    best = noise._replace(deviation=noise.deviation / 10)
+    records = script("rollouts").records_of("a", 5, {"score": noise, "pathwise": best})
+    assert records[0]["relative"] == pytest.approx(10.0)
+    assert records[0]["roll_outs_needed"] == pytest.approx(100 * 5 / 25, rel=0.1)
+    assert [record["apart"] for record in records] == [0.0, 0.0]

@@ -64,6 +64,7 @@ def entropies(pi):
     return -(pi * jnp.log(pi)).sum(axis=-1)
 
 
+@eqx.filter_jit
 def exact_values(world: Table, parameters, pi, horizon, bonus: jax.Array | float = 0.0):
     """V[task, state] and Q[task, state, action] of a fixed policy that looks so far; acting adds `bonus` to V."""
     model, tasks = world.dynamics.model.with_parameters(parameters), world.tasks.task

@@ -35,7 +35,7 @@ WALKERS, CENTRES = 24, 16
 """People to each goal, and centres of basis functions a side."""
 BETA, PRIOR_MEAN, PRIOR_VARIANCE = 4.0, -2.5, 20.0
 PLANNER = Planner(horizon=24, learning_rate=0.02)
-SCHEDULE = Schedule(iterations=300, rehearsals=80, learning_rate=0.15)
+SCHEDULE = Schedule(iterations=300, rehearsals=80, learning_rate=0.15, drift=0.5, lag=0.2)
 _WIDTH = 48
 _TRIPS = (((1.0, 2.0), 1), ((9.0, 3.0), 2), ((3.0, 4.0), 3), ((7.0, 1.0), 4))
 """Where planned walks start, and which goals they have."""

@@ -37,7 +37,7 @@ _PANEL = 2.9
 _DOTS_PER_INCH = 150
 
 
-Places = Integer[np.ndarray, " places"] | Float[np.ndarray, "places 2"]
+Places = Integer[np.ndarray, " _"] | Float[np.ndarray, "_ 2"]
 """States, or positions in metres."""
 
 

@@ -32,7 +32,7 @@ def figure_belief(
     learned.axhline(believed, color=_BELIEVED, linestyle="--", label="what people believe")
     learned.axhline(real, color=_REAL, linestyle=":", label="what is so")
     learned.set(title="Gravity", xlabel="iteration", ylabel="m/s²")
-    learned.set_ylim(0.8 * min(real, believed, way.min()), 1.15 * max(real, believed, way.max()))
+    learned.set_ylim(0.6 * min(real, believed, way.min()), 1.15 * max(real, believed, way.max()))
     learned.legend(frameon=False, loc="lower right")
     for axes in (swings, learned):
         axes.grid(color="0.92")
