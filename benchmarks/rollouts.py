@@ -19,7 +19,8 @@ unbiased, so this should hardly be above 3, unless a few rare roll-outs make up 
 `rollout_noise.py`: linear dynamics that turn by 0.3 and shrink to 0.9 or grow to 1.05 a move, with a Gaussian policy
 (∇ by six parameters); a pendulum held where it hangs, or upright, with five torques (∇ by the logarithm of gravity).
 
-Everything is compiled before it is timed, takes turns in one process, and medians are told.
+Everything is compiled before it is timed, takes turns in one process, and medians are told. With `--quick` the compiler
+hardly optimises, so its times say nothing.
 
 Records (`--json`): for speed `part`, `name`, `estimator`, `roll_outs` (a batch), `horizon`, `steps_per_second`,
 `update_seconds`, `roll_outs_seconds`, `model_seconds`, `policy_seconds`, `critic_seconds`; for noise `part`, `name`,
@@ -32,6 +33,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 
 from measuring import argument_parser, main, milliseconds, note, number, print_table, write_records
@@ -136,8 +138,9 @@ def print_noise(records: Sequence[Record]) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Measures, prints and writes what the arguments ask for."""
     if arguments.quick:
+        jax.config.update("jax_disable_most_optimizations", True)
         arguments.cases, arguments.problems, arguments.horizons = CASES[-1:], PROBLEMS[:1], [10]
-        arguments.turns, arguments.iterations, arguments.steps, arguments.samples = 2, 3, 20, 64
+        arguments.turns, arguments.iterations, arguments.steps, arguments.samples = 1, 1, 10, 64
     records: list[Record] = []
     if arguments.part != "noise":
         speed = [timed(name, arguments.turns, arguments.iterations) for name in arguments.cases]
