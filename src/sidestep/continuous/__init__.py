@@ -21,7 +21,7 @@ from sidestep.continuous.obstacles import (
 from sidestep.continuous.physical import Pendulum, PointMass
 from sidestep.continuous.planning import Plan, Planner, Planning, PlanProgress, plan
 from sidestep.continuous.policies import FinitePolicy, GaussianPolicy, Policy, finite_policy, gaussian_policy
-from sidestep.continuous.rollouts import RollOut, action_values, returns, roll_out, roll_outs, to_come
+from sidestep.continuous.rollouts import RollOut, returns, roll_out, roll_outs, said, to_come
 from sidestep.continuous.simulation import simulate
 from sidestep.continuous.tasks import ContinuousTask, Hold, Reach, Regulate, TableTask, reach, stack
 
@@ -56,7 +56,6 @@ __all__ = [
     "TableDynamics",
     "TableTask",
     "Walls",
-    "action_values",
     "critic",
     "finite_policy",
     "fit",
@@ -69,6 +68,7 @@ __all__ = [
     "returns",
     "roll_out",
     "roll_outs",
+    "said",
     "score_surrogate",
     "simulate",
     "stack",

@@ -14,6 +14,7 @@ With one outcome, s′ = m_θ(s, a) + noise · ε, so that the noise can be held
 """
 
 import abc
+from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
 import equinox as eqx
@@ -29,6 +30,7 @@ from sidestep.tabular.models import TransitionModel
 
 State = Shaped[Array, "*state"]
 Action = Shaped[Array, "*action"]
+Value = Callable[[State], Float[Scalar, ""]]
 
 _Family = TypeVar("_Family", bound="Dynamics")
 
@@ -57,6 +59,15 @@ class Dynamics(eqx.Module):
     @abc.abstractmethod
     def log_prob(self, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
         """ln T_θ(s, a, s′), in nats."""
+
+    def surprise(self, value: Value, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
+        """What a function of the next state is beyond what was to be expected: of this function, or of one like it.
+
+        It averages to nothing over next states, and is taken off what roll-outs say, to make it less noisy. 0, unless a
+        family knows better.
+        """
+        del state, action, next_state
+        return jnp.zeros((), jnp.result_type(float))
 
     def with_parameters(self: _Family, parameters: PyTree[Float[Array, "..."]]) -> _Family:
         """The same family at another θ."""
@@ -106,6 +117,17 @@ class GaussianDynamics(Dynamics):
         log_probabilities, means = self.outcomes(state, action)
         each = norm.logpdf(next_state, means, self.noise).sum(axis=-1)
         return jax.nn.logsumexp(log_probabilities + each)
+
+    def surprise(self, value: Value, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
+        """Of the function made linear around each outcome, v_k(s′) = v(m_k) + ∇v(m_k)·(s′ − m_k).
+
+        That is Σ_k P(k | s′) v_k(s′) − Σ_k p_k v(m_k).
+        """
+        log_probabilities, means = self.outcomes(state, action)
+        each = norm.logpdf(next_state, means, self.noise).sum(axis=-1)
+        values, slopes = jax.vmap(jax.value_and_grad(value))(means)
+        there = values + jnp.sum(slopes * (next_state - means), axis=-1)
+        return jax.nn.softmax(log_probabilities + each) @ there - jnp.exp(log_probabilities) @ values
 
 
 class LinearGaussian(GaussianDynamics):
@@ -168,6 +190,11 @@ class TableDynamics(Dynamics):
         same = self.model.graph.successors[state, action] == next_state
         log_probabilities = self._log_probabilities(state, action)
         return jax.nn.logsumexp(jnp.where(same, log_probabilities, -jnp.inf))
+
+    def surprise(self, value: Value, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
+        """Of the function itself."""
+        successors = self.model.graph.successors[state, action].astype(next_state.dtype)
+        return value(next_state) - jnp.exp(self._log_probabilities(state, action)) @ jax.vmap(value)(successors)
 
 
 def certain(mean: Float[Array, " dimensions"]) -> Outcomes:

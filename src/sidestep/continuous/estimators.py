@@ -18,6 +18,7 @@ Both are written as *surrogates*, numbers whose derivative by θ is the estimate
 from collections.abc import Callable
 from typing import Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree, Shaped
@@ -25,7 +26,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree, Shaped
 from sidestep.continuous.critics import Critic
 from sidestep.continuous.dynamics import Dynamics
 from sidestep.continuous.policies import Policy
-from sidestep.continuous.rollouts import RollOut, roll_outs, spread_over, to_come
+from sidestep.continuous.rollouts import RollOut, roll_outs, said, spread_over
 from sidestep.continuous.tasks import ContinuousTask
 from sidestep.errors import InputError
 from sidestep.tabular.backups import Behavior
@@ -34,11 +35,6 @@ Estimator = Literal["score", "pathwise"]
 
 Weigh = Callable[[Float[Array, "places options"]], Float[Array, "places options"]]
 """What ∇Q of every option counts, by estimates of Q."""
-
-
-def said(rolled: RollOut, discount: Float[Array, "*#batch"]) -> Float[Array, "*batch moves"]:
-    """Q̂_i = R_i + γ W_{i+1}, for every move of roll-outs."""
-    return rolled.rewards[..., :-1] + discount[..., None] * to_come(rolled, discount)[..., 1:]
 
 
 def everywhere(function: Callable, tasks: ContinuousTask, rolled: RollOut, *more: Array) -> Array:
@@ -68,6 +64,22 @@ def guesses(critic: Critic, tasks: ContinuousTask, rolled: RollOut) -> Float[Arr
     return everywhere(guess, tasks, rolled, shares_left(rolled))
 
 
+def surprised(dynamics: Dynamics, policy: Policy, tasks: ContinuousTask, rolled: RollOut, critic: Critic) -> RollOut:
+    """Roll-outs with the surprises that a critic sees in them; no gradients pass through these."""
+    left_after = shares_left(rolled) - 1 / rolled.acting.shape[-1]
+
+    def surprise(task: ContinuousTask, state: Array, choice: Array, following: Array, left: Array) -> Array:
+        def value(state: Array) -> Array:
+            going_on = jnp.where(left > 0.5 / rolled.acting.shape[-1], critic(task.features(state), left), 0.0)
+            return jnp.where(task.terminal(state), task.final_reward(state), going_on)
+
+        return task.discount * dynamics.surprise(value, state, policy.action(choice), following)
+
+    seen = everywhere(surprise, tasks, rolled, rolled.choices, rolled.following, left_after)
+    surprises = jax.lax.stop_gradient(jnp.where(rolled.acting, seen, 0.0))
+    return eqx.tree_at(lambda rolled: rolled.surprises, rolled, surprises.astype(rolled.rewards.dtype))
+
+
 def shares_left(rolled: RollOut) -> Float[Array, "*batch moves"]:
     """1 − i/τ for every move."""
     moves = rolled.acting.shape[-1]
@@ -94,7 +106,9 @@ def score_surrogate(
     """Numbers whose derivative by θ is the score estimate of each roll-out."""
     discount = spread_over(tasks, rolled).discount
     expected = values_expected(critic, tasks, rolled)
-    credit = _powers(discount, rolled) * jnp.where(rolled.acting, said(rolled, discount) - expected, 0.0)
+    # what a move led to is what its own score is about: its surprise belongs to the credit
+    beyond = said(rolled, discount) + rolled.surprises - expected
+    credit = _powers(discount, rolled) * jnp.where(rolled.acting, beyond, 0.0)
 
     def log_prob(task: ContinuousTask, state: Array, choice: Array, following: Array) -> Array:
         del task
@@ -148,6 +162,8 @@ def value_gradient(
         moved = dynamics.with_parameters(parameters)
         along = moved if estimator == "pathwise" else dynamics
         rolled = roll_outs(along, policy, tasks, behavior, key, states, horizon, choices, samples)
+        if critic is not None:
+            rolled = surprised(dynamics, policy, tasks, rolled, critic)
         if estimator == "pathwise":
             surrogates = path_surrogate(policy, tasks, rolled, critic)
         else:

@@ -26,10 +26,10 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, Shaped
 
 from sidestep.continuous.demonstrations import check_choices
 from sidestep.continuous.dynamics import Dynamics, check_finite
-from sidestep.continuous.estimators import Estimator, check_estimator, said, value_gradient
+from sidestep.continuous.estimators import Estimator, check_estimator, value_gradient
 from sidestep.continuous.planning import Planner, Planning, PlanProgress, check_places, check_planner, plan
 from sidestep.continuous.policies import FinitePolicy, Policy
-from sidestep.continuous.rollouts import spread_over
+from sidestep.continuous.rollouts import said, spread_over
 from sidestep.continuous.tasks import ContinuousTask, check_tasks, task_at
 from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError, NotConverged

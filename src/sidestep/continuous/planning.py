@@ -24,13 +24,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, Shaped
 
 from sidestep.continuous.critics import Critic, critic
 from sidestep.continuous.dynamics import Dynamics
-from sidestep.continuous.estimators import advantages, everywhere, guesses, said, shares_left, values_expected
+from sidestep.continuous.estimators import advantages, everywhere, shares_left, surprised, values_expected
 from sidestep.continuous.policies import FinitePolicy, Policy
-from sidestep.continuous.rollouts import RollOut, returns, roll_outs, spread_over, to_come
+from sidestep.continuous.rollouts import RollOut, returns, roll_outs, said, spread_over, to_come
 from sidestep.continuous.tasks import ContinuousTask, check_tasks, task_at
 from sidestep.errors import InputError, NotConverged
 from sidestep.tabular.backups import Behavior, HardMax
@@ -74,6 +74,7 @@ class Planner(eqx.Module):
     - `options`: how many choices are tried at a place where actions are vectors; from a finite set, all are.
     - `learning_rate`, `critic_rate`: of Adam.
     - `critic_width`: how many units each hidden layer of the critic has.
+    - `critic_steps`: in how many parts the moves of a batch are dealt out, each for a step of the critic.
     """
 
     horizon: int = eqx.field(static=True)
@@ -83,6 +84,7 @@ class Planner(eqx.Module):
     learning_rate: float = eqx.field(default=3e-3, static=True)
     critic_rate: float = eqx.field(default=3e-3, static=True)
     critic_width: int = eqx.field(default=64, static=True)
+    critic_steps: int = eqx.field(default=8, static=True)
 
     def begin(
         self,
@@ -140,13 +142,31 @@ class Planner(eqx.Module):
         policy, guess = planning.policy, planning.critic
         gradient = _policy_gradient(policy, guess, tasks, rolled, shares)
         step, policy_moments = self._adam(self.learning_rate).update(gradient, planning.policy_moments)
-        slope = eqx.filter_grad(_critic_loss)(guess, tasks, rolled)
-        critic_step, critic_moments = self._adam(self.critic_rate).update(slope, planning.critic_moments)
+        guess, critic_moments = self._followed(guess, planning.critic_moments, tasks, rolled)
         progress = _progress(policy, tasks, behavior, rolled, shares, optax.tree.norm(gradient))
-        improved = Planning(
-            eqx.apply_updates(policy, step), eqx.apply_updates(guess, critic_step), policy_moments, critic_moments
-        )
-        return improved, progress
+        return Planning(eqx.apply_updates(policy, step), guess, policy_moments, critic_moments), progress
+
+    def _followed(
+        self, guess: Critic, moments: PyTree, tasks: ContinuousTask, rolled: RollOut
+    ) -> tuple[Critic, PyTree]:
+        """A critic after steps towards what was to come, each by a part of the moves.
+
+        First moves are left out, for their choices were not the policy's.
+        """
+        seen = everywhere(lambda task, state: task.features(state), tasks, rolled)
+        worths = to_come(rolled, spread_over(tasks, rolled).discount)[..., :-1]
+        moves = seen, shares_left(rolled), worths, rolled.acting
+        parts = jax.tree.map(lambda leaf: _dealt(leaf[:, :, :, 1:], self.critic_steps), moves)
+        learned, fixed = eqx.partition(guess, eqx.is_inexact_array)
+
+        def step(carry: tuple[PyTree, PyTree], part: tuple[Array, Array, Array, Array]) -> tuple[tuple, None]:
+            learned, moments = carry
+            slope = jax.grad(lambda learned: _critic_loss(eqx.combine(learned, fixed), *part))(learned)
+            change, moments = self._adam(self.critic_rate).update(slope, moments)
+            return (optax.apply_updates(learned, change), moments), None
+
+        (learned, moments), _ = jax.lax.scan(step, (learned, moments), parts)
+        return eqx.combine(learned, fixed), moments
 
     def _adam(self, rate: float) -> optax.GradientTransformation:
         return optax.adam(rate)
@@ -229,6 +249,7 @@ def _plan_step(
     own, here = task_at(tasks, places), states[places]
     choices, shares = planner.tried(drawing, planning.policy, own, here)
     rolled = _rolled(planner, dynamics, planning.policy, own, behavior, rolling, here, choices)
+    rolled = surprised(dynamics, planning.policy, own, rolled, planning.critic)
     return planner.improve(planning, own, behavior, rolled, shares)
 
 
@@ -272,12 +293,22 @@ def _policy_gradient(
     return eqx.filter_grad(loss)(policy)
 
 
-def _critic_loss(guess: Critic, tasks: ContinuousTask, rolled: RollOut) -> Float[Array, ""]:
-    """The mean squared error over all moves but the first, whose choice was not the policy's."""
-    worths = to_come(rolled, spread_over(tasks, rolled).discount)[..., 1:-1]
-    guessed = guesses(guess, tasks, rolled)[..., 1:]
-    acting = rolled.acting[..., 1:]
-    squares = jnp.where(acting, (guessed - worths) ** 2, 0.0) / jax.lax.stop_gradient(guess.spread) ** 2
+def _dealt(leaf: Shaped[Array, "places options samples moves *rest"], parts: int) -> Shaped[Array, "parts each *rest"]:
+    """All moves, dealt out like cards; what is left over is left out."""
+    flat = leaf.reshape(-1, *leaf.shape[4:])
+    each = len(flat) // parts
+    return jnp.swapaxes(flat[: each * parts].reshape(each, parts, *leaf.shape[4:]), 0, 1)
+
+
+def _critic_loss(
+    guess: Critic,
+    seen: Float[Array, "moves features"],
+    left: Float[Array, " moves"],
+    worths: Float[Array, " moves"],
+    acting: Bool[Array, " moves"],
+) -> Float[Array, ""]:
+    """The mean squared error, in units of the critic's spread."""
+    squares = jnp.where(acting, (jax.vmap(guess)(seen, left) - worths) ** 2, 0.0) / guess.spread**2
     return squares.sum() / jnp.maximum(acting.sum(), 1)
 
 
@@ -322,7 +353,7 @@ def _lag(
 
 def check_planner(planner: Planner) -> None:
     """Raises `InputError` for settings below 1, fewer than 2 samples (halves are compared), or rates not above 0."""
-    for name in ("horizon", "places", "samples", "options", "critic_width"):
+    for name in ("horizon", "places", "samples", "options", "critic_width", "critic_steps"):
         least = 2 if name == "samples" else 1
         if getattr(planner, name) < least:
             raise InputError(f"expected at least {least}, found {getattr(planner, name)}", field=name)

@@ -3,13 +3,17 @@
 Move i = 0…τ−1 takes action a_i in state s_i, pays R(s_i, a_i) and leads to s_{i+1}; a terminal state pays its final
 reward once and nothing happens after. The worth of what is *to come* from state s_i is
 
-    W_i = R_i + b_i + γ W_{i+1},        W_τ = R_τ (a final reward, if s_τ is the first terminal state),
+    W_i = R_i + b_i − z_i + γ W_{i+1},        W_τ = R_τ (a final reward, if s_τ is the first terminal state),
 
 where b_i is what the people's backup adds to the mean of its actions' values (`Backup.bonus`: the entropy over β for
 the log-sum-exp, nothing for the Boltzmann average and the hard maximum), less q_λ(s_i, a_i)/β, what the policy's own
 advantages expect of this choice beyond the mean. The latter averages to nothing, whatever the policy, and takes off
 most of the noise of drawing choices where the policy is near π ∝ exp βQ^π. (For the log-sum-exp, b_i is so
-−ln π(a_i | s_i)/β.) Then E[R_0 + γ W_1] is Q^π(s_0, a_0), and E[W_0] = V^π(s_0), of people who look τ moves ahead.
+−ln π(a_i | s_i)/β.) The *surprise* z_i = γ (V_w(s_{i+1}) − E V_w(s_{i+1})), by a critic V_w and the dynamics, does the
+same for the noise of what an action leads to; it averages to nothing too, however wrong the critic. What a roll-out
+says of Q^π(s_i, a_i), of people who look τ moves ahead, is then
+
+    Q̂_i = R_i − z_i + γ W_{i+1},        and E[W_0] = V^π(s_0).
 """
 
 import equinox as eqx
@@ -30,6 +34,7 @@ class RollOut(eqx.Module):
     - `choices`: those of the policy; `choices[0]` may have been given.
     - `rewards`: R_0…R_τ, 0 after the end.
     - `bonuses`: b_0…b_{τ−1}, 0 after the end.
+    - `surprises`: z_0…z_{τ−1}, 0 until a critic says what was to be expected (`estimators.surprised`).
     - `acting`: whether an action was taken in s_i.
     """
 
@@ -37,6 +42,7 @@ class RollOut(eqx.Module):
     choices: Shaped[Array, "..."]
     rewards: Float[Array, "*batch payments"]
     bonuses: Float[Array, "*batch moves"]
+    surprises: Float[Array, "*batch moves"]
     acting: Bool[Array, "*batch moves"]
 
     @property
@@ -92,8 +98,14 @@ def roll_out(
     states, choices, rewards, bonuses, acting = passed
     end, _, over = last
     pays = jnp.where(task.terminal(end) & ~over, task.final_reward(end), 0.0).astype(rewards.dtype)
+    bonuses = bonuses.astype(rewards.dtype)
     return RollOut(
-        jnp.concatenate([states, end[None]]), choices, jnp.append(rewards, pays), bonuses.astype(rewards.dtype), acting
+        jnp.concatenate([states, end[None]]),
+        choices,
+        jnp.append(rewards, pays),
+        bonuses,
+        jnp.zeros_like(bonuses),
+        acting,
     )
 
 
@@ -131,15 +143,16 @@ def to_come(rolled: RollOut, discount: Float[Array, "*#batch"]) -> Float[Array, 
         worth = now + discount * after
         return worth, worth
 
-    gains = rolled.rewards[..., :-1] + rolled.bonuses
+    gains = rolled.rewards[..., :-1] + rolled.bonuses - rolled.surprises
     last = rolled.rewards[..., -1]
     _, worths = jax.lax.scan(earlier, last, jnp.moveaxis(gains, -1, 0), reverse=True)
     return jnp.concatenate([jnp.moveaxis(worths, 0, -1), last[..., None]], axis=-1)
 
 
-def action_values(rolled: RollOut, discount: Float[Array, "*#batch"]) -> Float[Array, "*batch"]:
-    """What each roll-out says of Q(s_0, a_0): R_0 + γ W_1."""
-    return rolled.rewards[..., 0] + discount * to_come(rolled, discount)[..., 1]
+def said(rolled: RollOut, discount: Float[Array, "*#batch"]) -> Float[Array, "*batch moves"]:
+    """Q̂_i = R_i − z_i + γ W_{i+1}, what roll-outs say of Q^π(s_i, a_i), for every move."""
+    after = to_come(rolled, discount)[..., 1:]
+    return rolled.rewards[..., :-1] - rolled.surprises + discount[..., None] * after
 
 
 def returns(rolled: RollOut, discount: Float[Array, "*#batch"]) -> Float[Array, "*batch"]:
