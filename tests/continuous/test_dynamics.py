@@ -50,6 +50,7 @@ class Look(NamedTuple):
 
     - `samples`: next states. `log_probs`: of `points`.
     - `slope`, `differences`: the gradient by all parameters of a sample's log-probability, and by differences.
+    - `surprises`: of the points, in a function that is not linear. `linear`: in one that is, of samples.
     - `moved`: by how much a sample moves with the parameters while its key is held.
     """
 
@@ -58,6 +59,8 @@ class Look(NamedTuple):
     log_probs: np.ndarray
     slope: np.ndarray
     differences: np.ndarray
+    surprises: np.ndarray
+    linear: np.ndarray
     moved: np.ndarray
 
 
@@ -77,13 +80,27 @@ def look(name) -> Look:
         log_probs = jax.vmap(dynamics.log_prob, (None, None, 0))(state, action, points)
         slope = jax.grad(lambda flat: at(flat).log_prob(state, action, samples[0]))(flat)
         beside = jax.vmap(lambda flat: at(flat).log_prob(state, action, samples[0]))(flat + steps)
+        surprises = jax.vmap(dynamics.surprise, (None, None, None, 0))(curved, state, action, points)
+        linear = jax.vmap(dynamics.surprise, (None, None, None, 0))(straight, state, action, samples)
         moved = at(flat + 0.1).sample(keys[0], state, action) - samples[0]
-        return samples, log_probs, slope, beside, moved
+        return samples, log_probs, slope, beside, surprises, linear, moved
 
     keys = jax.random.split(jax.random.key(0, impl="unsafe_rbg"), SAMPLES)  # random enough, and compiles in no time
-    samples, log_probs, slope, beside, moved = seen(keys, jnp.asarray(points), jnp.concatenate([steps, -steps]))
+    samples, log_probs, slope, beside, *surprises, moved = seen(
+        keys, jnp.asarray(points), jnp.concatenate([steps, -steps])
+    )
     differences = (beside[: len(flat)] - beside[len(flat) :]) / 2e-5
-    return Look(*map(np.asarray, (samples, points, log_probs, slope, differences, moved)))
+    return Look(*map(np.asarray, (samples, points, log_probs, slope, differences, *surprises, moved)))
+
+
+def curved(state):
+    """A function of states that is not linear."""
+    return jnp.sum(jnp.sin(2.0 * state) + state**2)
+
+
+def straight(state):
+    """A function of states that is linear."""
+    return jnp.sum(jnp.arange(1, 1 + jnp.size(state)) * state.ravel()) + 3.0
 
 
 def around(dynamics, state, action):
@@ -107,6 +124,23 @@ def test_densities_add_up_to_one_and_samples_have_their_moments(name):
     spread, away = np.sqrt(np.diag(covariance)), found.samples - mean
     np.testing.assert_allclose(away.mean(axis=0) / spread, 0, atol=0.03)
     np.testing.assert_allclose((away.T @ away / SAMPLES - covariance) / np.outer(spread, spread), 0, atol=0.05)
+
+
+@pytest.mark.parametrize("name", [*GAUSSIAN, "table"])
+def test_surprises_average_to_nothing_and_are_what_was_not_expected(name):
+    found = look(name)
+    volume = 1.0 if name == "table" else np.asarray(GAUSSIAN[name].dynamics.noise).prod()
+    shares = np.exp(found.log_probs) * volume
+    assert shares @ found.surprises == pytest.approx(0, abs=1e-6)
+    assert shares @ found.surprises**2 > 1e-4
+    if EVERY[name].dynamics.reparameterised or name == "table":
+        expected = found.samples.reshape(SAMPLES, -1) @ np.arange(1, 1 + found.samples[0].size)
+        mean = shares @ (found.points.reshape(len(shares), -1) @ np.arange(1, 1 + found.samples[0].size))
+        np.testing.assert_allclose(found.linear, expected - mean, atol=1e-6)
+
+
+def test_a_family_that_knows_no_better_is_never_surprised():
+    assert not look("Laplace").surprises.any()
 
 
 def test_a_table_is_drawn_as_often_as_it_says():

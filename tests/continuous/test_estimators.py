@@ -21,6 +21,7 @@ from small_worlds import (
     entropies,
     exact_values,
     linear,
+    peoples_policy,
     policy_table,
     table,
     with_logits,
@@ -28,8 +29,9 @@ from small_worlds import (
 
 from sidestep.continuous.critics import Critic
 from sidestep.continuous.dynamics import LinearGaussian
-from sidestep.continuous.estimators import check_estimator, value_gradient
+from sidestep.continuous.estimators import check_estimator, surprised, value_gradient
 from sidestep.continuous.policies import FinitePolicy, Scaled
+from sidestep.continuous.rollouts import roll_outs, said, spread_over
 from sidestep.continuous.tasks import task_at
 from sidestep.errors import InputError
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
@@ -155,6 +157,23 @@ def test_a_good_critic_makes_score_estimates_of_people_s_own_policy_less_noisy()
         drawn(4, MANY, world, SOFT, EVERYWHERE, WEIGHTS, critic=critic) for critic in (None, critic_of(values))
     )
     assert knowing.var(axis=0).sum() < 0.5 * guessing.var(axis=0).sum()
+
+
+def test_a_critic_that_knows_all_takes_the_noise_off_roll_outs():
+    pi = peoples_policy(TABLE, SOFT)
+    values, q = exact_values(TABLE, TABLE.dynamics.parameters, pi, 40, entropies(pi) / BETA)
+    policy, tasks = with_logits(jnp.log(pi)), task_at(TABLE.tasks, WHICH)
+
+    @eqx.filter_jit
+    def seen(critic):
+        rolled = roll_outs(TABLE.dynamics, policy, tasks, SOFT, jax.random.key(0), PLACES, 40, EVERYWHERE.choices, 20)
+        known = surprised(TABLE.dynamics, policy, tasks, rolled, critic)
+        discount = spread_over(tasks, rolled).discount
+        return [said(each, discount)[..., 0] for each in (rolled, known)]
+
+    plain, known = seen(critic_of(values))
+    assert plain.std(axis=-1).max() > 0.1
+    np.testing.assert_allclose(known, np.broadcast_to(q[WHICH, PLACES][..., None], known.shape), atol=1e-3)
 
 
 def test_the_noise_of_weights_is_not_that_of_the_gradients_they_weigh():

@@ -115,8 +115,9 @@ def optimal_control(task, dynamics):
 def test_a_gaussian_policy_becomes_that_of_maximum_entropy_control():
     dynamics, tasks, _ = linear(goals=((0.0, 0.0),))
     starts = jax.random.normal(jax.random.key(1), (256, 2))
-    rates = {"learning_rate": 0.015, "critic_rate": 0.02}
-    planner = Planner(horizon=12, places=16, samples=2, options=16, critic_width=8, **rates)
+    planner = Planner(
+        horizon=12, places=16, samples=2, options=16, critic_width=8, learning_rate=0.015, critic_rate=0.02
+    )
     blank = gaussian_policy(jax.random.key(2), 1, starts, depth=0)
     made = plan(dynamics, tasks, SOFT, blank, starts, jnp.zeros(256, int), planner, steps=250)
     gain, spread = optimal_control(task_at(tasks, 0), dynamics)
@@ -183,8 +184,9 @@ def test_a_warm_start_begins_where_the_former_plan_ended(found):
     again = planned(SOFT, warm=former.planning, steps=2)
     entropy = entropies(policy_table(former.policy))[WHICH, PLACES].mean()
     assert again.history[0].entropy == pytest.approx(float(entropy), rel=1e-9)
-    counts = [plan.planning.policy_moments[0].count for plan in (former, again)]
-    assert counts == [300, 302]
+    for moments, each in (("policy_moments", 1), ("critic_moments", PLANNER.critic_steps)):
+        counts = [getattr(plan.planning, moments)[0].count for plan in (former, again)]
+        assert counts == [300 * each, 302 * each]
     before, after = (ravel_pytree(eqx.filter(plan.policy, eqx.is_inexact_array))[0] for plan in (former, again))
     assert 0 < np.abs(after - before).max() < 3 * PLANNER.learning_rate
 
@@ -210,7 +212,14 @@ def test_critics_begin_at_the_mean_of_what_is_to_come(begun):
 
 @pytest.mark.parametrize(
     ("name", "value", "least"),
-    [("horizon", 0, 1), ("places", 0, 1), ("samples", 1, 2), ("options", 0, 1), ("critic_width", 0, 1)],
+    [
+        ("horizon", 0, 1),
+        ("places", 0, 1),
+        ("samples", 1, 2),
+        ("options", 0, 1),
+        ("critic_width", 0, 1),
+        ("critic_steps", 0, 1),
+    ],
 )
 def test_settings_that_are_too_small_are_refused(name, value, least, begun):
     planner = Planner(**{"horizon": 2, name: value})

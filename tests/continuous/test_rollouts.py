@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_worlds import ACTIONS, ENDS, PLACES, WHICH, entropies, exact_values, policy_table, table
 
-from sidestep.continuous.rollouts import RollOut, action_values, returns, roll_out, roll_outs, to_come
+from sidestep.continuous.rollouts import RollOut, returns, roll_out, roll_outs, said, to_come
 from sidestep.continuous.tasks import task_at
 from sidestep.tabular.backups import Behavior, LogSumExp
 
@@ -44,6 +44,7 @@ class Plain(NamedTuple):
     choices: np.ndarray
     rewards: np.ndarray
     bonuses: np.ndarray
+    surprises: np.ndarray
     acting: np.ndarray
 
 
@@ -88,16 +89,18 @@ def test_every_action_pays_until_the_end_pays_once(rolled):
 def test_what_is_to_come_is_a_plain_sum(rolled):
     few = jax.tree.map(lambda leaf: leaf[:2, :, :20], rolled)
     discounts = jnp.asarray([0.8, 1.0])[:, None, None]
-    found = [np.asarray(worth(few, discounts)) for worth in (to_come, returns, action_values)]
+    few = eqx.tree_at(lambda few: few.surprises, few, np.random.default_rng(0).normal(size=few.bonuses.shape))
+    found = [np.asarray(worth(few, discounts)) for worth in (to_come, returns, said)]
     found = [part.reshape(-1, *part.shape[3:]) for part in found]
     plain = one_by_one(few)
     for index, each in enumerate(plain):
         discount = 0.8 if index < len(plain) / 2 else 1.0
         worths = [each.rewards[HORIZON]]
         for move in reversed(range(HORIZON)):
-            worths.insert(0, each.rewards[move] + each.bonuses[move] + discount * worths[0])
+            gain = each.rewards[move] + each.bonuses[move] - each.surprises[move]
+            worths.insert(0, gain + discount * worths[0])
         earned = sum(discount**move * reward for move, reward in enumerate(each.rewards))
-        expected = worths, earned, each.rewards[0] + discount * worths[1]
+        expected = worths, earned, np.array(worths[:-1]) - each.bonuses
         for part, number in zip(found, expected, strict=True):
             np.testing.assert_allclose(part[index], number, rtol=1e-12, atol=1e-12)
 
@@ -105,7 +108,7 @@ def test_what_is_to_come_is_a_plain_sum(rolled):
 def test_roll_outs_are_worth_on_average_what_actions_are(rolled):
     _, q = exact_values(WORLD, WORLD.dynamics.parameters, PI, HORIZON, BONUS)
     discounts = WORLD.tasks.discount[OWN][:, None, None]
-    found = np.asarray(action_values(rolled, discounts))[: len(PLACES), :ACTIONS]
+    found = np.asarray(said(rolled, discounts))[: len(PLACES), :ACTIONS, :, 0]
     error = found.std(axis=-1) / np.sqrt(SAMPLES)
     assert error.max() < 0.2
     np.testing.assert_array_less(np.abs(found.mean(axis=-1) - np.asarray(q)[WHICH, PLACES]), 3 * error)

@@ -66,7 +66,7 @@ class Dynamics(eqx.Module):
         It averages to nothing over next states, and is taken off what roll-outs say, to make it less noisy. 0, unless a
         family knows better.
         """
-        del state, action, next_state
+        del value, state, action, next_state
         return jnp.zeros((), jnp.result_type(float))
 
     def with_parameters(self: _Family, parameters: PyTree[Float[Array, "..."]]) -> _Family:

@@ -82,7 +82,7 @@ class Planner(eqx.Module):
     samples: int = eqx.field(default=4, static=True)
     options: int = eqx.field(default=8, static=True)
     learning_rate: float = eqx.field(default=3e-3, static=True)
-    critic_rate: float = eqx.field(default=3e-3, static=True)
+    critic_rate: float = eqx.field(default=1e-2, static=True)
     critic_width: int = eqx.field(default=64, static=True)
     critic_steps: int = eqx.field(default=8, static=True)
 

@@ -125,13 +125,13 @@ def run(folder: Path, seed: int = 0, report: Report = lambda _: None) -> dict[st
     blocked, blind = blocked_in(found.dynamics, world), blocked_in(without.dynamics, world)
     report("planning in the learned room")
     trips = _trips(world, found.dynamics, seed)
-    by_transitions = scores(blind, world)
+    by_transitions, walks = scores(blind, world), WALKERS * len(world.tasks)
     summary = {
         "command": "experiment room",
         "seed": seed,
         **scores(blocked, world)._asdict(),
         "transitions_only": by_transitions._asdict(),
-        "walks": WALKERS * len(world.tasks),
+        "walks": walks,
         "moves": len(demonstrations),
         "collisions_removed": collisions,
         "planned_walks_arrived": sum(arrived for _, arrived in trips),
@@ -144,7 +144,7 @@ def run(folder: Path, seed: int = 0, report: Report = lambda _: None) -> dict[st
     demonstrated_paths = paths(demonstrations)
     planned = [walk for walk, _ in trips]
     panels = [
-        Panel(f"{len(demonstrated_paths)} walks", cells, paths=demonstrated_paths, goals=goals),
+        Panel(f"{walks} walks", cells, paths=demonstrated_paths, goals=goals),
         Panel(
             "What they say, and new plans",
             cells,
