@@ -9,9 +9,19 @@ import os
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 import jax
+import pytest
 from hypothesis import settings
 
 jax.config.update("jax_enable_x64", True)
 
 settings.register_profile("sidestep", deadline=None, max_examples=25)
 settings.load_profile("sidestep")
+
+
+@pytest.fixture(scope="module")
+def unoptimised():
+    """Compiled quickly rather than well, for tests that compile large functions and run them briefly."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)

@@ -9,6 +9,7 @@ from sidestep.continuous.fit import Schedule
 from sidestep.continuous.planning import Planner
 from sidestep.experiments import pendulum, room
 
+pytestmark = pytest.mark.usefixtures("unoptimised")
 PLANNER = Planner(horizon=3, places=4, samples=2, critic_width=4)
 SCHEDULE = Schedule(iterations=2, rehearsals=1, moves=4)
 KEYS = {
