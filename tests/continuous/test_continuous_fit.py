@@ -14,9 +14,10 @@ from scipy.stats import norm
 
 from sidestep.continuous.demonstrations import gather
 from sidestep.continuous.dynamics import LinearGaussian
-from sidestep.continuous.fit import FitProgress, Schedule, fit
+from sidestep.continuous.fit import Schedule, fit
+from sidestep.continuous.likelihood import FitProgress
 from sidestep.continuous.obstacles import ObstacleMotion, Walls
-from sidestep.continuous.planning import Planner
+from sidestep.continuous.planner import Planner
 from sidestep.continuous.policies import FinitePolicy, Scaled, finite_policy, gaussian_policy
 from sidestep.continuous.tasks import Regulate, reach, stack
 from sidestep.demonstrations import Trajectory

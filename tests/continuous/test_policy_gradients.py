@@ -24,7 +24,8 @@ from small_worlds import (
     with_logits,
 )
 
-from sidestep.continuous.planning import Plan, Planner, Planning, PlanProgress, check_planner, plan
+from sidestep.continuous.planner import Planner, Planning, PlanProgress, check_planner
+from sidestep.continuous.planning import Plan, plan
 from sidestep.continuous.policies import gaussian_policy, table_policy
 from sidestep.continuous.tasks import task_at
 from sidestep.errors import InputError, NotConverged

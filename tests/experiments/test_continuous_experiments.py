@@ -6,7 +6,7 @@ import pytest
 
 from sidestep.cli import main
 from sidestep.continuous.fit import Schedule
-from sidestep.continuous.planning import Planner
+from sidestep.continuous.planner import Planner
 from sidestep.experiments import pendulum, room
 
 pytestmark = pytest.mark.usefixtures("unoptimised")

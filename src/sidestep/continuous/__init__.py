@@ -7,8 +7,9 @@ from sidestep.continuous.critics import Critic, critic
 from sidestep.continuous.demonstrations import gather
 from sidestep.continuous.dynamics import Dynamics, GaussianDynamics, LinearGaussian, Outcomes, TableDynamics
 from sidestep.continuous.estimators import score_surrogate, value_gradient
-from sidestep.continuous.fit import ContinuousFit, FitProgress, Schedule, fit
+from sidestep.continuous.fit import ContinuousFit, Schedule, fit
 from sidestep.continuous.lattice import Lattice
+from sidestep.continuous.likelihood import FitProgress
 from sidestep.continuous.obstacles import (
     Field,
     NetworkField,
@@ -19,7 +20,8 @@ from sidestep.continuous.obstacles import (
     radial_field,
 )
 from sidestep.continuous.physical import Pendulum, PointMass
-from sidestep.continuous.planning import Plan, Planner, Planning, PlanProgress, plan
+from sidestep.continuous.planner import Planner, Planning, PlanProgress
+from sidestep.continuous.planning import Plan, plan
 from sidestep.continuous.policies import FinitePolicy, GaussianPolicy, Policy, finite_policy, gaussian_policy
 from sidestep.continuous.rollouts import RollOut, returns, roll_out, roll_outs, said, to_come
 from sidestep.continuous.simulation import simulate

@@ -15,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from sidestep.continuous.demonstrations import gather
-from sidestep.continuous.fit import FitProgress, Schedule, fit
+from sidestep.continuous.fit import Schedule, fit
 from sidestep.continuous.lattice import Lattice
+from sidestep.continuous.likelihood import FitProgress
 from sidestep.continuous.physical import Pendulum
-from sidestep.continuous.planning import Planner
+from sidestep.continuous.planner import Planner
 from sidestep.continuous.policies import finite_policy
 from sidestep.continuous.simulation import simulate
 from sidestep.continuous.tasks import Hold, task_at

@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Float
 
-from sidestep.continuous.fit import FitProgress
+from sidestep.continuous.likelihood import FitProgress
 from sidestep.continuous.obstacles import ObstacleMotion, network_field, radial_field
 from sidestep.demonstrations import Demonstrations
 from sidestep.domains.rooms import RESOLUTION, SIDE, Room, room

@@ -17,9 +17,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from sklearn.metrics import roc_auc_score
 
-from sidestep.continuous.fit import ContinuousFit, FitProgress, Schedule, fit
+from sidestep.continuous.fit import ContinuousFit, Schedule, fit
+from sidestep.continuous.likelihood import FitProgress
 from sidestep.continuous.obstacles import Field, ObstacleMotion, radial_field
-from sidestep.continuous.planning import Planner
+from sidestep.continuous.planner import Planner
 from sidestep.continuous.policies import finite_policy
 from sidestep.continuous.simulation import simulate
 from sidestep.continuous.tasks import task_at
