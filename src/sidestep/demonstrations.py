@@ -51,12 +51,12 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         """The number of trajectories."""
         return int(self.trajectory[-1]) + 1
 
-    def paths(self) -> list[Int[np.ndarray, " _"]]:
+    def paths(self) -> list[Shaped[np.ndarray, "_ *state"]]:
         """The states along each trajectory, the last one included."""
         starts = np.flatnonzero(np.diff(np.asarray(self.trajectory))) + 1
         states, ends = np.asarray(self.states), np.asarray(self.next_states)
         pieces = zip(np.split(states, starts), np.split(ends, starts), strict=True)
-        return [np.append(piece, end[-1]) for piece, end in pieces]
+        return [np.concatenate([piece, end[-1:]]) for piece, end in pieces]
 
     def visited(self: "Demonstrations[Task]") -> Int[np.ndarray, "visits 2"]:
         """The different (state, goal) pairs of all moves; the goal is the first terminal state of the task."""

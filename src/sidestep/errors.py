@@ -1,5 +1,8 @@
 """Everything that `sidestep` refuses, and why: each error says what was wrong, where, and what was expected."""
 
+from math import isfinite
+from numbers import Integral
+
 
 class SidestepError(Exception):
     """The base of all errors that the library raises on purpose; the command line prints it and exits with 1."""
@@ -28,6 +31,19 @@ class InputError(SidestepError):
         place += [f"row {row}"] if row is not None else []
         place += [f"field '{field}'"] if field is not None else []
         super().__init__(f"{', '.join(place)}: {message}" if place else message)
+
+
+def check_count(value: object, least: int, field: str) -> None:
+    """Raises `InputError` unless a setting is a whole number, at least so large."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+        what = f"at least {least}" if isinstance(value, Integral) else f"a whole number, at least {least}"
+        raise InputError(f"expected {what}, found {value}", field=field)
+
+
+def check_positive(value: float, field: str) -> None:
+    """Raises `InputError` unless a setting is a finite number above 0."""
+    if not (isfinite(value) and value > 0):
+        raise InputError(f"expected a finite number above 0, found {value}", field=field)
 
 
 class ImproperTask(SidestepError):

@@ -1,6 +1,7 @@
 """Fits in continuous worlds: they find what is known in closed form, go on where they stopped, and refuse the rest."""
 
 import sys
+from dataclasses import replace
 from functools import cache, partial
 
 import equinox as eqx
@@ -24,7 +25,7 @@ from sidestep.demonstrations import Trajectory
 from sidestep.errors import InputError, NotConverged
 from sidestep.inference.checkpoints import Saver
 from sidestep.inference.priors import Normal
-from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax, Mellowmax
+from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax, LogSumExp, Mellowmax
 
 pytestmark = pytest.mark.usefixtures("unoptimised")
 
@@ -106,6 +107,33 @@ def test_from_actions_alone_a_drift_is_learned():
     assert found.history[0].prior == pytest.approx(-(0.5**2) / 100)
 
 
+def test_from_vectors_that_people_chose_a_drift_is_learned():
+    """People with R(s, a) = −s² − a² choose from a normal distribution, which Riccati's equation gives."""
+    beta, discount, count = 4.0, 0.6, 300
+    task = Regulate(jnp.zeros(1), jnp.eye(1), jnp.eye(1), jnp.asarray(discount))
+    curve = 1.0  # V(s) = −curve s² − 2 tilt s, whatever else
+    for _ in range(100):
+        curve = 1 + discount * curve / (1 + discount * curve)
+    steepness = 1 + discount * curve
+    tilt = discount * curve * TRUTH / (steepness - discount)
+    random = np.random.default_rng(2)
+    states, spread = random.uniform(-2, 2, count), 1 / np.sqrt(2 * beta * steepness)
+    means = -discount * (curve * (states + TRUTH) + tilt) / steepness
+    actions = means + spread * random.normal(size=count)
+    demos = demonstrated(states, actions[:, None], states + actions + TRUTH, (task,))
+    found = fit(
+        BEGINNING, demos, Behavior(LogSumExp(), beta),
+        gaussian_policy(jax.random.key(0), 1, demos.states, depth=0, spread=0.3),
+        Planner(horizon=8, places=16, samples=2, options=8, learning_rate=0.03, critic_width=4),
+        prior=PRIOR, terms=("actions",), estimator="pathwise",
+        schedule=Schedule(iterations=200, rehearsals=60, moves=30, learning_rate=0.02),
+    )  # fmt: skip
+    assert found.converged
+    assert float(found.dynamics.parameters[0]) == pytest.approx(TRUTH, abs=0.1)
+    likelihood = norm.logpdf(actions, means, spread).sum() / count
+    assert np.mean([progress.actions for progress in found.history[-30:]]) / count == pytest.approx(likelihood, abs=0.1)
+
+
 def test_people_know_the_first_model_before_it_moves(monkeypatch):
     """Their policy is found for so many steps; without the actions' term it is of no use."""
 
@@ -151,7 +179,11 @@ def test_a_fit_is_the_mean_of_its_last_quarter():
     found, reports = fitted()
     drifts = np.array([float(dynamics.parameters[0]) for _, dynamics in reports])
     assert float(found.dynamics.parameters[0]) == pytest.approx(drifts[12:].mean())
-    assert found.drift == pytest.approx(abs(drifts[14:].mean() - drifts[12:14].mean()))
+    # a cosine from 0.2 to a twentieth of it
+    rates = 0.2 * (0.05 + 0.95 * (1 + np.cos(np.pi * np.arange(16) / 16)) / 2)
+    gone = np.cumsum(rates)
+    possible = gone[14:].mean() - gone[12:14].mean()
+    assert found.drift == pytest.approx(abs(drifts[14:].mean() - drifts[12:14].mean()) / possible, rel=1e-6)
     assert found.lag == pytest.approx(np.mean([progress.lag for progress in found.history[12:]]))
     assert [progress for progress, _ in reports] == list(found.history)
     assert [progress.iteration for progress in found.history] == list(range(16))
@@ -159,22 +191,38 @@ def test_a_fit_is_the_mean_of_its_last_quarter():
 
 def test_a_policy_that_lags_behind_is_not_found_yet():
     found, _ = fitted()
-    assert 0 < found.drift < 0.3
+    assert 0 < found.drift < 1
     assert found.lag > 0.1
     assert not found.converged
     assert found.message == (
-        f"over the last quarter the parameters drifted by up to {found.drift:.2g} (allowed: 0.3) and "
-        f"the policy lagged {found.lag:.2g} behind the model (allowed: 0.1)"
+        f"over the last quarter parameters drifted by up to {found.drift:.2g} of what their steps allow (asked: 0.5), "
+        f"and the policy lagged {found.lag:.2g} behind the model (asked: 0.1)"
     )
 
 
-@pytest.mark.parametrize(("allowed", "converged"), [(0.5, True), (1e-6, False)])
-def test_parameters_that_still_drift_are_not_found_yet(allowed, converged):
-    schedule = Schedule(iterations=8, rehearsals=3, moves=MOVES, learning_rate=0.1, drift=allowed)
+def test_a_lag_too_noisy_to_tell_is_none_that_is_small():
+    """Two roll-outs an option tell so little at this β that their noise is more than what it is taken from."""
+    sharp = Behavior(BoltzmannAverage(), 40.0)
+    found = fit(BEGINNING, DEMONSTRATIONS, sharp, POLICY, PLANNER, prior=PRIOR, schedule=SHORT)
+    assert abs(found.lag) > 0.1
+    assert not found.converged
+
+
+@pytest.mark.parametrize(("asked", "converged"), [(1.0, True), (1e-6, False)])
+def test_parameters_that_still_drift_are_not_found_yet(asked, converged):
+    schedule = Schedule(iterations=8, rehearsals=3, moves=MOVES, learning_rate=0.1, drift=asked)
     found = learn(terms=("transitions",), schedule=schedule)
-    assert 1e-6 < found.drift < 0.5
+    assert 1e-6 < found.drift < 1
     assert found.converged == converged
-    assert f"(allowed: {allowed:g}) and the policy lagged 0 behind" in found.message
+    assert f"(asked: {asked:g}), and the policy lagged 0 behind" in found.message
+
+
+def test_parameters_that_go_one_way_drift_as_far_as_they_can():
+    """A prior far away is a slope that does not change, and Adam then takes whole steps."""
+    schedule = Schedule(iterations=40, moves=MOVES, learning_rate=0.01)
+    found = learn(terms=("transitions",), schedule=schedule, prior=Normal(1e4, 1e3))
+    assert found.drift == pytest.approx(1, rel=0.05)
+    assert not found.converged
 
 
 def test_the_same_seed_gives_the_same_result_and_another_another():
@@ -207,13 +255,17 @@ def leaves(found):
     return [np.asarray(leaf) for leaf in jax.tree.leaves((found.dynamics, found.planning)) if eqx.is_array(leaf)]
 
 
-def test_resumed_to_the_last_bit(checkpoint):
+def test_resumed_to_the_last_bit(checkpoint, monkeypatch):
+    whole = partial(BOTH, schedule=replace(SHORT, rehearsals=2), checkpoint=checkpoint)
+    expected = whole()
+    checkpoint.unlink()
     for iteration in (2, 3, 9):
         with pytest.raises(KeyboardInterrupt):
-            BOTH(report=interrupted_at(iteration), checkpoint=checkpoint, resume=True)
+            whole(report=interrupted_at(iteration), resume=True)
+        # what has been rehearsed is in the checkpoint
+        monkeypatch.setattr(sys.modules[fit.__module__], "plan", None)
     went_on_at = []
-    found = BOTH(report=lambda progress, _: went_on_at.append(progress.iteration), checkpoint=checkpoint, resume=True)
-    expected = fitted()[0]
+    found = whole(report=lambda progress, _: went_on_at.append(progress.iteration), resume=True)
     assert went_on_at == list(range(10, 16))
     assert found.history == expected.history
     assert all(map(np.array_equal, leaves(found), leaves(expected)))
@@ -320,16 +372,22 @@ FIRST_BACK = int(np.argmax(CHOICES == 0)) + 1
     ({"planner": Planner(horizon=0)}, "'horizon': expected at least 1, found 0"),
     ({"planner": Planner(horizon=2, samples=1)}, "'samples': expected at least 2, found 1"),
     ({"planner": Planner(horizon=2, places=0)}, "'places': expected at least 1, found 0"),
-    ({"planner": Planner(horizon=2, learning_rate=0.0)}, "'learning_rate': expected a number above 0, found 0"),
+    ({"planner": Planner(horizon=2, learning_rate=0.0)}, "'learning_rate': expected a finite number above 0, found 0"),
     ({"terms": ()}, r"'terms': expected one or both of .*, found \(\)"),
     ({"schedule": Schedule(iterations=0)}, "'iterations': expected at least 2, found 0"),
     ({"schedule": Schedule(moves=0)}, "'moves': expected at least 1, found 0"),
     ({"schedule": Schedule(policy_steps=0)}, "'policy_steps': expected at least 1, found 0"),
-    ({"schedule": Schedule(learning_rate=0.0)}, "'learning_rate': expected a number above 0, found 0"),
-    ({"schedule": Schedule(learning_rate=jnp.nan)}, "'learning_rate': expected a number above 0, found nan"),
+    ({"schedule": Schedule(rehearsals=-1)}, "'rehearsals': expected at least 0, found -1"),
+    ({"schedule": Schedule(learning_rate=0.0)}, "'learning_rate': expected a finite number above 0, found 0"),
+    ({"schedule": Schedule(learning_rate=jnp.inf)}, "'learning_rate': expected a finite number above 0, found inf"),
+    ({"schedule": Schedule(drift=jnp.nan)}, "'drift': expected a finite number above 0, found nan"),
+    ({"demonstrations": changed(next_states=NAN)}, "'next_states': expected finite numbers"),
+    ({"demonstrations": changed(tasks=stack([reach((0.0,), 9.0)]))}, "states, row 1: .*has not ended"),
+    ({"dynamics": LinearGaussian(jnp.eye(2), jnp.ones((2, 1)), vector(1, 1))},
+     r"'demonstrations': expected states and actions that the dynamics can take, found shapes \(1,\)"),
     ({"estimator": "pathwise", "dynamics": Gusts(vector(0, 0, 0))},
      "'estimator': these dynamics jump, .*: expected 'score'"),
-    ({"estimator": "pathwise", "demonstrations": changed(tasks=stack([reach((0.0,), 0.1)]))},
+    ({"estimator": "pathwise", "demonstrations": changed(tasks=stack([reach((9.0,), 0.1)]))},
      "'estimator': the returns of these tasks jump, .*: expected 'score'"),
     *(({"policy": GAUSSIAN, "demonstrations": VECTORS, "behavior": Behavior(backup)},
        "'behavior': over vectors of actions people's policy is known for the log-sum-exp only")

@@ -192,6 +192,12 @@ AROUND = Tried(jnp.asarray([[1.0, 0.5], [-0.5, -1.0]]), jnp.arange(2), jnp.asarr
 SHARES = jnp.asarray([[1.0, -0.5], [0.3, 0.8]])
 
 
+def wrong_critic() -> Critic:
+    """A critic for the linear world, of whom it cannot be said that it follows anything."""
+    network = eqx.nn.MLP(3, 1, 8, 1, jnp.tanh, key=jax.random.key(5))
+    return Critic(Scaled(network, jnp.zeros(3), jnp.ones(3)), jnp.asarray(0.5), jnp.asarray(2.0))
+
+
 def expected_cost(mean, covariance, weight):
     """E[xᵀ weight x]."""
     return mean @ weight @ mean + jnp.trace(weight @ covariance)
@@ -240,8 +246,9 @@ def test_the_error_of_pathwise_estimates_falls_as_the_root_of_the_roll_outs(alon
     assert_falls_as_root(along_paths, closed_form)
 
 
-def test_score_estimates_are_the_closed_form_in_a_linear_world_and_noisier(along_paths, closed_form):
-    scores = drawn(8, MANY, LINEAR, SOFT, AROUND, SHARES)
+@pytest.mark.parametrize("critic", [None, wrong_critic()], ids=["no critic", "a wrong critic"])
+def test_score_estimates_are_the_closed_form_in_a_linear_world_and_noisier(along_paths, closed_form, critic):
+    scores = drawn(8, MANY, LINEAR, SOFT, AROUND, SHARES, critic=critic)
     assert_agrees(scores, closed_form, precision=0.1)
     assert (scores.var(axis=0) > 10 * along_paths.var(axis=0)).all()
 
@@ -275,10 +282,11 @@ def value_by_all_paths(policy):
     return value
 
 
-def test_pathwise_estimates_see_that_choices_from_a_finite_set_jump():
+@pytest.mark.parametrize("critic", [None, wrong_critic()], ids=["no critic", "a wrong critic"])
+def test_pathwise_estimates_see_that_choices_from_a_finite_set_jump(critic):
     world = choosing(noise=1e-3)
     exact = exact_linear(value_by_all_paths(world.policy), PUSHES[PUSHED.choices], PARTS)
-    found = drawn(9, MANY, world, SOFT, PUSHED, PARTS, estimator="pathwise", horizon=MOVES)
+    found = drawn(9, MANY, world, SOFT, PUSHED, PARTS, estimator="pathwise", horizon=MOVES, critic=critic)
     assert_agrees(found, exact, precision=0.03)
 
 
@@ -291,9 +299,24 @@ def test_pathwise_and_score_estimates_agree_on_choices_from_a_finite_set():
     assert_agrees(along_paths, scores.mean(axis=0), precision=0.1, uncertain=standard_error(scores))
 
 
+def short_gradient(**given):
+    """An estimate in the table, of two moves and roll-outs unless another number is given."""
+    tasks, key = task_at(TABLE.tasks, WHICH), jax.random.key(0)
+    arguments = TABLE.dynamics, TABLE.policy, tasks, SOFT, key, PLACES, EVERYWHERE.choices, jnp.ones_like
+    return value_gradient(*arguments, **{"horizon": 2, "samples": 2, **given})
+
+
 def test_estimators_that_would_be_biased_are_refused():
     for dynamics, tasks in ((TABLE.dynamics, LINEAR.tasks), (LINEAR.dynamics, TABLE.tasks)):
         check_estimator("score", dynamics, tasks)
         with pytest.raises(InputError, match=r"jump.*expected 'score'"):
             check_estimator("pathwise", dynamics, tasks)
     check_estimator("pathwise", LINEAR.dynamics, LINEAR.tasks)
+    with pytest.raises(InputError, match="jump"):
+        short_gradient(estimator="pathwise")
+
+
+@pytest.mark.parametrize(("setting", "value"), [("horizon", 0), ("samples", 0)])
+def test_roll_outs_that_are_none_are_refused(setting, value):
+    with pytest.raises(InputError, match=f"{setting}.*at least 1, found {value}"):
+        short_gradient(**{setting: value})

@@ -133,8 +133,12 @@ def test_a_belief_in_another_gravity_changes_what_people_do():
 
 
 def test_walkers_start_somewhere():
-    with pytest.raises(InputError, match="starts of task 0: expected finite numbers"):
+    with pytest.raises(InputError, match="starts of task 0: expected rows of 2 finite numbers"):
         people(ROOM, SHARP, starts=[np.array([[1.0, np.nan]])])
+    with pytest.raises(InputError, match="starts of task 0: expected rows of 2 finite numbers"):
+        people(ROOM, SHARP, starts=[np.ones((2, 3))])
+    with pytest.raises(InputError, match="'starts': expected as many as tasks, found 0 for 1"):
+        people(ROOM, SHARP, starts=[])
 
 
 def test_people_who_never_want_to_arrive_are_no_examples():

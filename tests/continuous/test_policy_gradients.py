@@ -24,7 +24,7 @@ from small_worlds import (
     with_logits,
 )
 
-from sidestep.continuous.planner import Planner, Planning, PlanProgress, check_planner
+from sidestep.continuous.planner import Planner, Planning, PlanProgress, check_planner, dealt
 from sidestep.continuous.planning import Plan, plan
 from sidestep.continuous.policies import gaussian_policy, table_policy
 from sidestep.continuous.tasks import task_at
@@ -231,9 +231,9 @@ def test_settings_that_are_too_small_are_refused(name, value, least, begun):
 
 
 @pytest.mark.parametrize("name", ["learning_rate", "critic_rate"])
-@pytest.mark.parametrize("rate", [0.0, -1.0, float("nan")])
+@pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf")])
 def test_rates_that_are_not_above_0_are_refused(name, rate):
-    with pytest.raises(InputError, match=f"{name}.*above 0"):
+    with pytest.raises(InputError, match=f"{name}.*finite number above 0"):
         check_planner(Planner(horizon=2, **{name: rate}))
 
 
@@ -251,8 +251,29 @@ def test_what_cannot_be_planned_for_is_refused():
         planned_from(PLACES[:0], WHICH[:0])
     with pytest.raises(InputError, match=r"task.*0…1"):
         planned_from(PLACES[:2], jnp.asarray([0, 2]))
+    with pytest.raises(InputError, match=r"states.*row 2.*has not ended"):
+        planned_from(jnp.asarray([0, 4]), jnp.zeros(2, int))
     with pytest.raises(InputError, match="has not ended"):
-        planned_from(jnp.full(HERE, 4), jnp.zeros(HERE, int))
+        PLANNER.begin(jax.random.key(0), world, UNIFORM, task_at(tasks, jnp.zeros(2, int)), SOFT, jnp.asarray([4, 4]))
+
+
+def test_parts_of_a_deal_differ_by_places_and_hold_every_move():
+    places, options, samples, moves = 6, 2, 3, 4
+    shape = places, options, samples, moves
+    cards = np.moveaxis(np.indices(shape), 0, -1)
+    hands = np.asarray(dealt(jnp.asarray(cards), parts=4))
+    assert hands.shape == (4, 36, 4)
+    assert len(np.unique(hands.reshape(-1, 4), axis=0)) == np.prod(shape)
+    for hand in hands:
+        assert set(hand[:, 3]) == set(range(moves))
+    assert dealt(jnp.ones((1, 1, 2, 1)), parts=8).shape == (2, 1)
+
+
+def test_with_nothing_to_come_a_critic_stays_as_it_is():
+    planner = Planner(horizon=1, places=HERE, samples=2, critic_width=8)
+    made = planned(SOFT, planner=planner, steps=3)
+    assert made.planning.critic_moments[0].count == 0
+    assert made.planning.policy_moments[0].count == 3
 
 
 def test_figures_that_are_not_finite_are_an_error(begun):

@@ -2,11 +2,14 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from sidestep.cli import main
 from sidestep.continuous.fit import Schedule
 from sidestep.continuous.planner import Planner
+from sidestep.demonstrations import Trajectory
+from sidestep.domains.rooms import without
 from sidestep.experiments import pendulum, room
 
 pytestmark = pytest.mark.usefixtures("unoptimised")
@@ -46,7 +49,24 @@ def test_an_experiment_that_does_not_exist_is_wrong_usage(capsys):
 
 def test_moves_into_the_wall_are_taken_out():
     world = room.room()
-    demonstrations, collisions = room.demonstrated(world, seed=3)
+    demonstrations, _ = room.demonstrated(world, seed=3)
     aims = demonstrations.states + world.actions[demonstrations.actions]
-    assert collisions >= 0
     assert not world.inside(aims.__array__()).any()
+
+
+@pytest.mark.parametrize(
+    ("hits", "pieces"),
+    [
+        ("......", [range(7)]),
+        ("x....x", [range(1, 6)]),
+        ("..xx..", [range(3), range(4, 7)]),
+        (".x.x.x", [range(2), range(2, 4), range(4, 6)]),
+        ("xxxxxx", []),
+    ],
+)
+def test_what_is_left_of_a_walk_are_the_pieces_between(hits, pieces):
+    walk = Trajectory(np.arange(7)[:, None], np.arange(10, 16), 3)
+    left = without(np.array([hit == "x" for hit in hits]), walk)
+    assert [each.states.ravel().tolist() for each in left] == [list(piece) for piece in pieces]
+    assert [each.actions.tolist() for each in left] == [[10 + state for state in piece[:-1]] for piece in pieces]
+    assert all(each.task == 3 for each in left)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sidestep.continuous.policies import FinitePolicy, GaussianPolicy, Policy
-from sidestep.continuous.tasks import ContinuousTask, check_tasks, stack
+from sidestep.continuous.tasks import ContinuousTask, check_tasks, ended_at, stack
 from sidestep.demonstrations import Demonstrations, Trajectory
 from sidestep.errors import InputError
 
@@ -14,8 +14,8 @@ from sidestep.errors import InputError
 def gather(trajectories: Sequence[Trajectory], tasks: Sequence[ContinuousTask]) -> Demonstrations:
     """Demonstrations from trajectories in a continuous world.
 
-    Raises `InputError` for an empty one, lengths or shapes that do not fit, numbers that are not finite, and a task
-    that is not there.
+    Raises `InputError` for an empty one, lengths or shapes that do not fit, numbers that are not finite, a task that is
+    not there, and a trajectory that goes on after its task has ended.
     """
     stacked = stack(tasks)
     check_tasks(stacked)
@@ -42,7 +42,7 @@ def gather(trajectories: Sequence[Trajectory], tasks: Sequence[ContinuousTask]) 
         if not 0 <= task < len(tasks):
             raise InputError(f"expected a task in 0…{len(tasks) - 1}, found {task}", source="trajectory", row=index)
     lengths = [len(each.actions) for each in trajectories]
-    return Demonstrations(
+    gathered = Demonstrations(
         states=jnp.asarray(np.concatenate([each.states[:-1] for each in trajectories])),
         actions=jnp.asarray(np.concatenate([each.actions for each in trajectories])),
         next_states=jnp.asarray(np.concatenate([each.states[1:] for each in trajectories])),
@@ -50,6 +50,11 @@ def gather(trajectories: Sequence[Trajectory], tasks: Sequence[ContinuousTask]) 
         trajectory=jnp.asarray(np.repeat(np.arange(len(lengths)), lengths), dtype=jnp.int32),
         tasks=stacked,
     )
+    ended = ended_at(stacked, gathered.task, gathered.states)
+    if ended.any():
+        row = int(gathered.trajectory[int(ended.argmax())]) + 1
+        raise InputError("goes on after a terminal state of its task", source="trajectory", row=row)
+    return gathered
 
 
 def check_choices(demonstrations: Demonstrations, policy: Policy) -> None:

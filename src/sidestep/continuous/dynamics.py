@@ -33,6 +33,7 @@ Action = Shaped[Array, "*action"]
 Value = Callable[[State], Float[Scalar, ""]]
 
 _Family = TypeVar("_Family", bound="Dynamics")
+_Table = TypeVar("_Table", bound="TableDynamics")
 
 
 class Dynamics(eqx.Module):
@@ -86,7 +87,8 @@ class GaussianDynamics(Dynamics):
 
     - `noise`: the standard deviation of every component of the state, above 0; it is not learned.
 
-    A new family is a subclass with `outcomes`.
+    A new family is a subclass with `outcomes`, and with `example_action` where actions are not of the state's shape.
+    Who changes `sample` or `log_prob` as well must change `surprise`, which would not average to nothing any more.
     """
 
     noise: eqx.AbstractVar[Float[Array, " dimensions"]]
@@ -99,9 +101,9 @@ class GaussianDynamics(Dynamics):
     def reparameterised(self) -> bool:
         """With a single outcome, the path moves with θ; which of several happens, jumps."""
         example = jnp.zeros_like(self.noise)
-        return jax.eval_shape(self.outcomes, example, self._example_action()).means.shape[0] == 1
+        return jax.eval_shape(self.outcomes, example, self.example_action()).means.shape[0] == 1
 
-    def _example_action(self) -> Float[Array, " inputs"]:
+    def example_action(self) -> Float[Array, " inputs"]:
         """An action of the right shape; as many components as the state has, unless a family says otherwise."""
         return jnp.zeros_like(self.noise)
 
@@ -110,7 +112,7 @@ class GaussianDynamics(Dynamics):
         choosing, shaking = jax.random.split(key)
         log_probabilities, means = self.outcomes(state, action)
         chosen = 0 if len(means) == 1 else jax.random.categorical(choosing, log_probabilities)
-        return means[chosen] + self.noise * jax.random.normal(shaking, self.noise.shape, self.noise.dtype)
+        return means[chosen] + self.noise * jax.random.normal(shaking, means.shape[1:], means.dtype)
 
     def log_prob(self, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
         """The logarithm of the mixture's density."""
@@ -145,12 +147,18 @@ class LinearGaussian(GaussianDynamics):
         action: Float[Array, "dimensions inputs"],
         noise: Float[Array, " dimensions"],
     ):
-        """Raises `InputError` for numbers that are not finite or noise that is not above 0."""
-        self.noise = checked_noise(noise)
+        """Raises `InputError` for numbers that are not finite, noise not above 0, and shapes that do not fit."""
+        self.noise = checked_noise(noise, len(state))
         self.parameters = {"state": jnp.asarray(state), "action": jnp.asarray(action)}
+        if np.shape(state) != (len(state),) * 2 or np.ndim(action) != 2 or len(action) != len(state):
+            raise InputError(
+                f"expected a square matrix and one with as many rows, found {np.shape(state)} and {np.shape(action)}",
+                field="state, action",
+            )
         check_finite(self.parameters)
 
-    def _example_action(self) -> Float[Array, " inputs"]:
+    def example_action(self) -> Float[Array, " inputs"]:
+        """As many components as B has columns."""
         return jnp.zeros_like(self.parameters["action"][0])
 
     def outcomes(self, state: Float[Array, " dimensions"], action: Float[Array, " inputs"]) -> Outcomes:
@@ -163,7 +171,7 @@ class TableDynamics(Dynamics):
 
     What is built for densities can so be checked where exact answers are known.
 
-    - `model`: any `TransitionModel` in which no two outcomes of an action are the same state.
+    - `model`: any `TransitionModel`.
     """
 
     model: TransitionModel
@@ -177,24 +185,34 @@ class TableDynamics(Dynamics):
         """Never: states jump."""
         return False
 
-    def _log_probabilities(self, state: State, action: Action) -> Float[Array, " outcomes"]:
-        return jnp.log(self.model.with_parameters(self.parameters).probabilities()[state, action])
+    def with_parameters(self: _Table, parameters: PyTree[Float[Array, "..."]]) -> _Table:
+        """The same family at another θ, which is also that of its model."""
+        places = (lambda dynamics: dynamics.parameters, lambda dynamics: dynamics.model.parameters)
+        moved = self
+        for place in places:
+            moved = eqx.tree_at(place, moved, parameters)
+        return moved
+
+    def _probabilities(self, state: State, action: Action) -> Float[Array, " outcomes"]:
+        return self.model.probabilities()[state, action]
 
     def sample(self, key: PRNGKeyArray, state: State, action: Action) -> State:
         """An outcome drawn by its probability."""
-        outcome = jax.random.categorical(key, self._log_probabilities(state, action))
+        outcome = jax.random.categorical(key, jnp.log(self._probabilities(state, action)))
         return self.model.graph.successors[state, action, outcome].astype(state.dtype)
 
     def log_prob(self, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
         """The logarithm of the probabilities of all outcomes that are the next state."""
         same = self.model.graph.successors[state, action] == next_state
-        log_probabilities = self._log_probabilities(state, action)
-        return jax.nn.logsumexp(jnp.where(same, log_probabilities, -jnp.inf))
+        probability = jnp.sum(jnp.where(same, self._probabilities(state, action), 0.0))
+        # the logarithm of 0 has no gradient, even where it is not looked at
+        possible = probability > 0
+        return jnp.where(possible, jnp.log(jnp.where(possible, probability, 1.0)), -jnp.inf)
 
     def surprise(self, value: Value, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
         """Of the function itself."""
         successors = self.model.graph.successors[state, action].astype(next_state.dtype)
-        return value(next_state) - jnp.exp(self._log_probabilities(state, action)) @ jax.vmap(value)(successors)
+        return value(next_state) - self._probabilities(state, action) @ jax.vmap(value)(successors)
 
 
 def certain(mean: Float[Array, " dimensions"]) -> Outcomes:
@@ -202,9 +220,14 @@ def certain(mean: Float[Array, " dimensions"]) -> Outcomes:
     return Outcomes(jnp.zeros(1, mean.dtype), mean[None])
 
 
-def checked_noise(noise: Float[Array, " dimensions"] | np.ndarray) -> Float[Array, " dimensions"]:
-    """The standard deviations as floating-point numbers; raises `InputError` unless they are finite and above 0."""
-    noise = jnp.atleast_1d(jnp.asarray(noise, jnp.result_type(float)))
+def checked_noise(noise: Float[Array, " _"] | np.ndarray, dimensions: int) -> Float[Array, " dimensions"]:
+    """The standard deviations as floating-point numbers.
+
+    Raises `InputError` unless there is one for each dimension, finite and above 0.
+    """
+    noise = jnp.asarray(noise, jnp.result_type(float))
+    if noise.shape != (dimensions,):
+        raise InputError(f"expected {dimensions} numbers, one a component of the state, found {noise}", field="noise")
     if not isinstance(noise, Tracer) and not (np.isfinite(noise).all() and (np.asarray(noise) > 0).all()):
         raise InputError(f"expected finite numbers above 0, found {noise}", field="noise")
     return noise

@@ -156,7 +156,10 @@ def value_gradient(
     - `weigh`: the weights, by the means of Q̂_0 over samples. With two samples or more each half is weighed by what the
       other half says, so that the noise of weights and of gradients is independent.
     - `samples`: roll-outs an option. `estimator`: which estimate; both are unbiased where they apply.
+
+    Raises `InputError` for a horizon or samples below 1, and an estimator that does not apply (`check_estimator`).
     """
+    check_estimator(estimator, dynamics, tasks)
 
     def total(parameters: PyTree[Float[Array, "..."]]) -> tuple[Array, RollOut]:
         moved = dynamics.with_parameters(parameters)

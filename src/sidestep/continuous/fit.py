@@ -27,7 +27,7 @@ from sidestep.continuous.planning import plan
 from sidestep.continuous.policies import Policy
 from sidestep.continuous.tasks import task_at
 from sidestep.demonstrations import Demonstrations
-from sidestep.errors import InputError, NotConverged
+from sidestep.errors import NotConverged, check_count, check_positive
 from sidestep.inference.checkpoints import Saver, fingerprint
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior
@@ -42,7 +42,8 @@ class ContinuousFit(eqx.Module, Generic[Family, SomePolicy]):
     - `dynamics`: the family at the mean of θ over the last quarter of the iterations.
     - `planning`: the people's policy, and what planning goes on from.
     - `history`: a `FitProgress` an iteration.
-    - `drift`: how far the mean of θ over the last eighth is from that over the eighth before, at most, a parameter.
+    - `drift`: how far the mean of θ over the last eighth is from that over the eighth before, at most, a parameter:
+      as a share of how far that would be, had every step gone the whole learning rate one way.
     - `lag`: the policy's, on average over the last quarter.
     - `converged`: whether drift and lag are below the tolerances that were asked for; `message` says what they are.
     """
@@ -63,7 +64,7 @@ class Schedule(eqx.Module):
     - `moves`: how many demonstrated moves a step looks at.
     - `learning_rate`: of Adam, in units of θ; it falls to a twentieth along a cosine.
     - `policy_steps`: steps of the policy for each of the model's, one of them with the model's own roll-outs.
-    - `drift`, `lag`: below which a fit counts as converged, in units of θ and as in `PlanProgress`.
+    - `drift`, `lag`: below which (either side of 0) a fit counts as converged, as in `ContinuousFit`.
     """
 
     iterations: int = eqx.field(default=400, static=True)
@@ -71,12 +72,16 @@ class Schedule(eqx.Module):
     moves: int = eqx.field(default=32, static=True)
     learning_rate: float = eqx.field(default=0.05, static=True)
     policy_steps: int = eqx.field(default=1, static=True)
-    drift: float = eqx.field(default=0.3, static=True)
+    drift: float = eqx.field(default=0.5, static=True)
     lag: float = eqx.field(default=0.1, static=True)
+
+    def rate(self) -> optax.Schedule:
+        """The learning rate at each iteration."""
+        return optax.cosine_decay_schedule(self.learning_rate, self.iterations, alpha=0.05)
 
     def adam(self) -> optax.GradientTransformation:
         """The model's optimiser; it forgets rare large gradients, which roll-outs give, within a hundred steps."""
-        return optax.adam(optax.cosine_decay_schedule(self.learning_rate, self.iterations, alpha=0.05), b2=0.99)
+        return optax.adam(self.rate(), b2=0.99)
 
 
 class _Fitting(eqx.Module):
@@ -131,12 +136,14 @@ def fit(
     saver = Saver(
         checkpoint, fingerprint(_identity((problem, schedule, policy, seed))) if checkpoint is not None else ""
     )
-    begun = _rehearsed(problem, schedule, policy, rehearsing)
-    carried, fixed = eqx.partition(begun, eqx.is_array)
+    beginning, rehearsing = jax.random.split(rehearsing)
+    carried, fixed = eqx.partition(_begun(problem, schedule, policy, beginning), eqx.is_array)
     history: list[FitProgress] = []
     if resume:
         carried, records, _ = saver.load(carried)
         history = [FitProgress(int(record[0]), *record[1:]) for record in records]
+    if not history:
+        carried = eqx.filter(_rehearsed(problem, schedule, eqx.combine(carried, fixed), rehearsing), eqx.is_array)
     for iteration in range(len(history), schedule.iterations):
         carried, numbers = _step(
             problem, schedule, carried, fixed, jax.random.fold_in(key, iteration), jnp.asarray(iteration)
@@ -156,27 +163,33 @@ def _identity(problem: PyTree) -> tuple[list, str]:
     return jax.tree.leaves(numbers), re.sub(r" at 0x[0-9a-f]+", "", text)
 
 
-def _rehearsed(problem: Problem, schedule: Schedule, policy: Policy, key: PRNGKeyArray) -> _Fitting:
-    """A fit at its start: the policy has been found for the first model, as well as so many steps can."""
-    demos, planner = problem.demonstrations, problem.planner
+def _begun(problem: Problem, schedule: Schedule, policy: Policy, key: PRNGKeyArray) -> _Fitting:
+    """A fit before anything has been found."""
+    demos, parameters = problem.demonstrations, problem.dynamics.parameters
     own = task_at(demos.tasks, demos.task)
-    planning = planner.begin(key, problem.dynamics, policy, own, problem.behavior, demos.states)
-    if schedule.rehearsals and "actions" in problem.terms:
-        planning = plan(
-            problem.dynamics,
-            demos.tasks,
-            problem.behavior,
-            policy,
-            demos.states,
-            demos.task,
-            planner,
-            steps=schedule.rehearsals,
-            seed=int(jax.random.randint(key, (), 0, 2**31 - 1)),
-            warm=planning,
-        ).planning
-    parameters = problem.dynamics.parameters
+    planning = problem.planner.begin(key, problem.dynamics, policy, own, problem.behavior, demos.states)
     flat = ravel_pytree(parameters)[0]
     return _Fitting(parameters, schedule.adam().init(parameters), planning, jnp.zeros((2, len(flat)), flat.dtype))
+
+
+def _rehearsed(problem: Problem, schedule: Schedule, begun: _Fitting, key: PRNGKeyArray) -> _Fitting:
+    """A fit once the policy has been found for the first model, as well as so many steps can."""
+    if not schedule.rehearsals or "actions" not in problem.terms:
+        return begun
+    demos = problem.demonstrations
+    found = plan(
+        problem.dynamics,
+        demos.tasks,
+        problem.behavior,
+        begun.planning.policy,
+        demos.states,
+        demos.task,
+        problem.planner,
+        steps=schedule.rehearsals,
+        seed=int(jax.random.randint(key, (), 0, 2**31 - 1)),
+        warm=begun.planning,
+    )
+    return eqx.tree_at(lambda fitting: fitting.planning, begun, found.planning)
 
 
 @eqx.filter_jit
@@ -210,7 +223,8 @@ def _ended(problem: Problem, schedule: Schedule, fitting: _Fitting, history: lis
     begin, middle, end = _windows(schedule)
     flat, to_parameters = ravel_pytree(problem.dynamics.parameters)
     former, latter = fitting.sums / jnp.asarray([[middle - begin], [end - middle]], flat.dtype)
-    drift = float(jnp.abs(latter - former).max())
+    gone = jnp.cumsum(schedule.rate()(jnp.arange(end)))
+    drift = float(jnp.abs(latter - former).max() / (gone[middle:end].mean() - gone[begin:middle].mean()))
     lag = float(np.mean([progress.lag for progress in history[begin:]]))
     return ContinuousFit(
         dynamics=problem.dynamics.with_parameters(to_parameters((former + latter) / 2)),
@@ -218,20 +232,19 @@ def _ended(problem: Problem, schedule: Schedule, fitting: _Fitting, history: lis
         history=tuple(history),
         drift=drift,
         lag=lag,
-        converged=drift <= schedule.drift and lag <= schedule.lag,
-        message=f"over the last quarter the parameters drifted by up to {drift:.2g} (allowed: {schedule.drift:g}) and "
-        f"the policy lagged {lag:.2g} behind the model (allowed: {schedule.lag:g})",
+        converged=drift <= schedule.drift and abs(lag) <= schedule.lag,
+        message=f"over the last quarter parameters drifted by up to {drift:.2g} of what their steps allow (asked: "
+        f"{schedule.drift:g}), and the policy lagged {lag:.2g} behind the model (asked: {schedule.lag:g})",
     )
 
 
 def check_schedule(schedule: Schedule) -> None:
     """Raises `InputError` for settings that are too small, or a rate that is not above 0."""
-    for name in ("iterations", "moves", "policy_steps"):
-        least = 2 if name == "iterations" else 1  # the drift is from one half of the last quarter to the other
-        if getattr(schedule, name) < least:
-            raise InputError(f"expected at least {least}, found {getattr(schedule, name)}", field=name)
-    if not schedule.learning_rate > 0:
-        raise InputError(f"expected a number above 0, found {schedule.learning_rate}", field="learning_rate")
+    # the drift is from one half of the last quarter to the other
+    for name, least in {"iterations": 2, "rehearsals": 0, "moves": 1, "policy_steps": 1}.items():
+        check_count(getattr(schedule, name), least, name)
+    for name in ("learning_rate", "drift", "lag"):
+        check_positive(getattr(schedule, name), name)
 
 
 def _check_numbers(progress: FitProgress) -> None:

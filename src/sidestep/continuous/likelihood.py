@@ -5,8 +5,8 @@ The objective is that of the tabular half (eq. 6), and so is its gradient, but f
     ∇ log L = Σ_moves [ β ( ∇Q(s, a) − Σ_a′ π(a′|s) ∇Q(s, a′) ) + ∇ ln T_θ(s, a, s′) ],
 
 with ∇Q by roll-outs of the people's policy under the current model (eq. 11). The same roll-outs give a step of that
-policy and of its critic (eq. 12). Over vectors of actions the sum over a′ is the mean over choices that the policy
-draws.
+policy and of its critic (eq. 12). Over vectors of actions the sum over a′ is a mean over choices that the policy draws,
+weighed by exp(βQ)/π_λ: so it is that of the people under the current model, even where the policy is a little behind.
 """
 
 from typing import NamedTuple
@@ -70,33 +70,42 @@ class Problem(eqx.Module):
     estimator: Estimator = eqx.field(static=True)
 
 
+class _Batch(NamedTuple):
+    """Some of the moves, and by how much sums over them have to be scaled up."""
+
+    moves: Int[Array, " some"]
+    scale: float
+
+
 def rehearse(problem: Problem, parameters: PyTree, planning: Planning, key: PRNGKeyArray) -> Planning:
     """Planning after a step by roll-outs from a batch of moves; nothing is learned of the dynamics."""
-    return _actions(problem, parameters, planning, key, learning=False)[0]
+    choosing, rolling = jax.random.split(key)
+    return _actions(problem, parameters, planning, _drawn(problem, choosing), rolling)[0]
 
 
 def descend(
     problem: Problem, parameters: PyTree, planning: Planning, key: PRNGKeyArray
 ) -> tuple[Planning, PyTree, FitProgress]:
     """By one batch of moves: improved planning, the slope of minus the objective, and where the fit stands."""
-    slope, numbers = _rest(problem, parameters, key)
+    choosing, rolling = jax.random.split(key)
+    batch = _drawn(problem, choosing)
+    slope, numbers = _rest(problem, parameters, batch)
     if "actions" in problem.terms:
-        planning, of_actions, progress = _actions(problem, parameters, planning, key, learning=True)
+        planning, of_actions, progress = _actions(problem, parameters, planning, batch, rolling)
         slope = jax.tree.map(jnp.add, slope, of_actions)
         numbers = _together(numbers, progress)
     return planning, slope, numbers._replace(gradient=optax.tree.norm(slope))
 
 
-def _drawn(problem: Problem, key: PRNGKeyArray) -> tuple[Int[Array, " some"], float]:
-    """Some of the moves, and by how much sums over them have to be scaled up."""
+def _drawn(problem: Problem, key: PRNGKeyArray) -> _Batch:
     count, all_moves = min(problem.moves, len(problem.demonstrations)), len(problem.demonstrations)
-    return jax.random.choice(key, all_moves, (count,), replace=False), all_moves / count
+    return _Batch(jax.random.choice(key, all_moves, (count,), replace=False), all_moves / count)
 
 
-def _rest(problem: Problem, parameters: PyTree, key: PRNGKeyArray) -> tuple[PyTree, FitProgress]:
+def _rest(problem: Problem, parameters: PyTree, batch: _Batch) -> tuple[PyTree, FitProgress]:
     """The slope of minus what needs no roll-outs, the transitions' term (if it counts) and the prior, and the two."""
     demos = problem.demonstrations
-    moves, scale = _drawn(problem, key)
+    moves, scale = batch
 
     def parts(parameters: PyTree) -> tuple[Array, tuple[Array, Array]]:
         dynamics, prior = problem.dynamics.with_parameters(parameters), problem.prior.log_density(parameters)
@@ -124,19 +133,20 @@ def _together(rest: FitProgress, progress: tuple[Array, PlanProgress]) -> FitPro
 
 
 def _actions(
-    problem: Problem, parameters: PyTree, planning: Planning, key: PRNGKeyArray, learning: bool
+    problem: Problem, parameters: PyTree, planning: Planning, batch: _Batch, key: PRNGKeyArray
 ) -> tuple[Planning, PyTree, tuple[Array, PlanProgress]]:
     """What roll-outs from some demonstrated moves say.
 
-    That is the improved planning, the slope of minus the actions' log-likelihood (nothing, unless it is to be learned
-    from), the log-likelihood itself, and how good the policy is.
+    That is the improved planning, the slope of minus the actions' log-likelihood, the log-likelihood itself, and how
+    good the policy is.
     """
     demos, planner, behavior = problem.demonstrations, problem.planner, problem.behavior
-    choosing, drawing, rolling = jax.random.split(key, 3)
-    moves, scale = _drawn(problem, choosing)
+    drawing, rolling = jax.random.split(key)
+    moves, scale = batch
     tasks, states, chosen = task_at(demos.tasks, demos.task[moves]), demos.states[moves], demos.actions[moves]
-    people = _People(behavior, planning.policy, tasks, states, chosen)
-    tried, shares = people.options(*planner.tried(drawing, planning.policy, tasks, states))
+    drawn, shares = planner.tried(drawing, planning.policy, tasks, states)
+    people = _People(behavior, planning.policy, tasks, states, chosen, drawn)
+    tried, shares = people.options(shares)
     gradient, rolled = value_gradient(
         problem.dynamics.with_parameters(parameters),
         planning.policy,
@@ -145,7 +155,7 @@ def _actions(
         rolling,
         states,
         tried,
-        people.weights if learning else jnp.zeros_like,
+        people.weights,
         horizon=planner.horizon,
         samples=planner.samples,
         critic=planning.critic,
@@ -158,20 +168,24 @@ def _actions(
 
 
 class _People(NamedTuple):
-    """Some demonstrated moves, and how probable their choices are by what roll-outs say."""
+    """Some demonstrated moves, and how probable their choices are by what roll-outs say.
+
+    - `chosen`: what was done. `drawn`: what the policy would do; over a finite set, all actions.
+    """
 
     behavior: Behavior
     policy: Policy
     tasks: ContinuousTask
     states: Array
     chosen: Array
+    drawn: Array
 
-    def options(self, choices: Array, shares: Array) -> tuple[Array, Array]:
+    def options(self, shares: Array) -> tuple[Array, Array]:
         """What is to be tried: all actions of a finite set, or what people did and what the policy draws."""
         if isinstance(self.policy, FinitePolicy):
-            return choices, shares
+            return self.drawn, shares
         return (
-            jnp.concatenate([self.chosen[:, None], choices], axis=1),
+            jnp.concatenate([self.chosen[:, None], self.drawn], axis=1),
             jnp.concatenate([jnp.zeros_like(shares[:, :1]), shares], axis=1),
         )
 
@@ -181,15 +195,21 @@ class _People(NamedTuple):
         if isinstance(self.policy, FinitePolicy):
             done = jax.nn.one_hot(self.chosen, q.shape[1], dtype=q.dtype)
             return beta * (done - jnp.exp(self.behavior.log_policy(q)))
-        drawn = q.shape[1] - 1
-        return beta * jnp.broadcast_to(jnp.append(1.0, jnp.full(drawn, -1 / drawn)), q.shape)
+        shares = jax.nn.softmax(self._soft(q), axis=1)
+        return beta * jnp.concatenate([jnp.ones_like(shares[:, :1]), -shares], axis=1)
 
     def log_probs(self, q: Float[Array, "places options"]) -> Float[Array, " places"]:
-        """log π of what was done: by the values of all actions, or by the policy where these cannot be listed."""
+        """log π of what was done."""
         if isinstance(self.policy, FinitePolicy):
             return jnp.take_along_axis(self.behavior.log_policy(q), self.chosen[:, None], axis=1)[:, 0]
+        drawn = self._soft(q)
+        return self.behavior.beta * q[:, 0] - jax.nn.logsumexp(drawn, axis=1) + jnp.log(drawn.shape[1])
+
+    def _soft(self, q: Float[Array, "places options"]) -> Float[Array, "places drawn"]:
+        """βQ − ln π_λ of what the policy draws; means by π ∝ exp βQ are means of draws with the exponential of this."""
         seen = jax.vmap(lambda task, state: task.features(state))(self.tasks, self.states)
-        return jax.vmap(self.policy.log_prob)(seen, self.chosen)
+        log_probs = jax.vmap(jax.vmap(self.policy.log_prob, (None, 0)))(seen, self.drawn)
+        return self.behavior.beta * q[:, 1:] - log_probs
 
 
 def check_problem(problem: Problem, policy: Policy) -> None:
@@ -209,6 +229,9 @@ def check_problem(problem: Problem, policy: Policy) -> None:
             "over vectors of actions people's policy is known for the log-sum-exp only: expected that, or a finite set",
             field="behavior",
         )
+    if not np.isfinite(demos.next_states).all():
+        raise InputError("expected finite numbers", field="next_states")
+    _check_shapes(problem)
     densities = np.asarray(jax.vmap(problem.dynamics.log_prob)(demos.states, problem.taken, demos.next_states))
     wrong = np.isnan(densities) | ((densities == -np.inf) & ("transitions" in problem.terms))
     if wrong.any():
@@ -218,3 +241,15 @@ def check_problem(problem: Problem, policy: Policy) -> None:
             source=f"trajectory {int(demos.trajectory[move]) + 1}",
             field="log_prob",
         )
+
+
+def _check_shapes(problem: Problem) -> None:
+    """Raises `InputError` for states or actions that the dynamics cannot take."""
+    states, taken = problem.demonstrations.states, problem.taken
+    expected = f"expected states and actions that the dynamics can take, found shapes {states.shape[1:]} and "
+    try:
+        led = jax.eval_shape(problem.dynamics.sample, jax.random.key(0), states[0], taken[0]).shape
+    except (TypeError, ValueError, IndexError) as error:
+        raise InputError(f"{expected}{taken.shape[1:]}", field="demonstrations") from error
+    if led != states.shape[1:]:
+        raise InputError(f"{expected}{taken.shape[1:]}, which lead to {led}", field="demonstrations")

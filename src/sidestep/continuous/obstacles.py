@@ -12,6 +12,7 @@ so that θ_k is the logit around c_k and takes the same prior as a cell's; a net
 """
 
 import abc
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -116,6 +117,9 @@ class Walls(Field):
         return ((place >= self.low) & (place <= self.high)).all(axis=-1).any()
 
 
+_Motion = TypeVar("_Motion", bound="ObstacleMotion")
+
+
 class ObstacleMotion(GaussianDynamics):
     """Moves that a field of obstacles stops or slows.
 
@@ -138,7 +142,12 @@ class ObstacleMotion(GaussianDynamics):
         check_room(low, high)
         check_finite(field.parameters)
         self.parameters, self.field, self.stops = field.parameters, field, stops
-        self.low, self.high, self.noise = jnp.asarray(low), jnp.asarray(high), checked_noise(noise)
+        self.low, self.high, self.noise = jnp.asarray(low), jnp.asarray(high), checked_noise(noise, len(low))
+
+    def with_parameters(self: _Motion, parameters: PyTree[Float[Array, "..."]]) -> _Motion:
+        """The same family at another θ, which is also that of its field."""
+        moved = eqx.tree_at(lambda motion: motion.field.parameters, self, parameters)
+        return eqx.tree_at(lambda motion: motion.parameters, moved, parameters)
 
     def blocked(self, place: Place) -> Float[Scalar, ""]:
         """P(blocked) at a place."""

@@ -57,13 +57,14 @@ class Pendulum(GaussianDynamics):
             raise InputError(f"expected some of {PENDULUM_CONSTANTS}, found {tuple(unknown)}", field="unknown")
         self.parameters = {name: jnp.log(jnp.asarray(values[name], jnp.result_type(float))) for name in unknown}
         self.known = {name: value for name, value in values.items() if name not in unknown}
-        self.noise, self.time_step = checked_noise(jnp.asarray(noise)), time_step
+        self.noise, self.time_step = checked_noise(jnp.asarray(noise), 2), time_step
 
     def constant(self, name: str) -> Float[Scalar, ""] | float:
         """A constant in its own units, known or not."""
         return jnp.exp(self.parameters[name]) if name in self.parameters else self.known[name]
 
-    def _example_action(self) -> Float[Array, " 1"]:
+    def example_action(self) -> Float[Array, " 1"]:
+        """A torque."""
         return jnp.zeros(1, self.noise.dtype)
 
     def outcomes(self, state: Float[Array, " 2"], action: Float[Array, " 1"]) -> Outcomes:
@@ -102,9 +103,10 @@ class PointMass(GaussianDynamics):
         real = jnp.result_type(float)
         self.parameters = {"friction": jnp.log(jnp.asarray(friction, real)), "wind": jnp.asarray(wind, real)}
         check_finite(self.parameters)
-        self.noise, self.time_step = checked_noise(jnp.asarray(noise)), time_step
+        self.noise, self.time_step = checked_noise(jnp.asarray(noise), 4), time_step
 
-    def _example_action(self) -> Float[Array, " 2"]:
+    def example_action(self) -> Float[Array, " 2"]:
+        """An acceleration."""
         return jnp.zeros(2, self.noise.dtype)
 
     def outcomes(self, state: Float[Array, " 4"], action: Float[Array, " 2"]) -> Outcomes:

@@ -30,8 +30,8 @@ from sidestep.continuous.dynamics import Dynamics
 from sidestep.continuous.estimators import advantages, everywhere, shares_left, values_expected
 from sidestep.continuous.policies import FinitePolicy, Policy
 from sidestep.continuous.rollouts import RollOut, returns, roll_outs, said, spread_over, to_come
-from sidestep.continuous.tasks import ContinuousTask
-from sidestep.errors import InputError
+from sidestep.continuous.tasks import ContinuousTask, task_at
+from sidestep.errors import InputError, check_count, check_positive
 from sidestep.tabular.backups import Behavior, HardMax
 
 SomePolicy = TypeVar("SomePolicy", bound=Policy)
@@ -69,7 +69,8 @@ class Planner(eqx.Module):
 
     - `horizon`: how many moves a roll-out has at most.
     - `places`, `samples`: how many places are tried a step, and how many roll-outs each of their options gets; of
-      these at least 2, for `PlanProgress.lag` compares halves of them.
+      these at least 2, for `PlanProgress.lag` compares halves of them. (The iterations of a fit try `Schedule.moves`
+      places.)
     - `options`: how many choices are tried at a place where actions are vectors; from a finite set, all are.
     - `learning_rate`, `critic_rate`: of Adam.
     - `critic_width`: how many units each hidden layer of the critic has.
@@ -99,7 +100,9 @@ class Planner(eqx.Module):
         `tasks` are those of each of the states.
         """
         check_planner(self)
-        rolling, drawing, making = jax.random.split(key, 3)
+        choosing, rolling, drawing, making = jax.random.split(key, 4)
+        few = jax.random.choice(choosing, len(states), (min(len(states), 8 * self.places),), replace=False)
+        tasks, states = task_at(tasks, few), states[few]
         choices, _ = self.tried(drawing, policy, tasks, states)
         rolled = self.roll(dynamics, policy, tasks, behavior, rolling, states, choices)
         over = spread_over(tasks, rolled)
@@ -164,12 +167,15 @@ class Planner(eqx.Module):
     ) -> tuple[Critic, PyTree]:
         """A critic after steps towards what was to come, each by a part of the moves.
 
-        First moves are left out, for their choices were not the policy's.
+        First moves are left out, for their choices were not the policy's. With a horizon of 1 there are no others, and
+        nothing is to come.
         """
+        if rolled.acting.shape[-1] == 1:
+            return guess, moments
         seen = everywhere(lambda task, state: task.features(state), tasks, rolled)
         worths = to_come(rolled, spread_over(tasks, rolled).discount)[..., :-1]
         moves = seen, shares_left(rolled), worths, rolled.acting
-        parts = jax.tree.map(lambda leaf: _dealt(leaf[:, :, :, 1:], self.critic_steps), moves)
+        parts = jax.tree.map(lambda leaf: dealt(leaf[:, :, :, 1:], self.critic_steps), moves)
         learned, fixed = eqx.partition(guess, eqx.is_inexact_array)
 
         def step(carry: tuple[PyTree, PyTree], part: tuple[Array, Array, Array, Array]) -> tuple[tuple, None]:
@@ -211,9 +217,13 @@ def _policy_gradient(
     return eqx.filter_grad(loss)(policy)
 
 
-def _dealt(leaf: Shaped[Array, "places options samples moves *rest"], parts: int) -> Shaped[Array, "parts each *rest"]:
-    """All moves, dealt out like cards; what is left over is left out."""
-    flat = leaf.reshape(-1, *leaf.shape[4:])
+def dealt(leaf: Shaped[Array, "places options samples moves *rest"], parts: int) -> Shaped[Array, "parts each *rest"]:
+    """All moves, dealt out like cards, place after place, so that parts differ by places and not by moves.
+
+    No more parts than cards; what is left over is left out.
+    """
+    flat = jnp.moveaxis(leaf, (3, 0), (0, 3)).reshape(-1, *leaf.shape[4:])
+    parts = min(parts, len(flat))
     each = len(flat) // parts
     return jnp.swapaxes(flat[: each * parts].reshape(each, parts, *leaf.shape[4:]), 0, 1)
 
@@ -272,12 +282,9 @@ def _lag(
 def check_planner(planner: Planner) -> None:
     """Raises `InputError` for settings below 1, fewer than 2 samples (halves are compared), or rates not above 0."""
     for name in ("horizon", "places", "samples", "options", "critic_width", "critic_steps"):
-        least = 2 if name == "samples" else 1
-        if getattr(planner, name) < least:
-            raise InputError(f"expected at least {least}, found {getattr(planner, name)}", field=name)
+        check_count(getattr(planner, name), 2 if name == "samples" else 1, name)
     for name in ("learning_rate", "critic_rate"):
-        if not getattr(planner, name) > 0:
-            raise InputError(f"expected a number above 0, found {getattr(planner, name)}", field=name)
+        check_positive(getattr(planner, name), name)
 
 
 def _learned(module: eqx.Module) -> PyTree:

@@ -8,11 +8,11 @@ import jax
 import numpy as np
 from jaxtyping import Array, Int, PRNGKeyArray, Shaped
 
-from sidestep.continuous.dynamics import Dynamics
+from sidestep.continuous.dynamics import Dynamics, check_finite
 from sidestep.continuous.estimators import surprised
 from sidestep.continuous.planner import Planner, Planning, PlanProgress, SomePolicy, check_planner
-from sidestep.continuous.tasks import ContinuousTask, check_tasks, task_at
-from sidestep.errors import InputError, NotConverged
+from sidestep.continuous.tasks import ContinuousTask, check_tasks, ended_at, task_at
+from sidestep.errors import InputError, NotConverged, check_count
 from sidestep.tabular.backups import Behavior
 
 
@@ -54,14 +54,15 @@ def plan(
     - `steps`: how many steps are taken.
     - `report`: called after each of them.
 
-    Raises `InputError` for places that are not finite, tasks that are not there, settings below 1 and mellowmax people
-    whose actions are vectors; `NotConverged` if numbers cease to be finite.
+    Raises `InputError` for places that are not finite or where a task has ended, tasks that are not there, parameters
+    that are not finite, settings below 1 and mellowmax people whose actions are vectors; `NotConverged` if numbers
+    cease to be finite.
     """
     check_planner(planner)
     check_tasks(tasks)
     check_places(states, task, tasks)
-    if steps < 1:
-        raise InputError(f"expected at least 1, found {steps}", field="steps")
+    check_finite(dynamics.parameters)
+    check_count(steps, 1, "steps")
     beginning, key = jax.random.split(jax.random.key(seed))
     all_tasks = task_at(tasks, task)
     planning = warm or planner.begin(beginning, dynamics, policy, all_tasks, behavior, states)
@@ -72,7 +73,10 @@ def plan(
         )
         history.append(PlanProgress(iteration, *(float(number) for number in progress[1:])))
         if not np.isfinite(history[-1]).all():
-            raise NotConverged(f"the policy's figures ceased to be finite at step {iteration}: a lower rate may help")
+            raise NotConverged(
+                f"the policy's figures ceased to be finite at step {iteration}: dynamics or rewards that return NaN, "
+                "or too high a rate"
+            )
         if report:
             report(history[-1])
     return Plan(planning, tuple(history))
@@ -98,7 +102,7 @@ def _plan_step(
 
 
 def check_places(states: Shaped[Array, "places *state"], task: Int[Array, " places"], tasks: ContinuousTask) -> None:
-    """Raises `InputError` unless there are places, all finite, with tasks that exist."""
+    """Raises `InputError` unless there are places, all finite, with tasks that exist and have not ended there."""
     count = len(tasks.discount)
     if len(states) == 0 or len(task) != len(states):
         raise InputError(f"expected places and a task for each, found {len(states)} and {len(task)}", field="states")
@@ -107,3 +111,7 @@ def check_places(states: Shaped[Array, "places *state"], task: Int[Array, " plac
         raise InputError("expected finite numbers", source="states", row=int(wrong.argmax()) + 1)
     if int(task.min()) < 0 or int(task.max()) >= count:
         raise InputError(f"expected tasks in 0…{count - 1}", field="task")
+    ended = ended_at(tasks, task, states)
+    if ended.any():
+        row = int(ended.argmax()) + 1
+        raise InputError("expected places where a task has not ended", source="states", row=row)

@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, Shaped
 from sidestep.continuous.dynamics import Dynamics, State
 from sidestep.continuous.policies import Choice, FinitePolicy, Policy
 from sidestep.continuous.tasks import ContinuousTask
+from sidestep.errors import check_count
 from sidestep.tabular.backups import Behavior, HardMax
 
 
@@ -73,8 +74,10 @@ def roll_out(
 ) -> RollOut:
     """What happens from `state` within `horizon` moves; the first choice is the policy's, unless it is given.
 
-    Differentiable along the path by θ, by λ, or both, where dynamics and policy are reparameterised.
+    Differentiable along the path by θ, by λ, or both, where dynamics and policy are reparameterised. Raises
+    `InputError` for a horizon below 1.
     """
+    check_count(horizon, 1, "horizon")
 
     def move(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, tuple]:
         state, choice, over = carry
@@ -125,7 +128,10 @@ def roll_outs(
     - `tasks`: the task of each place (a leading axis of places).
     - The result has leading axes (places, options, samples). The options of a place share their random numbers, so that
       differences between them are less noisy than they are.
+
+    Raises `InputError` for a horizon or samples below 1.
     """
+    check_count(samples, 1, "samples")
     keys = jax.random.split(key, (len(states), samples))
 
     def one(task: ContinuousTask, state: State, choice: Choice, key: PRNGKeyArray) -> RollOut:

@@ -16,7 +16,7 @@ from sidestep.continuous.dynamics import GaussianDynamics
 from sidestep.continuous.lattice import Lattice, action_values, tabular, tabular_task
 from sidestep.continuous.tasks import ContinuousTask
 from sidestep.demonstrations import Trajectory
-from sidestep.errors import InputError, NotConverged
+from sidestep.errors import InputError, NotConverged, check_count
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.solve import check_proper, solve
 
@@ -37,14 +37,21 @@ def simulate(
     - `tasks`, `starts`: for each task, where its walkers start; those who start at the end of their task do not walk.
     - `behavior`: how they choose. `lattice`: where their values are found.
 
-    Raises `InputError` for starts that are not finite, `ImproperTask` for a task without values, `NotConverged` if
+    Raises `InputError` for starts or actions that are not finite or have another width than the dynamics', other
+    numbers of tasks and starts, and `moves` below 1; `ImproperTask` for a task without values, `NotConverged` if
     these cannot be found.
     """
+    check_count(moves, 1, "moves")
+    if not tasks or len(tasks) != len(starts):
+        raise InputError(f"expected as many as tasks, found {len(starts)} for {len(tasks)}", field="starts")
+    width = real.example_action().shape
+    if not np.isfinite(actions).all() or actions.shape[1:] != width:
+        raise InputError(f"expected rows of finite numbers of shape {width}, found {actions.shape}", field="actions")
     model = tabular(believed, lattice, actions)
     trajectories = []
     for index, (task, own) in enumerate(zip(tasks, starts, strict=True)):
-        if not np.isfinite(own).all():
-            raise InputError("expected finite numbers", source=f"starts of task {index}")
+        if not np.isfinite(own).all() or np.shape(own)[1:] != real.noise.shape:
+            raise InputError(f"expected rows of {len(real.noise)} finite numbers", source=f"starts of task {index}")
         table = tabular_task(task, lattice, actions)
         check_proper(table, behavior, len(actions))
         solution = solve(model, table, behavior)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Scalar
+from jaxtyping import Array, Bool, Float, Int, Scalar, Shaped
 
 from sidestep.continuous.dynamics import Action, State
 from sidestep.errors import InputError
@@ -200,6 +200,13 @@ def stack(tasks: Sequence[_Task]) -> _Task:
 def task_at(tasks: _Task, index: Array | int) -> _Task:
     """One of stacked tasks (or several, for several indices)."""
     return jax.tree.map(lambda leaf: leaf[index], tasks)
+
+
+def ended_at(
+    tasks: ContinuousTask, task: Int[Array, " places"], states: Shaped[Array, "places *state"]
+) -> Bool[np.ndarray, " places"]:
+    """Whether the task of each place has ended there; `task` are indices into stacked tasks."""
+    return np.asarray(jax.vmap(lambda own, state: own.terminal(state))(task_at(tasks, task), states))
 
 
 def check_tasks(tasks: ContinuousTask) -> None:

@@ -87,12 +87,18 @@ def walks_without_collisions(
     pieces, collisions = [], 0
     for trajectory in walked:
         aims = np.clip(trajectory.states[:-1] + np.asarray(world.actions)[trajectory.actions], 0, SIDE)
-        hits = np.flatnonzero(world.inside(aims))
-        collisions += len(hits)
-        begin = 0
-        for end in (*hits, len(aims)):
-            if end > begin:
-                states, actions = trajectory.states[begin : end + 1], trajectory.actions[begin:end]
-                pieces.append(Trajectory(states, actions, trajectory.task))
-            begin = end + 1
+        hits = world.inside(aims)
+        collisions += int(hits.sum())
+        pieces += without(hits, trajectory)
     return gather(pieces, world.tasks), collisions
+
+
+def without(moves: Bool[np.ndarray, " moves"], trajectory: Trajectory) -> list[Trajectory]:
+    """What is left of a trajectory when some moves are taken out: the pieces before, between and after them."""
+    pieces, begin = [], 0
+    for end in (*np.flatnonzero(moves), len(moves)):
+        if end > begin:
+            states, actions = trajectory.states[begin : end + 1], trajectory.actions[begin:end]
+            pieces.append(Trajectory(states, actions, trajectory.task))
+        begin = end + 1
+    return pieces

@@ -36,7 +36,7 @@ WALKERS, MOVES, BETA, DISCOUNT = 5, 60, 10.0, 0.9
 TORQUES = (-2.0, -1.0, 0.0, 1.0, 2.0)
 NOISE = (0.01, 0.1)
 PLANNER = Planner(horizon=20, learning_rate=0.01)
-SCHEDULE = Schedule(iterations=300, rehearsals=150, moves=100, learning_rate=0.03, drift=0.05)
+SCHEDULE = Schedule(iterations=300, rehearsals=150, moves=100, learning_rate=0.03)
 _ANGLES, _SPEEDS, _WIDTH = 2.5, 3.0, 48
 
 

@@ -27,7 +27,6 @@ from sidestep.experiments.room import (
     blocked_in,
     demonstrated,
     learned,
-    paths,
     scores,
     tasks_of,
 )
@@ -122,7 +121,7 @@ def _walks(demonstrations: Demonstrations) -> Walks:
     goals = np.asarray(demonstrations.tasks.goal)  # pyright: ignore[reportAttributeAccessIssue]
     rows = [
         {"walk": walk, "step": step, "x": x, "y": y, "goal_x": goal[0], "goal_y": goal[1]}
-        for walk, (places, goal) in enumerate(zip(paths(demonstrations), goals[tasks_of(demonstrations)], strict=True))
+        for walk, (places, goal) in enumerate(zip(demonstrations.paths(), goals[tasks_of(demonstrations)], strict=True))
         for step, (x, y) in enumerate(np.clip(places, edge, SIDE - edge))
     ]
     return walks_of_table(pa.Table.from_pylist(rows))

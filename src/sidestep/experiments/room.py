@@ -36,7 +36,7 @@ WALKERS, CENTRES = 24, 16
 """People to each goal, and centres of basis functions a side."""
 BETA, PRIOR_MEAN, PRIOR_VARIANCE = 4.0, -2.5, 20.0
 PLANNER = Planner(horizon=24, learning_rate=0.02)
-SCHEDULE = Schedule(iterations=300, rehearsals=80, learning_rate=0.15, drift=0.5, lag=0.2)
+SCHEDULE = Schedule(iterations=300, rehearsals=80, learning_rate=0.15, lag=0.2)
 _WIDTH = 48
 _TRIPS = (((1.0, 2.0), 1), ((9.0, 3.0), 2), ((3.0, 4.0), 3), ((7.0, 1.0), 4))
 """Where planned walks start, and which goals they have."""
@@ -142,7 +142,7 @@ def run(folder: Path, seed: int = 0, report: Report = lambda _: None) -> dict[st
         "seconds": round(time.monotonic() - started, 1),
     }
     cells, goals = world.cells, np.asarray([task.goal for task in world.tasks])
-    demonstrated_paths = paths(demonstrations)
+    demonstrated_paths = demonstrations.paths()
     planned = [walk for walk, _ in trips]
     panels = [
         Panel(f"{walks} walks", cells, paths=demonstrated_paths, goals=goals),
@@ -160,14 +160,6 @@ def run(folder: Path, seed: int = 0, report: Report = lambda _: None) -> dict[st
     save(figure_learned(panels), folder / "room.png")
     write_json(folder / "summary.json", summary)
     return summary
-
-
-def paths(demonstrations: Demonstrations) -> list[Float[np.ndarray, "places 2"]]:
-    """The places along each trajectory."""
-    states, after = np.asarray(demonstrations.states), np.asarray(demonstrations.next_states)
-    cuts = np.flatnonzero(np.diff(np.asarray(demonstrations.trajectory))) + 1
-    pieces = zip(np.split(states, cuts), np.split(after, cuts), strict=True)
-    return [np.concatenate([piece, ends[-1:]]) for piece, ends in pieces]
 
 
 def tasks_of(demonstrations: Demonstrations) -> Int[np.ndarray, " trajectories"]:
