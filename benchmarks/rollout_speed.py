@@ -39,17 +39,18 @@ from sidestep.experiments import room as walking
 from sidestep.tabular.backups import Behavior, LogSumExp
 
 CASES = ("room, score", "pendulum, score", "pendulum, pathwise")
-_WALKERS, _WIDTH = 16, 48
+_WALKERS, _WIDTH = 25, 48
 
 
 class Case(NamedTuple):
-    """A fit: of which dynamics, to what, by whom, and how."""
+    """A fit: of which dynamics, to what, by whom, and how; a batch is of so many `moves`."""
 
     dynamics: Dynamics
     demonstrations: Demonstrations
     behavior: Behavior
     policy: FinitePolicy
     planner: Planner
+    moves: int
     estimator: Estimator
 
 
@@ -68,13 +69,14 @@ def case_of(name: str) -> Case:
     world, estimator = name.split(", ")
     random = np.random.default_rng(0)
     if world == "room":
-        rooms, planner, behavior = room(), walking.PLANNER, walking.people()
+        rooms, planner, moves, behavior = room(), walking.PLANNER, walking.SCHEDULE.moves, walking.people()
         known = rooms.dynamics
         field = radial_field(known.low, known.high, (walking.CENTRES, walking.CENTRES), walking.PRIOR_MEAN)
         dynamics = ObstacleMotion(field, known.low, known.high, known.noise)
         tasks, actions, begins = rooms.tasks, rooms.actions, starts(rooms, _WALKERS, random)
     else:
-        dynamics, planner, behavior = Pendulum(), swinging.PLANNER, Behavior(LogSumExp(), swinging.BETA)
+        dynamics, planner, moves = Pendulum(noise=swinging.NOISE), swinging.PLANNER, swinging.SCHEDULE.moves
+        behavior = Behavior(LogSumExp(), swinging.BETA)
         tasks = [Hold(jnp.asarray(goal), jnp.asarray(swinging.DISCOUNT)) for goal in swinging.GOALS]
         actions = jnp.asarray(swinging.TORQUES)[:, None]
         begins = [np.array([goal, 0.0]) + random.uniform(-1, 1, (_WALKERS, 2)) for goal in swinging.GOALS]
@@ -87,15 +89,15 @@ def case_of(name: str) -> Case:
         for state, index in zip(np.asarray(states), task.tolist(), strict=True)
     ]
     kind: Estimator = "pathwise" if estimator == "pathwise" else "score"
-    return Case(dynamics, gather(trajectories, tasks), behavior, policy, planner, kind)
+    return Case(dynamics, gather(trajectories, tasks), behavior, policy, planner, moves, kind)
 
 
 def timed(name: str, turns: int, iterations: int) -> dict[str, float | int | str]:
     """The record of one fit: medians over turns, in each of which a fit goes on for so many iterations."""
     case = case_of(name)
-    planner, demos, moves = case.planner, case.demonstrations, Schedule().moves
+    planner, demos = case.planner, case.demonstrations
     key = jax.random.key(2)
-    looked = jax.random.choice(key, len(demos), (moves,), replace=False)
+    looked = jax.random.choice(key, len(demos), (case.moves,), replace=False)
     tasks, states = task_at(demos.tasks, demos.task[looked]), demos.states[looked]
     note(f"{name}: compiling")
     planning, _ = _fitted(case, iterations)
@@ -147,7 +149,7 @@ def _fitted(case: Case, iterations: int) -> tuple[Planning[FinitePolicy], float]
         case.policy,
         case.planner,
         estimator=case.estimator,
-        schedule=Schedule(iterations=1 + iterations, rehearsals=0),
+        schedule=Schedule(iterations=1 + iterations, rehearsals=0, moves=case.moves),
         report=lambda *_: reported.append(time.perf_counter()),
     )
     return found.planning, float(np.median(np.diff(reported)))

@@ -7,8 +7,9 @@
 **Speed.** The room and the pendulum of `sidestep experiment`, with the experiments' own planners and batches; the
 demonstrations are made up, for what they say makes no difference here. An *update* is an iteration of `fit`, from
 one report to the next: one step of the model, the policy and its critic. Its parts are compiled and timed by
-themselves: the roll-outs; the model's gradient (`value_gradient`, less the roll-outs); the policy's; the critic's. What
-the whole shares among them it computes once, so the parts need not add up to it. Steps are those of single roll-outs.
+themselves: the roll-outs; the model's gradient (`value_gradient` with its surprises, less the roll-outs); the policy's;
+the critic's. What the whole shares among them it computes once, so the parts need not add up to it. Steps are those of
+single roll-outs.
 
 **Noise.** One roll-out gives one estimate of ∇_θ Q^π(s, a): by score, by score with a critic, along the path (with a
 critic for the draws of the policy, as in a fit). Told are the standard deviation of one such estimate (a norm over
