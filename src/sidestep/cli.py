@@ -114,6 +114,9 @@ def learn_command(
     prior_variance: Annotated[
         float, typer.Option(help="a in the penalty (logit - mean)²/a.")
     ] = Settings.prior_variance,
+    lines: Annotated[
+        float, typer.Option(help="What it is worth to a blocked cell to lie between two others, in nats.")
+    ] = Settings.lines,
     connectivity: Connected = "4",
     terms: Annotated[Terms, typer.Option(help="Which parts of the likelihood count.")] = Settings.terms,
     gradient: Annotated[
@@ -139,6 +142,7 @@ def learn_command(
         step_cost=step_cost,
         prior_mean=prior_mean,
         prior_variance=prior_variance,
+        lines=lines,
         connectivity=4 if connectivity == "4" else 8,
         terms=terms,
         gradient="exact" if gradient == "exact" else "fixed_policy",
