@@ -16,6 +16,7 @@ from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid, closed, road_network, true_model, walled_grid
+from sidestep.tabular.planning import plan
 from sidestep.tasks import Task, reach
 
 UP, DOWN, LEFT, RIGHT = range(4)
@@ -26,6 +27,12 @@ def surely(model, state, action):
     chances = np.asarray(model.probabilities()[state, action])
     assert chances.max() > 1 - 1e-4
     return int(model.graph.successors[state, action, chances.argmax()])
+
+
+def dense(model):
+    """T[s, a, s′]."""
+    states = np.eye(model.graph.states)[np.asarray(model.graph.successors)]
+    return np.einsum("sak,sakt->sat", model.probabilities(), states)
 
 
 def anywhere(graph: Graph, states, discount=0.95) -> Task:
@@ -63,16 +70,18 @@ def test_before_anything_is_known_every_direction_is_as_probable():
         Gravity(np.zeros((2, 2), int)).model()
 
 
-@pytest.mark.parametrize("terms", [("actions",), ("actions", "transitions")])
-def test_the_rule_of_gravity_is_found_from_ten_demonstrations_a_goal(terms):
+def test_the_rule_of_gravity_is_found_from_ten_demonstrations_a_goal():
     """Of optimal people, who choose their colours by where these let them go."""
     world, random = FALLING.ruled(RULE), np.random.default_rng(1)
     goals = [0, 4, 20, 24]
     tasks = [anywhere(world.graph, 4 * goal + np.arange(4)) for goal in goals]
-    free = np.setdiff1d(np.arange(25), [*goals, *np.flatnonzero(COLOURS)])
-    starts = [4 * random.choice(free, 10) + random.integers(4, size=10) for _ in goals]
+    # in some corners one falls for ever
+    arriving = [np.flatnonzero(np.asarray(plan(world, task).solution.values) > 1e-3) for task in tasks]
+    starts = [
+        random.choice(np.setdiff1d(own, 4 * goal + np.arange(4)), 10) for own, goal in zip(arriving, goals, strict=True)
+    ]
     demos = gather(simulate(jax.random.key(0), world, tasks, starts), tasks)
-    found = fit(FALLING.model(), demos, Behavior(BoltzmannAverage(), 10.0), prior=Normal(0.0, 4.0), terms=terms)
+    found = fit(FALLING.model(), demos, Behavior(BoltzmannAverage(), 10.0), prior=Normal(0.0, 4.0))
     assert found.converged
     assert rule_of(found.model).tolist() == RULE.tolist()
 
@@ -145,8 +154,7 @@ def test_walls_stand_between_cells_that_are_free():
     model = walled_grid(Grid(known), -12.0)
     assert surely(model, 1, RIGHT) == 1  # blocked, whatever the wall before it
     assert surely(model, 0, RIGHT) == 1
-    expected = true_model(Grid(known)).probabilities()
-    np.testing.assert_allclose(model.probabilities()[:2], expected[:2], atol=1e-5)
+    np.testing.assert_allclose(dense(model)[:2], dense(true_model(Grid(known)))[:2], atol=1e-5)
     with pytest.raises(InputError, match="connectivity"):
         walled_grid(Grid(known, connectivity=8))
 

@@ -177,7 +177,7 @@ def check_log_likelihood(graph, name, horizon):
     assert relative_error(found, expected) < CLOSE
     step = STEP.get(name, 1e-4)
     direction = unit(np.random.default_rng(5).normal(size=found.shape))
-    difference = central_difference(lambda p: plain(p)[0], model.parameters, unravel(direction), step)
+    difference = central_difference(lambda p: plain(p)[0], model.parameters, unravel(jnp.asarray(direction)), step)
     assert float(np.sum(found * direction)) == pytest.approx(difference, rel=CLOSE, abs=1e-14 / step)
 
 

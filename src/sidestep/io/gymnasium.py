@@ -3,10 +3,12 @@
 `env.unwrapped.P[s][a]` lists (probability, next state, reward, whether the episode ends), as in `FrozenLake-v1`,
 `CliffWalking-v1` and `Taxi`. A state in which an episode ends is terminal here. What ending there pays beyond the other
 outcomes of the same action is the terminal state's final reward (over γ, for it is paid one move later); all else is
-R(s, a). Outcomes of one action that pay differently without ending enter R(s, a) by their mean.
+R(s, a). Outcomes of one action that pay differently without ending enter R(s, a) by their mean. Where an episode may
+end in a state that may also be passed (of a taxi whose passenger waits at the destination), the end has a state of its
+own, behind those of the environment.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -14,17 +16,21 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sidestep.demonstrations import Trajectory
-from sidestep.errors import InputError
+from sidestep.errors import InputError, check_count
 from sidestep.tabular.graph import graph
 from sidestep.tabular.models import FIXED, IMPOSSIBLE, TabularModel, TiedModel
 from sidestep.tasks import Task, check_discount
 
 
 class Environment(NamedTuple):
-    """An environment as the library sees it: the model of its table, and its task."""
+    """An environment as the library sees it: the model of its table, and its task.
+
+    - `ends`: the states of their own that ends have, by the environment's state.
+    """
 
     model: TabularModel
     task: Task
+    ends: Mapping[int, int]
 
 
 class _Outcome(NamedTuple):
@@ -51,6 +57,7 @@ def from_gymnasium(env: Any, discount: float = 0.99) -> Environment:
     if found is None:
         raise InputError("expected an environment with a transition table, `P`", source=env)
     table = [[[_Outcome(*each) for each in found[s][a] if each[0] > 0] for a in found[s]] for s in range(len(found))]
+    ends = _with_own_ends(table)
     terminal = np.zeros(len(table), dtype=bool)
     width = 1
     for row in table:
@@ -65,7 +72,21 @@ def from_gymnasium(env: Any, discount: float = 0.99) -> Environment:
                 successors[s, a, k], chances[s, a, k] = outcome.state, outcome.probability
     logits = jnp.log(jnp.asarray(np.where(chances > 0, chances, 1.0)))
     model = TabularModel(graph(successors), logits, jnp.asarray(chances > 0))
-    return Environment(model, _task(table, terminal, discount))
+    return Environment(model, _task(table, terminal, discount), ends)
+
+
+def _with_own_ends(table: _Table) -> dict[int, int]:
+    """Gives ends a state of their own where they need one, in the table, and returns these by the former ones."""
+    outcomes = [(s, outcome) for s, row in enumerate(table) for several in row for outcome in several]
+    ending = {int(outcome.state) for _, outcome in outcomes if outcome.ends}
+    passed = {int(outcome.state) for s, outcome in outcomes if not outcome.ends and s not in ending}
+    own = {state: len(table) + number for number, state in enumerate(sorted(ending & passed))}
+    for several in (several for row in table for several in row):
+        for number, outcome in enumerate(several):
+            if outcome.ends:
+                several[number] = outcome._replace(state=own.get(int(outcome.state), outcome.state))
+    table += [[[_Outcome(1.0, state, 0.0, True)]] * len(table[0]) for state in own.values()]
+    return own
 
 
 def _task(table: _Table, terminal: Bool[np.ndarray, " states"], discount: float) -> Task:
@@ -120,14 +141,22 @@ def slip_of(model: TiedModel) -> float:
 
 
 def collect(
-    env: Any, act: Callable[[int, np.random.Generator], int], episodes: int, *, seed: int = 0, task: int = 0
+    env: Any,
+    world: Environment,
+    act: Callable[[int, np.random.Generator], int],
+    episodes: int,
+    *,
+    seed: int = 0,
+    task: int = 0,
 ) -> list[Trajectory]:
-    """Episodes in a Gymnasium environment with discrete states and actions, as trajectories of a task.
+    """Episodes in a Gymnasium environment, as trajectories of a task.
 
-    - `act`: an action for a state. `seed`: of the environment's first episode, and of what `act` draws.
+    - `world`: what `from_gymnasium` made of it. `act`: an action for a state.
+    - `seed`: of the environment's first episode, and of what `act` draws.
 
     Episodes that end because time is up are cut there.
     """
+    check_count(episodes, 1, "episodes")
     random, trajectories = np.random.default_rng(seed), []
     for episode in range(episodes):
         state, _ = env.reset(seed=seed if episode == 0 else None)
@@ -135,7 +164,7 @@ def collect(
         while not over:
             actions.append(int(act(states[-1], random)))
             state, _, terminated, truncated, _ = env.step(actions[-1])
-            states.append(int(state))
+            states.append(world.ends.get(int(state), int(state)) if terminated else int(state))
             over = terminated or truncated
         trajectories.append(Trajectory(np.asarray(states), np.asarray(actions), task))
     return trajectories
