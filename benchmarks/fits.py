@@ -64,6 +64,7 @@ def measure(name: str, truth: Grid, arguments: argparse.Namespace) -> dict[str, 
         step_cost=1.0,
         prior_mean=arguments.prior_mean,
         prior_variance=arguments.prior_variance,
+        lines=arguments.lines,
         iterations=arguments.iterations,
         memory=arguments.memory,
     )
@@ -145,6 +146,7 @@ def _arguments() -> argparse.Namespace:
     add("--beta", type=float, default=5.0)
     add("--prior-mean", type=float, default=0.0)
     add("--prior-variance", type=float, default=8.0)
+    add("--lines", type=float, default=0.0)
     add("--iterations", type=int, help="at most this many")
     add("--memory", type=float, default=2.0, help="GiB for the fit's arrays")
     add("--seed", type=int, default=0)

@@ -10,8 +10,9 @@ from sidestep.inference.climb import Progress
 from sidestep.inference.fit import Fit, fit
 from sidestep.inference.objective import tasks_mesh
 from sidestep.inference.optimisers import LBFGS, Ascent, Resilient
-from sidestep.inference.priors import Normal
+from sidestep.inference.priors import Lines, Normal, Prior, Smooth
 from sidestep.io.demonstrations import demonstrations
+from sidestep.io.gymnasium import collect, from_gymnasium, slip_of, slippery
 from sidestep.io.maps import read_map, write_map
 from sidestep.io.walks import Walks, read_walks, write_walks
 from sidestep.simulation import simulate
@@ -19,7 +20,18 @@ from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax, LogSum
 from sidestep.tabular.graph import Graph, graph, grid_graph
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.likelihood import LogLikelihood, log_likelihood
-from sidestep.tabular.models import ObstacleGrid, TabularModel, TransitionModel, true_model
+from sidestep.tabular.models import (
+    FeaturedGrid,
+    ObstacleGrid,
+    TabularModel,
+    TiedModel,
+    TransitionModel,
+    borders,
+    closed,
+    road_network,
+    true_model,
+    walled_grid,
+)
 from sidestep.tabular.planning import Plan, RollOuts, plan, roll_out
 from sidestep.tabular.solve import Solution, check_proper, solve
 from sidestep.tabular.solvers.jacobi import Jacobi
@@ -33,6 +45,7 @@ __all__ = [
     "BoltzmannAverage",
     "Cell",
     "Demonstrations",
+    "FeaturedGrid",
     "Fit",
     "Graph",
     "Grid",
@@ -40,6 +53,7 @@ __all__ = [
     "ImproperTask",
     "InputError",
     "Jacobi",
+    "Lines",
     "LogLikelihood",
     "LogSumExp",
     "Mellowmax",
@@ -48,21 +62,28 @@ __all__ = [
     "ObstacleGrid",
     "Ordered",
     "Plan",
+    "Prior",
     "Progress",
     "Resilient",
     "Reward",
     "RollOuts",
     "SidestepError",
+    "Smooth",
     "Solution",
     "TabularModel",
     "Task",
+    "TiedModel",
     "Trajectory",
     "TransitionModel",
     "Walks",
+    "borders",
     "check_proper",
+    "closed",
+    "collect",
     "demonstrations",
     "evaluate",
     "fit",
+    "from_gymnasium",
     "gather",
     "graph",
     "grid_graph",
@@ -72,13 +93,17 @@ __all__ = [
     "reach",
     "read_map",
     "read_walks",
+    "road_network",
     "roll_out",
     "simulate",
+    "slip_of",
+    "slippery",
     "solve",
     "stack_tasks",
     "task",
     "tasks_mesh",
     "true_model",
+    "walled_grid",
     "write_map",
     "write_walks",
 ]

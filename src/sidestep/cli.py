@@ -22,6 +22,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from sidestep.commands.compare import compare
 from sidestep.commands.evaluate import evaluate_map
 from sidestep.commands.learn import Settings, Terms, learn, most_iterations
 from sidestep.commands.plan import plan_path
@@ -48,6 +49,7 @@ Folder = Annotated[Path, typer.Option("--out", help="The folder to write to.", m
 Seed = Annotated[int, typer.Option(help="Draws everything that is random.", min=0)]
 Connected = Annotated[Literal["4", "8"], typer.Option(help="Moves: 4 directions, or 8 with diagonals.")]
 Backup = Annotated[BackupName, typer.Option(help="How walkers value a state by its actions.")]
+Beta = Annotated[float, typer.Option(help="How sharply walkers choose, in units of one over reward.")]
 Discount = Annotated[float, typer.Option(help="γ, above 0 and at most 1.")]
 StepCost = Annotated[
     float | None,
@@ -103,9 +105,7 @@ def learn_command(
     map_file: Annotated[Path, typer.Option("--map", help="ROS map: what is already known.", metavar="MAP.yaml")],
     out: Folder,
     backup: Backup = Settings.backup,  # pyright: ignore[reportArgumentType]
-    beta: Annotated[
-        float, typer.Option(help="How sharply walkers choose, in units of one over reward.")
-    ] = Settings.beta,
+    beta: Beta = Settings.beta,
     discount: Discount = Settings.discount,
     step_cost: StepCost = Settings.step_cost,
     prior_mean: Annotated[
@@ -114,6 +114,9 @@ def learn_command(
     prior_variance: Annotated[
         float, typer.Option(help="a in the penalty (logit - mean)²/a.")
     ] = Settings.prior_variance,
+    lines: Annotated[
+        float, typer.Option(help="What it is worth to a blocked cell to lie between two others, in nats.")
+    ] = Settings.lines,
     connectivity: Connected = "4",
     terms: Annotated[Terms, typer.Option(help="Which parts of the likelihood count.")] = Settings.terms,
     gradient: Annotated[
@@ -139,6 +142,7 @@ def learn_command(
         step_cost=step_cost,
         prior_mean=prior_mean,
         prior_variance=prior_variance,
+        lines=lines,
         connectivity=4 if connectivity == "4" else 8,
         terms=terms,
         gradient="exact" if gradient == "exact" else "fixed_policy",
@@ -200,6 +204,46 @@ def evaluate_command(
     with _stages() as report:
         scores = evaluate_map(folder, truth, out, seed, report)
     _print_scores({str(folder): scores})
+
+
+@app.command(
+    name="compare", epilog="Example: sidestep compare walks.csv --map blank.yaml --truth office.yaml --out compared"
+)
+def compare_command(
+    walks: Annotated[Path, typer.Argument(help="CSV or Parquet, as for `sidestep learn`.")],
+    map_file: Annotated[Path, typer.Option("--map", help="ROS map: what is already known.", metavar="MAP.yaml")],
+    truth: Annotated[Path, typer.Option(help="The true map.", metavar="TRUE.yaml")],
+    out: Folder,
+    backup: Backup = Settings.backup,  # pyright: ignore[reportArgumentType]
+    beta: Beta = Settings.beta,
+    discount: Discount = Settings.discount,
+    step_cost: StepCost = Settings.step_cost,
+    connectivity: Connected = "4",
+    hold_out: Annotated[float, typer.Option(help="The share of walks that are scored and not learned from.")] = 0.2,
+    seed: Seed = Settings.seed,
+) -> None:
+    """Behavior-aware modeling beside its rivals: compare.png, summary.json."""
+    settings = Settings(
+        backup=backup,
+        beta=beta,
+        discount=discount,
+        step_cost=step_cost,
+        connectivity=4 if connectivity == "4" else 8,
+        seed=seed,
+    )
+    with _working("starting") as say:
+        summary = compare(walks, map_file, truth, out, settings, hold_out, say)
+    columns = {
+        "auc": "AUC",
+        "average_precision": "average\nprecision",
+        "average_precision_relevant": "of those\nthat matter",
+        "legal_share": "legal\npaths",
+        "regret": "regret",
+        "heldout_log_likelihood": "held-out\nnats a move",
+        "seconds": "seconds",
+    }
+    _print_table(summary["methods"], columns)
+    console.print(f"picture and numbers in {out}")
 
 
 @app.command(name="simulate", epilog="Example: sidestep simulate office.yaml --out walks.csv --walks 200 --goals 6")
@@ -330,12 +374,12 @@ def _print_scores(rows: Mapping[str, Mapping[str, Any]]) -> None:
         "excess_length": "excess\nlength",
         "regret": "regret",
     }
+    _print_table(rows, columns)
+
+
+def _print_table(rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> None:
     table = Table("", *columns.values())
     for name, scores in rows.items():
         cells = (scores[key] for key in columns)
         table.add_row(name, *("–" if number is None else f"{number:.3f}" for number in cells))
     console.print(table)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

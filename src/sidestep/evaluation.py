@@ -85,11 +85,13 @@ def evaluate(
     reward: Reward,
     seed: int = 0,
     report: Report = lambda *_: None,
+    ranking: Float[np.ndarray, "rows columns"] | None = None,
 ) -> Mapping[str, float | None]:
     """All scores of a learned map, by name: those of `scoring.MapScores` and `scoring.PathScores`, and `regret`.
 
     - `scored`: the cells that had to be learned.
     - `visited`: (state, goal) of the moves that were learned from; they tell which obstacles matter.
+    - `ranking`: what cells are ranked by, higher for obstacles, where that is not the model's P(blocked).
     - `reward`: what planned paths pursue. `seed` draws their starts and goals on maps too large for all pairs (see
       `sample_for`).
 
@@ -109,7 +111,7 @@ def evaluate(
     pairs = _pairs_with_a_way(_some(free, sample.starts, random), _some(free, sample.goals, random), graph)
     lengths = _planned_lengths(model, pairs, truth, graph, reward, report)
     return {
-        **asdict(score_map(blocked, truth, scored, relevant)),
+        **asdict(score_map(blocked if ranking is None else ranking, truth, scored, relevant)),
         **asdict(score_lengths(lengths, pairs.shortest)),
         "regret": _regret(model, pairs, lengths, truth, reward, sample.followed, random, report),
     }

@@ -40,12 +40,12 @@ class _Mind(NamedTuple):
 
     - `chances`: that each move succeeds; 0 for moves off the map and those that it knows to fail.
     - `values`: of the states by these chances, the goal's own included; −∞ at discount 1 where there is no way.
-    - `reward`: of each action. `tie`: within which share of the best its ties lie.
+    - `reward`: of each action in each state. `tie`: within which share of the best its ties lie.
     """
 
     chances: Float[np.ndarray, "states actions"]
     values: Float[np.ndarray, " states"]
-    reward: Float[np.ndarray, " actions"]
+    reward: Float[np.ndarray, "states actions"]
     discount: float
     goal: int
     tie: float
@@ -61,7 +61,7 @@ def lengths_with_bumps(
 ) -> Float[np.ndarray, " starts"]:
     """How far a robot goes from each start that plans in a learned map, and again whenever it bumps into something.
 
-    `task` is to reach `goal`, at a reward that no state changes. In cell sides, with moves that failed; infinite if the
+    `task` is to reach `goal`. In cell sides, with moves that failed; infinite if the
     robot never arrives because the learned map is sure of an obstacle that is not there. Each robot sets out knowing
     `model`, not what others found out. Raises `NotConverged` if the first plan's values did not converge.
     """
@@ -70,7 +70,7 @@ def lengths_with_bumps(
     values = np.where(reachable(found), found, -np.inf).astype(np.float64)
     on_the_map = world.needed[..., 0] < len(values)
     chances = np.where(on_the_map, np.asarray(model.probabilities(), dtype=np.float64)[..., 0], 0.0)
-    reward = np.array(np.broadcast_to(task.reward, (1, len(world.lengths)))[0], dtype=np.float64)
+    reward = np.array(np.broadcast_to(task.reward, chances.shape), dtype=np.float64)
 
     def mind() -> _Mind:
         return _Mind(chances.copy(), values.copy(), reward, float(task.discount), goal, tie)
@@ -107,12 +107,12 @@ def _walked(world, mind, start):  # pragma: no cover
 @compiled()
 def _chosen(mind, needed, here):  # pragma: no cover
     """The first of the best actions, as an optimal plan has it (see `HardMax`); −1 if none leads anywhere."""
-    worths = np.full(len(mind.reward), -np.inf)
+    worths = np.full(mind.reward.shape[1], -np.inf)
     own = mind.values[here]
     for a in range(len(worths)):
         if mind.chances[here, a] > 0:
             gain = mind.chances[here, a] * (mind.values[needed[here, a, 0]] - own)
-            worths[a] = mind.reward[a] + mind.discount * (own + gain)
+            worths[a] = mind.reward[here, a] + mind.discount * (own + gain)
     best = worths.max()
     return np.argmax(worths >= best - mind.tie * abs(best)) if best > -np.inf else -1
 
@@ -121,10 +121,12 @@ def _chosen(mind, needed, here):  # pragma: no cover
 def _supported(mind, needed, state, stale):  # pragma: no cover
     """The best that a state can have of those around it that are not stale: by one action, tried until it succeeds."""
     best = -np.inf
-    for a in range(len(mind.reward)):
+    for a in range(mind.reward.shape[1]):
         move = mind.discount * mind.chances[state, a]
         if move > 0 and not stale[needed[state, a, 0]]:
-            best = max(best, (mind.reward[a] + move * mind.values[needed[state, a, 0]]) / (1 - mind.discount + move))
+            best = max(
+                best, (mind.reward[state, a] + move * mind.values[needed[state, a, 0]]) / (1 - mind.discount + move)
+            )
     return best
 
 
@@ -134,7 +136,7 @@ def _close(mind, needed, cell, stale):  # pragma: no cover
     waiting = [(0.0, 0) for _ in range(0)]
     for state in needed[cell, :, 0]:
         if state < len(stale):
-            for a in range(len(mind.reward)):
+            for a in range(mind.reward.shape[1]):
                 if cell in needed[state, a]:
                     mind.chances[state, a] = 0.0
             heappush(waiting, (-mind.values[state], state))

@@ -1,11 +1,14 @@
-"""The Gaussian prior by hand, and what it refuses."""
+"""Priors by hand, and what they refuse."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sidestep.errors import InputError
-from sidestep.inference.priors import Normal
+from sidestep.inference.priors import Lines, Normal, Smooth
+from sidestep.tabular.grid import Grid
+from sidestep.tabular.models import borders
 
 
 @pytest.mark.parametrize(("prior", "parameters", "expected"), [
@@ -34,3 +37,51 @@ def test_refusals(mean, variance, field):
     mean, variance = (number if isinstance(number, float) else jnp.asarray(number) for number in (mean, variance))
     with pytest.raises(InputError, match=field):
         Normal(mean, variance)
+
+
+EACH = Normal(0.5, 8.0)
+
+
+def test_smooth_parameters_are_like_their_neighbours():
+    """A square of four cells, whose pairs are its sides: (1, 2), (0, 4), (1, 0) and (2, 4)."""
+    theta = jnp.asarray([1.0, 2.0, 0.0, 4.0])
+    prior = Smooth(EACH, borders(Grid.unknown(2, 2)), 0.3)
+    differences = 1 + 16 + 1 + 4
+    assert float(prior.log_density(theta)) == pytest.approx(float(EACH.log_density(theta)) - 0.3 * differences)
+
+
+@pytest.mark.parametrize(
+    ("drawing", "expected"),
+    [
+        ("### ... ...", 1),  # the middle one of a row
+        ("#.. #.. #..", 1),  # and of a column
+        (".#. ### .#.", 1),  # a cross counts once
+        ("### ### ###", 5),  # the middle, and those of every side
+        ("##. ##. ...", 0),  # a block two wide is no line
+        ("#.# ... #.#", 0),
+    ],
+)
+def test_walls_are_lines(drawing, expected):
+    """Cells that are all but sure, so that what lies in a line counts as one."""
+    signs = np.array([list(row) for row in drawing.split()])
+    theta = jnp.asarray(np.where(signs == "#", 30.0, -30.0).ravel())
+    for known in (np.full((3, 3), -1), np.where(signs == "#", 1, -1), np.where(signs == "#", 1, 0)):
+        lines = Lines(EACH, known, 2.0).log_density(theta) - EACH.log_density(theta)
+        assert float(lines) == pytest.approx(2 * expected, abs=1e-6)
+
+
+def test_a_gap_in_a_wall_is_more_probably_wall():
+    known = np.array([[0, 1, 0], [0, -1, 0], [0, 1, 0]])
+    theta = jnp.full(9, 0.5)
+    slope = jax.grad(Lines(EACH, known, 3.0).log_density)(theta).reshape(3, 3)
+    chance = 1 / (1 + np.exp(-0.5))
+    np.testing.assert_allclose(slope[1, 1], 3 * chance * (1 - chance), rtol=1e-9)
+    assert (np.delete(np.asarray(slope).ravel(), 4) == 0).all()
+
+
+@pytest.mark.parametrize("strength", [-1.0, np.nan, np.inf])
+def test_strengths_that_are_none_are_refused(strength):
+    with pytest.raises(InputError, match="strength"):
+        Smooth(EACH, borders(Grid.unknown(2, 2)), strength)
+    with pytest.raises(InputError, match="strength"):
+        Lines(EACH, np.full((2, 2), -1), strength)

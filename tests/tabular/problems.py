@@ -16,7 +16,17 @@ import numpy as np
 from sidestep.tabular.backups import Backup, BoltzmannAverage, HardMax, LogSumExp, Mellowmax
 from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Grid
-from sidestep.tabular.models import ObstacleGrid, TabularModel, TransitionModel
+from sidestep.tabular.models import (
+    FIXED,
+    IMPOSSIBLE,
+    FeaturedGrid,
+    ObstacleGrid,
+    TabularModel,
+    TiedModel,
+    TransitionModel,
+    road_network,
+    walled_grid,
+)
 from sidestep.tabular.solve import solve
 from sidestep.tasks import Task
 
@@ -134,6 +144,92 @@ PROBLEMS: dict[str, Problem] = {
     "8-connected": obstacle_problem(8),
     "tabular": random_problem(),
 }
+
+
+def tied_problem() -> Problem:
+    """The random table, its outcomes tied by seven logits; some cannot happen, and some are not learned."""
+    rng = np.random.default_rng(4)
+    successors = np.asarray(random_problem().model.graph.successors)
+    index = rng.integers(IMPOSSIBLE, 7, successors.shape)
+    index[..., 0] = np.maximum(index[..., 0], FIXED)
+
+    def dense(theta):
+        odds = jnp.where(index >= 0, jnp.exp(theta[np.maximum(index, 0)]), np.where(index == FIXED, 1.0, 0.0))
+        return jnp.einsum("sak,sakt->sat", odds / odds.sum(-1, keepdims=True), np.eye(len(successors))[successors])
+
+    return Problem(TiedModel(graph(successors), index, jnp.asarray(rng.normal(size=7))), dense, goal=0)
+
+
+def walled_problem(rows=3, columns=3) -> Problem:
+    """A grid with walls between cells: first those that one crosses to the right, then those downwards."""
+    theta = np.random.default_rng(5).normal(-1, 1.5, rows * (columns - 1) + (rows - 1) * columns)
+    model = walled_grid(Grid.unknown(rows, columns), jnp.asarray(theta))
+
+    def wall(cell, other):
+        (r, c), right = min(cell, other), cell[1] != other[1]
+        return r * (columns - 1) + c if right else rows * (columns - 1) + r * columns + c
+
+    def dense(theta):
+        transitions = jnp.zeros((rows * columns, 4, rows * columns))
+        for r, c in product(range(rows), range(columns)):
+            for a, (down, right) in enumerate(STEPS[:4]):
+                target, here = (r + down, c + right), r * columns + c
+                if not (0 <= target[0] < rows and 0 <= target[1] < columns):
+                    transitions = transitions.at[here, a, here].set(1.0)
+                    continue
+                shut = 1 / (1 + jnp.exp(-theta[wall((r, c), target)]))
+                transitions = transitions.at[here, a, here].set(shut)
+                transitions = transitions.at[here, a, target[0] * columns + target[1]].set(1 - shut)
+        return transitions
+
+    return Problem(model, dense, goal=1)
+
+
+TURNS = np.array([[0, 1], [1, 2], [2, 0], [1, 3], [3, 0], [4, 3], [3, 4], [4, 1]])
+
+
+def road_problem(by_turn) -> Problem:
+    """Five links and eight turns between them; links, or turns, may be closed."""
+    theta = np.random.default_rng(6).normal(-1, 1.5, len(TURNS) if by_turn else 5)
+    model = road_network(TURNS, np.arange(1.0, 6.0), jnp.asarray(theta), by_turn=by_turn)
+
+    def dense(theta):
+        transitions, taken = jnp.zeros((5, 2, 5)), [0] * 5
+        for number, (begin, onto) in enumerate(TURNS):
+            shut = 1 / (1 + jnp.exp(-theta[number if by_turn else onto]))
+            transitions = transitions.at[begin, taken[begin], begin].set(shut)
+            transitions = transitions.at[begin, taken[begin], onto].set(1 - shut)
+            taken[begin] += 1
+        for link, count in enumerate(taken):
+            for action in range(count, 2):
+                transitions = transitions.at[link, action, link].set(1.0)
+        return transitions
+
+    return Problem(model, dense, goal=0)
+
+
+def featured_problem() -> Problem:
+    """An obstacle grid whose logits are a network's, of three features a cell."""
+    features = jnp.asarray(np.random.default_rng(7).normal(size=(12, 3)))
+    network = eqx.nn.MLP(3, "scalar", 4, 1, jnp.tanh, key=jax.random.key(0))
+    model = FeaturedGrid(Grid.unknown(3, 4), features, network)
+
+    def dense(parameters):
+        first, last = parameters.layers
+        hidden = jnp.tanh(features @ first.weight.T + first.bias)
+        return dense_obstacles((hidden @ last.weight.T)[:, 0] + last.bias[0], 3, 4, 4)
+
+    return Problem(model, dense, goal=1)
+
+
+FAMILIES: dict[str, Problem] = {
+    "tied": tied_problem(),
+    "walls between cells": walled_problem(),
+    "links": road_problem(by_turn=False),
+    "turns": road_problem(by_turn=True),
+    "features": featured_problem(),
+}
+"""Models that are checked for their own gradients, not for every solver."""
 
 
 def generic_task(problem: Problem, discount: float, seed: int = 0) -> Task:

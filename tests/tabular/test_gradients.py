@@ -9,9 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from problems import (
     BACKUPS,
     DISCOUNTS,
+    FAMILIES,
     NAMES,
     PROBLEMS,
     dense_obstacles,
@@ -32,6 +34,7 @@ from sidestep.tasks import Task, reach, stack_tasks
 
 BETA = 4.0
 HORIZONS = (None, 6)
+EVERY = PROBLEMS | FAMILIES
 CLOSE = 1e-6
 ENOUGH = 900  # plain sweeps to a fixed point: .95^900 < 1e-20
 STEP = {"hard max": 2e-6}  # of differences; small where there may be kinks nearby, else 1e-4
@@ -118,7 +121,7 @@ def test_solve_three_ways(graph, name, discount, horizon):
 
 def demonstrated(graph: str) -> Demonstrations:
     """A few random walks on three tasks, one for each discount."""
-    problem = PROBLEMS[graph]
+    problem = EVERY[graph]
     rng = np.random.default_rng(3)
     successors = np.asarray(problem.model.graph.successors)
     trajectories = []
@@ -126,7 +129,8 @@ def demonstrated(graph: str) -> Demonstrations:
         states, actions = [problem.states - 1], []
         while len(actions) < 6 and states[-1] != problem.goal:
             actions.append(int(rng.integers(problem.actions)))
-            states.append(int(rng.choice(successors[states[-1], actions[-1]])))
+            likely = np.asarray(problem.model.probabilities()[states[-1], actions[-1]])
+            states.append(int(rng.choice(successors[states[-1], actions[-1]][likely > 0])))
         trajectories.append(Trajectory(np.array(states), np.array(actions), task))
     return gather(trajectories, [generic_task(problem, discount, seed) for seed, discount in enumerate(DISCOUNTS)])
 
@@ -137,7 +141,7 @@ def unrolled_log_likelihood(graph: str):
     demos = demonstrated(graph)
 
     def total(kind, sweeps, parameters):
-        transitions = PROBLEMS[graph].dense(parameters)
+        transitions = EVERY[graph].dense(parameters)
         q = jax.vmap(lambda task: plain_values(kind, transitions, task, BETA, sweeps)[1])(demos.tasks)
         log_policy = jnp.log(plain_policy(q, BETA))[demos.task, demos.states, demos.actions]
         return jnp.sum(log_policy + jnp.log(transitions[demos.states, demos.actions, demos.next_states]))
@@ -149,7 +153,17 @@ def unrolled_log_likelihood(graph: str):
 @each_backup
 @on_two_graphs
 def test_log_likelihood_three_ways(graph, name, horizon):
-    model, demos, people = PROBLEMS[graph].model, demonstrated(graph), Behavior(BACKUPS[name], BETA)
+    check_log_likelihood(graph, name, horizon)
+
+
+@pytest.mark.parametrize("name", ["hard max", "Boltzmann"])
+@pytest.mark.parametrize("family", FAMILIES)
+def test_log_likelihood_of_every_family_three_ways(family, name):
+    check_log_likelihood(family, name, None)
+
+
+def check_log_likelihood(graph, name, horizon):
+    model, demos, people = EVERY[graph].model, demonstrated(graph), Behavior(BACKUPS[name], BETA)
 
     @jax.jit
     @jax.value_and_grad
@@ -157,13 +171,13 @@ def test_log_likelihood_three_ways(graph, name, horizon):
         return log_likelihood(model.with_parameters(parameters), demos, people, horizon=horizon).total
 
     plain = partial(unrolled_log_likelihood(graph), NAMES.index(name), horizon or ENOUGH)
-    value, found = ours(model.parameters)
-    expected_value, expected = plain(model.parameters)
+    (value, found), (expected_value, expected) = ours(model.parameters), plain(model.parameters)
     assert float(value) == pytest.approx(float(expected_value), rel=1e-8)
+    (found, _), (expected, unravel) = ravel_pytree(found), ravel_pytree(expected)
     assert relative_error(found, expected) < CLOSE
     step = STEP.get(name, 1e-4)
     direction = unit(np.random.default_rng(5).normal(size=found.shape))
-    difference = central_difference(lambda p: plain(p)[0], model.parameters, direction, step)
+    difference = central_difference(lambda p: plain(p)[0], model.parameters, unravel(jnp.asarray(direction)), step)
     assert float(np.sum(found * direction)) == pytest.approx(difference, rel=CLOSE, abs=1e-14 / step)
 
 

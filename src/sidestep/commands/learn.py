@@ -18,7 +18,7 @@ from sidestep.inference.climb import Progress
 from sidestep.inference.fit import Fit, fit
 from sidestep.inference.objective import MEMORY
 from sidestep.inference.optimisers import LBFGS, Ascent, Optimiser, Resilient
-from sidestep.inference.priors import Normal
+from sidestep.inference.priors import Lines, Normal, Prior
 from sidestep.io.demonstrations import demonstrations_of_moves
 from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map
@@ -44,7 +44,8 @@ class Settings:
 
     - `backup`: a name in `BACKUPS`; `beta`: β above 0.
     - `discount`, `step_cost`: the walkers' reward, as in `reach`.
-    - `prior_mean`, `prior_variance`: of every unknown cell's logit.
+    - `prior_mean`, `prior_variance`: of every unknown cell's logit. `lines`: how many nats it is worth, beside that, if
+      a blocked cell lies between two others (`Lines`).
     - `connectivity`: 4 or 8. `terms`: which parts of the likelihood count. `gradient`: "exact" climbs by L-BFGS
       (on large maps by `Resilient`), "fixed_policy" by first-order ascent. `horizon`: how many moves walkers look
       ahead (None: all).
@@ -59,6 +60,7 @@ class Settings:
     step_cost: float | None = None
     prior_mean: float = 0.5
     prior_variance: float = 8.0
+    lines: float = 0.0
     connectivity: Connectivity = 4
     terms: Terms = "both"
     gradient: Gradient = "exact"
@@ -131,7 +133,7 @@ def fit_map(
     if not (np.isfinite(settings.memory) and settings.memory > 0):
         raise InputError(f"expected GiB above 0, found {settings.memory}", field="memory")
     people = Behavior(BACKUPS[settings.backup](), settings.beta)
-    prior = Normal(settings.prior_mean, settings.prior_variance)
+    prior = _prior_of(settings, model)
     optimiser = optimiser_of(settings, model.graph.states, len(demonstrations))
     if settings.terms == "both":
         # where people walked is known without a solve: begin there
@@ -152,6 +154,11 @@ def fit_map(
         checkpoint=checkpoint,
         resume=resume,
     )
+
+
+def _prior_of(settings: Settings, model: ObstacleGrid) -> Prior:
+    each = Normal(settings.prior_mean, settings.prior_variance)
+    return Lines(each, model.known, settings.lines) if settings.lines else each
 
 
 _CLOSED = 8.0

@@ -29,7 +29,7 @@ from sidestep.continuous.tasks import task_at
 from sidestep.demonstrations import Demonstrations
 from sidestep.errors import NotConverged, check_count, check_positive
 from sidestep.inference.checkpoints import Saver, fingerprint
-from sidestep.inference.priors import Normal
+from sidestep.inference.priors import Normal, Prior
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.likelihood import ALL_TERMS, Term
 
@@ -103,7 +103,7 @@ def fit(
     policy: SomePolicy,
     planner: Planner,
     *,
-    prior: Normal | None = None,
+    prior: Prior | None = None,
     terms: tuple[Term, ...] = ALL_TERMS,
     estimator: Estimator = "score",
     schedule: Schedule | None = None,

@@ -27,7 +27,7 @@ from sidestep.continuous.rollouts import said, spread_over
 from sidestep.continuous.tasks import ContinuousTask, check_tasks, task_at
 from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError
-from sidestep.inference.priors import Normal
+from sidestep.inference.priors import Prior
 from sidestep.tabular.backups import Behavior, LogSumExp
 from sidestep.tabular.likelihood import ALL_TERMS, Term
 
@@ -62,7 +62,7 @@ class Problem(eqx.Module):
     dynamics: Dynamics
     demonstrations: Demonstrations
     behavior: Behavior
-    prior: Normal
+    prior: Prior
     planner: Planner
     taken: Shaped[Array, "moves *action"]
     moves: int = eqx.field(static=True)

@@ -25,7 +25,7 @@ from sidestep.inference.checkpoints import Saver, fingerprint
 from sidestep.inference.climb import Climb, Progress
 from sidestep.inference.objective import MEMORY, Objective, Problem, Solved
 from sidestep.inference.optimisers import LBFGS, Ascent, Optimiser
-from sidestep.inference.priors import Normal
+from sidestep.inference.priors import Normal, Prior
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, Gradient
 from sidestep.tabular.likelihood import ALL_TERMS, Term, transition_probabilities
 from sidestep.tabular.models import TransitionModel
@@ -64,7 +64,7 @@ def fit(
     demonstrations: Demonstrations,
     behavior: Behavior,
     *,
-    prior: Normal | None = None,
+    prior: Prior | None = None,
     terms: tuple[Term, ...] = ALL_TERMS,
     gradient: Gradient = "exact",
     horizon: int | None = None,

@@ -28,7 +28,7 @@ from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError
 from sidestep.inference.batches import Batch, batches_of, planned
 from sidestep.inference.checkpoints import fingerprint
-from sidestep.inference.priors import Normal
+from sidestep.inference.priors import Prior
 from sidestep.tabular.backups import Behavior, Gradient
 from sidestep.tabular.likelihood import Choices, Term, choice_log_likelihood, transition_log_likelihood
 from sidestep.tabular.models import TransitionModel
@@ -47,7 +47,7 @@ class Problem(eqx.Module):
     model: TransitionModel
     demonstrations: Demonstrations
     behavior: Behavior
-    prior: Normal
+    prior: Prior
     terms: tuple[Term, ...] = eqx.field(static=True)
     horizon: int | None = eqx.field(static=True)
     gradient: Gradient = eqx.field(static=True)

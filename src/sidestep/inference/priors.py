@@ -1,15 +1,35 @@
-"""Priors over the parameters of a transition model."""
+"""Priors over the parameters of a transition model.
+
+`Normal` is the paper's, each parameter by itself. The others add to it what is known of how parameters go together:
+
+    Smooth:  − s Σ_{i~j} (θ_i − θ_j)²                                  over pairs of neighbours
+    Lines:   + s Σ_c p_c [1 − (1 − p_left p_right)(1 − p_up p_down)]   over cells, p = P(blocked)
+
+The first is a Gaussian Markov random field. The second says that walls are lines: a blocked cell is more probable
+between two others, in a row or in a column. So a gap one cell wide in a long wall, of which behavior says nothing, is
+taken for wall.
+"""
+
+import abc
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from sidestep.errors import InputError
 
 
-class Normal(eqx.Module):
+class Prior(eqx.Module):
+    """A density over parameters, up to a constant."""
+
+    @abc.abstractmethod
+    def log_density(self, parameters: PyTree[Float[Array, "..."]]) -> Float[Array, ""]:
+        """The logarithm of the density of θ, in nats."""
+
+
+class Normal(Prior):
     """The paper's prior θ ~ N(b, a), as its penalty: log prior(θ) = −Σ (θ − b)²/a, without the constant.
 
     - `mean`: b, one number for all parameters or an array that broadcasts to them (a value a cell, say).
@@ -39,3 +59,58 @@ class Normal(eqx.Module):
             for leaf in jax.tree.leaves(parameters)
         ]
         return -jnp.sum(jnp.stack(penalties))
+
+
+class Smooth(Prior):
+    """A Gaussian Markov random field: parameters like those of their neighbours.
+
+    - `each`: what is known of each parameter by itself.
+    - `pairs`: which parameters are neighbours; of a grid's cells `borders(grid)`.
+    - `strength`: s at least 0, in nats; neighbours differ by about 1/√(2s).
+    """
+
+    each: Normal
+    pairs: Int[Array, "pairs 2"]
+    strength: Float[Array, ""]
+
+    def __init__(self, each: Normal, pairs: Int[Array | np.ndarray, "pairs 2"], strength: float):
+        """Raises `InputError` for a strength below 0 or not finite."""
+        self.each, self.pairs, self.strength = each, jnp.asarray(pairs), _strength(strength)
+
+    def log_density(self, parameters: Float[Array, " parameters"]) -> Float[Array, ""]:
+        """That of each, and −s Σ (θ_i − θ_j)²."""
+        one, other = parameters[self.pairs].T
+        return self.each.log_density(parameters) - self.strength.astype(parameters.dtype) * jnp.sum((one - other) ** 2)
+
+
+class Lines(Prior):
+    """Walls are lines: a cell between two blocked ones, in a row or in a column, is more probably blocked.
+
+    - `each`: what is known of each cell's logit by itself.
+    - `known`: what the map says of each cell, as in `ObstacleGrid`; known cells are part of lines.
+    - `strength`: s at least 0, in nats: what a cell in a line is worth.
+    """
+
+    each: Normal
+    known: Int[Array, "rows columns"]
+    strength: Float[Array, ""]
+
+    def __init__(self, each: Normal, known: Int[Array | np.ndarray, "rows columns"], strength: float):
+        """Raises `InputError` for a strength below 0 or not finite."""
+        self.each, self.known, self.strength = each, jnp.asarray(known), _strength(strength)
+
+    def log_density(self, parameters: Float[Array, " cells"]) -> Float[Array, ""]:
+        """That of each, and s Σ p [1 − (1 − p_left p_right)(1 − p_up p_down)]; off the map nothing is blocked."""
+        blocked = jax.nn.sigmoid(parameters).reshape(self.known.shape)
+        blocked = jnp.where(self.known == -1, blocked, (self.known == 1).astype(blocked.dtype))
+        around = jnp.pad(blocked, 1)
+        across = around[1:-1, :-2] * around[1:-1, 2:]
+        along = around[:-2, 1:-1] * around[2:, 1:-1]
+        lines = jnp.sum(blocked * (1 - (1 - across) * (1 - along)))
+        return self.each.log_density(parameters) + self.strength.astype(parameters.dtype) * lines
+
+
+def _strength(strength: float) -> Float[Array, ""]:
+    if not (np.isfinite(strength) and strength >= 0):
+        raise InputError(f"expected a finite number, at least 0, found {strength}", field="strength")
+    return jnp.asarray(strength, jnp.result_type(float))

@@ -61,6 +61,11 @@ def grid_graph(grid: Grid) -> Graph:
     return Graph(jnp.asarray(np.stack([target, staying], -1), dtype=jnp.int32), jnp.asarray(grid.lengths[None]))
 
 
+def straight_moves(grid: Grid) -> Int[np.ndarray, "cells 4"]:
+    """The cell that each straight move leads to; off the map one stays."""
+    return np.asarray(grid_graph(grid).successors[:, :4, 0])
+
+
 def moves_into(grid: Grid) -> Int[np.ndarray, "states actions 3"]:
     """The cells that must be free for each move to succeed: the one moved into, then the two beside a diagonal.
 

@@ -1,0 +1,112 @@
+"""`sidestep compare`: behavior-aware modeling beside its rivals, on the same walks and by the same scores."""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from sidestep.commands.learn import Settings
+from sidestep.demonstrations import Demonstrations
+from sidestep.errors import InputError
+from sidestep.evaluation import evaluate
+from sidestep.io.demonstrations import demonstrations
+from sidestep.io.files import write_json
+from sidestep.io.maps import read_map
+from sidestep.io.walks import read_walks
+from sidestep.plotting.maps import Panel, figure_learned, save
+from sidestep.rivals.constraints import by_constraints
+from sidestep.rivals.costs import by_costs
+from sidestep.rivals.learned import Learned, Method, by_behavior, by_transitions, by_visits
+from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.likelihood import log_likelihood
+from sidestep.tasks import stack_tasks
+
+METHODS: Mapping[str, Method] = MappingProxyType(
+    {
+        "behavior": by_behavior,
+        "transitions": by_transitions,
+        "visits": by_visits,
+        "constraints": by_constraints,
+        "costs": by_costs,
+    }
+)
+"""The methods by name: behavior-aware modeling first, then its rivals."""
+
+
+def compare(
+    walks_file: Path,
+    map_file: Path,
+    truth_file: Path,
+    folder: Path,
+    settings: Settings,
+    hold_out: float = 0.2,
+    report: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Learns by every method from some of the walks, scores all, and writes `compare.png` and `summary.json`.
+
+    - `hold_out`: the share of walks, drawn by the settings' seed, that are not learned from. How probable their actions
+      are under what was learned, in nats a move, is `heldout_log_likelihood`.
+
+    The summary has `methods.<name>` with the scores of `evaluate`, that, and `seconds`. Raises `InputError` for files
+    that do not fit, and a share that leaves no walk to learn from or none to score.
+    """
+    given, truth = (read_map(file, connectivity=settings.connectivity) for file in (map_file, truth_file))
+    if given.shape != truth.shape or not np.isclose(given.resolution, truth.resolution):
+        raise InputError(f"expected the map's {given.shape} cells of {given.resolution} metres", source=truth_file)
+    walks = read_walks(walks_file)
+    held = round(hold_out * len(walks))
+    if not 0 < held < len(walks):
+        raise InputError(f"expected a share of the {len(walks)} walks, found {hold_out}", field="hold_out")
+    drawn = np.random.default_rng(settings.seed).permutation(len(walks))
+    own, others = (
+        demonstrations(walks.select(np.sort(some)), given, discount=settings.discount, step_cost=settings.step_cost)
+        for some in (drawn[held:], drawn[:held])
+    )
+    methods, pictures = {}, []
+    for name, learn in METHODS.items():
+        report(f"learning by {name}")
+        started = time.monotonic()
+        learned = learn(given, own, settings)
+        seconds = time.monotonic() - started
+        report(f"scoring {name}")
+        scores = evaluate(
+            learned.model, truth, given.known == Cell.UNKNOWN, own.visited(), learned.reward, settings.seed,
+            ranking=learned.ranking,
+        )  # fmt: skip
+        heldout = _log_likelihood(learned, others, given)
+        methods[name] = {**scores, "heldout_log_likelihood": heldout, "seconds": round(seconds, 3)}
+        pictures.append(Panel(name, given, _as_shares(learned), truth))
+    summary = {
+        "command": "compare",
+        "files": {"walks": str(walks_file), "map": str(map_file), "truth": str(truth_file)},
+        "settings": asdict(settings),
+        "data": {"walks": len(walks) - held, "heldout_walks": held, "moves": len(own), "heldout_moves": len(others)},
+        "methods": methods,
+    }
+    paths = own.paths()
+    save(
+        figure_learned([Panel(f"{len(paths)} walks", truth, paths=paths), *pictures], columns=3), folder / "compare.png"
+    )
+    write_json(folder / "summary.json", summary)
+    return summary
+
+
+def _log_likelihood(learned: Learned, demos: Demonstrations, grid: Grid) -> float:
+    """Of the actions, in nats a move, by people who know what was learned."""
+    goals = np.asarray(demos.tasks.terminal).argmax(axis=-1)
+    tasks = stack_tasks([learned.reward.reach(grid, int(goal)) for goal in goals])
+    moves = (demos.states, demos.actions, demos.next_states, demos.task, demos.trajectory)
+    total = log_likelihood(learned.model, Demonstrations(*moves, tasks), learned.behavior, terms=("actions",))
+    return float(total.actions) / len(demos)
+
+
+def _as_shares(learned: Learned) -> Float[np.ndarray, "rows columns"]:
+    """P(blocked), or for those who know of none the ranking from 0 to 1."""
+    if np.ptp(learned.ranking) and (learned.ranking.max() > 1 or not np.ptp(np.asarray(learned.model.blocked))):
+        return (learned.ranking - learned.ranking.min()) / np.ptp(learned.ranking)
+    return np.asarray(learned.model.blocked, dtype=np.float64)

@@ -1,0 +1,63 @@
+"""A farm: terrain is entered only with the right machine, and machines are swapped where they stand.
+
+After a later work of the paper's first author: a state is a cell and the machine that one drives. A move into terrain
+that the machine cannot enter stays put; which machine can enter which terrain is what there is to learn. Who enters a
+cell where a machine stands drives that one from there on.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from sidestep.errors import InputError
+from sidestep.tabular.graph import graph, straight_moves
+from sidestep.tabular.grid import Grid
+from sidestep.tabular.models import FIXED, IMPOSSIBLE, TiedModel
+
+_SURE = 12.0
+
+
+class Farm(NamedTuple):
+    """A map of terrain and machines. State `machines * cell + machine` is driving that machine in that cell.
+
+    - `terrain`: 0 for ground that everyone enters, 1…n for terrain.
+    - `machine`: which machine stands in each cell, 0…m−1, or −1 for none.
+    """
+
+    terrain: Int[np.ndarray, "rows columns"]
+    machine: Int[np.ndarray, "rows columns"]
+
+    @property
+    def machines(self) -> int:
+        """How many machines there are."""
+        return int(self.machine.max()) + 1
+
+    def model(self, logits: Float[Array | np.ndarray, "terrains machines"] | float = 0.0) -> TiedModel:
+        """The model at the given logits: terrain t stops machine m with probability σ(logits[t − 1, m]).
+
+        Raises `InputError` for maps of different shapes, or without terrain or machines.
+        """
+        count, terrains = self.machines, int(self.terrain.max())
+        if self.terrain.shape != self.machine.shape or terrains < 1 or count < 1:
+            raise InputError("expected maps of one shape with terrain above 0 and machines from 0", field="terrain")
+        cells, driven = np.divmod(np.arange(count * self.terrain.size), count)
+        target = straight_moves(Grid.unknown(*self.terrain.shape))[cells]
+        moves = target != cells[:, None]
+        terrain, standing = self.terrain.ravel()[target], self.machine.ravel()[target]
+        after = count * target + np.where(moves & (standing >= 0), standing, driven[:, None])
+        staying = np.broadcast_to(np.arange(len(cells))[:, None], after.shape)
+        stopped = np.where(moves & (terrain > 0), count * (terrain - 1) + driven[:, None], IMPOSSIBLE)
+        index = np.stack([np.full_like(stopped, FIXED), stopped], axis=-1)
+        flat = jnp.broadcast_to(jnp.asarray(logits, jnp.result_type(float)), (terrains, count)).ravel()
+        return TiedModel(graph(np.stack([after, staying], axis=-1)), index, flat)
+
+    def ruled(self, enters: Bool[np.ndarray, "terrains machines"]) -> TiedModel:
+        """The model of people who know which machine enters which terrain."""
+        return self.model(np.where(enters, -_SURE, _SURE))
+
+    def stopped(self, model: TiedModel) -> Float[Array, "terrains machines"]:
+        """The probability that each terrain stops each machine, under a model from `model`."""
+        return jax.nn.sigmoid(model.parameters).reshape(-1, self.machines)

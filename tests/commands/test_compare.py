@@ -1,0 +1,68 @@
+"""`sidestep compare`: one table for all methods, from files."""
+
+import json
+
+import numpy as np
+import pytest
+from office import call, write_office
+
+from sidestep.commands.compare import METHODS
+from sidestep.commands.learn import Settings, fit_map
+from sidestep.demonstrations import Demonstrations
+from sidestep.io.demonstrations import demonstrations
+from sidestep.io.maps import read_map
+from sidestep.io.walks import read_walks
+from sidestep.tabular.backups import Behavior, BoltzmannAverage
+from sidestep.tabular.likelihood import log_likelihood
+from sidestep.tabular.models import ObstacleGrid
+
+
+@pytest.fixture(scope="module")
+def office(tmp_path_factory):
+    folder = write_office(tmp_path_factory.mktemp("office"))
+    walked = ("--out", folder / "walks.csv", "--walks", 80, "--goals", 5)
+    assert call("simulate", folder / "true.yaml", *walked) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def compared(office):
+    files = (office / "walks.csv", "--map", office / "half.yaml", "--truth", office / "true.yaml")
+    assert call("compare", *files, "--out", office / "compared", "--seed", 3) == 0
+    return json.loads((office / "compared" / "summary.json").read_text())
+
+
+def test_every_method_has_every_score(office, compared):
+    assert set(compared["methods"]) == set(METHODS)
+    for scores in compared["methods"].values():
+        for key in ("auc", "average_precision", "legal_share", "regret", "heldout_log_likelihood", "seconds"):
+            assert np.isfinite(scores[key])
+    assert compared["data"]["walks"] == 64
+    assert compared["data"]["heldout_walks"] == 16
+    assert (office / "compared" / "compare.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_behavior_sees_walls_and_transitions_alone_do_not(compared):
+    methods = compared["methods"]
+    assert methods["behavior"]["mean_obstacle"] > methods["transitions"]["mean_obstacle"] + 0.1
+    assert methods["behavior"]["legal_share"] >= methods["transitions"]["legal_share"]
+    assert methods["behavior"]["heldout_log_likelihood"] > methods["transitions"]["heldout_log_likelihood"]
+
+
+def test_held_out_walks_are_judged_by_what_the_others_taught(office, compared):
+    grid, walks = read_map(office / "half.yaml"), read_walks(office / "walks.csv")
+    drawn = np.random.default_rng(3).permutation(80)
+    own, others = (demonstrations(walks.select(np.sort(some)), grid) for some in (drawn[16:], drawn[:16]))
+    assert isinstance(others, Demonstrations)
+    model = fit_map(ObstacleGrid(grid, 0.5), own, Settings()).model
+    people = Behavior(BoltzmannAverage(), Settings.beta)
+    expected = log_likelihood(model, others, people, terms=("actions",)).actions / len(others)
+    assert compared["methods"]["behavior"]["heldout_log_likelihood"] == pytest.approx(float(expected), rel=1e-6)
+
+
+@pytest.mark.parametrize("share", [0, 1, 0.001])
+def test_a_share_that_leaves_nothing_is_refused(office, share, capsys):
+    files = (office / "walks.csv", "--map", office / "half.yaml", "--truth", office / "true.yaml")
+    assert call("compare", *files, "--out", office / "none", "--hold-out", share) == 1
+    assert "hold_out" in capsys.readouterr().err
+    assert not (office / "none").exists()

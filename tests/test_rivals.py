@@ -1,0 +1,95 @@
+"""Rivals on small maps where it is known what they must find, and what they cannot."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sidestep.commands.learn import Settings
+from sidestep.demonstrations import Trajectory, gather
+from sidestep.rivals.constraints import by_constraints
+from sidestep.rivals.costs import by_costs
+from sidestep.rivals.learned import by_behavior, by_transitions, by_visits
+from sidestep.simulation import simulate
+from sidestep.tabular.backups import Behavior, BoltzmannAverage
+from sidestep.tabular.grid import Grid
+from sidestep.tabular.models import ObstacleGrid, true_model
+from sidestep.tabular.planning import plan
+from sidestep.tasks import reach
+
+WALL = np.zeros((5, 5), int)
+WALL[:4, 2] = 1
+TRUTH, BLANK = Grid(WALL), Grid.unknown(5, 5)
+GOALS = (0, 4, 9, 15)
+
+
+@pytest.fixture(scope="module")
+def walks():
+    """Optimal walks around a wall, in both directions."""
+    free = np.flatnonzero(WALL.ravel() == 0)
+    tasks = [reach(BLANK, goal) for goal in GOALS]
+    starts = [np.setdiff1d(free, [goal]) for goal in GOALS]
+    return gather(simulate(jax.random.key(0), true_model(TRUTH), tasks, starts), tasks)
+
+
+@pytest.mark.parametrize("method", [by_behavior, by_constraints])
+def test_a_wall_that_stood_in_the_way_is_found(method, walks):
+    """All of it that anybody would have crossed, which is more than every cell that nobody visited."""
+    learned = method(BLANK, walks, Settings())
+    assert learned.ranking[WALL == 1].min() > learned.ranking[WALL == 0].max()
+    assert (np.asarray(learned.model.blocked)[WALL == 1] > 0.5).all()
+    path = plan(learned.model, learned.reward.reach(BLANK, 4)).path_from(0)
+    assert len(path) == 13
+    assert not WALL.ravel()[path].any()
+
+
+def test_visits_are_counted():
+    walk = Trajectory(np.array([0, 1, 2, 1, 2, 7]), np.array([3, 3, 2, 3, 1]), 0)
+    demos = gather([walk], [reach(BLANK, 7)])
+    learned = by_visits(BLANK, demos, Settings())
+    blocked = np.asarray(learned.model.blocked).ravel()
+    np.testing.assert_allclose(blocked[[0, 1, 2, 7]], [1 / 2, 1 / 3, 1 / 3, 1 / 2])
+    np.testing.assert_allclose(np.delete(blocked, [0, 1, 2, 7]), 0.98)
+    assert learned.ranking.ravel()[[0, 1, 3]].tolist() == [-1, -2, 0]
+
+
+def test_transitions_alone_say_nothing_of_what_nobody_touched(walks):
+    blocked = np.asarray(by_transitions(BLANK, walks, Settings()).model.blocked)
+    prior = 1 / (1 + np.exp(-Settings().prior_mean))
+    np.testing.assert_allclose(blocked[WALL == 1], prior, atol=1e-4)
+    assert blocked[WALL == 0].max() < prior
+
+
+def test_costs_explain_detours_without_walls(walks):
+    """They are highest where people would have walked, no move fails, and plans go round what is dear."""
+    learned = by_costs(BLANK, walks, Settings())
+    assert np.asarray(learned.model.blocked).max() == 0
+    assert learned.ranking[1:4, 2].min() > learned.ranking[WALL == 0].mean()
+    path = plan(learned.model, learned.reward.reach(BLANK, 9)).path_from(5)
+    assert not WALL.ravel()[path].any()
+
+
+def test_costs_are_what_makes_actions_most_probable():
+    """A corridor and a way round it: of a hundred walkers forty go through, and the cost explains that share."""
+    known = np.array([[0, 0, 0], [0, 1, 0], [0, 0, 0]])
+    grid = Grid(known)
+    around = Trajectory(np.array([3, 0, 1, 2, 5]), np.array([0, 3, 3, 1]), 0)
+    under = Trajectory(np.array([3, 6, 7, 8, 5]), np.array([1, 3, 3, 0]), 0)
+    settings = Settings(beta=40.0)
+    demos = gather([around] * 60 + [under] * 40, [reach(grid, 5)])
+    learned = by_costs(grid, demos, settings)
+    task = learned.reward.reach(grid, 5)
+    policy = plan(learned.model, task, learned.behavior).policy
+    assert float(policy[3, 0] / (policy[3, 0] + policy[3, 1])) == pytest.approx(0.6, abs=0.05)
+    assert learned.ranking[2].sum() > learned.ranking[0].sum()
+    paid = np.asarray(task.reward - reach(grid, 5).reward)
+    np.testing.assert_allclose(paid[3, 0], -learned.ranking[0, 0], rtol=1e-9)
+
+
+def test_constraints_end_where_the_walls_end():
+    """People who walk on an empty map, straight to the goal from everywhere, are no reason to forbid anything."""
+    tasks = [reach(BLANK, goal) for goal in (0, 24)]
+    starts = [np.setdiff1d(np.arange(25), [0, 24, 12])] * 2
+    world = ObstacleGrid(BLANK, jnp.full(25, -20.0))
+    demos = gather(simulate(jax.random.key(1), world, tasks, starts, Behavior(BoltzmannAverage(), 7.0)), tasks)
+    assert np.asarray(by_constraints(BLANK, demos, Settings()).model.blocked).max() < 0.5
