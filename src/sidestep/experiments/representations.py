@@ -12,10 +12,10 @@ from typing import Any
 import jax
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Float
+from jaxtyping import Array, Float, PyTree
 
 from sidestep.continuous.likelihood import FitProgress
-from sidestep.continuous.obstacles import ObstacleMotion, network_field, radial_field
+from sidestep.continuous.obstacles import Field, ObstacleMotion, network_field, radial_field
 from sidestep.demonstrations import Demonstrations
 from sidestep.domains.rooms import RESOLUTION, SIDE, Room, room
 from sidestep.experiments.room import (
@@ -31,7 +31,7 @@ from sidestep.experiments.room import (
     tasks_of,
 )
 from sidestep.inference.fit import fit
-from sidestep.inference.priors import Normal
+from sidestep.inference.priors import Normal, Prior
 from sidestep.io.demonstrations import demonstrations as on_grid
 from sidestep.io.files import write_json
 from sidestep.io.walks import Walks, walks_of_table
@@ -82,6 +82,22 @@ def run(folder: Path, seed: int = 0, report: Report = lambda _: None) -> dict[st
     return summary
 
 
+class Said(Prior):
+    """A prior on what a field says at some places, whatever its parameters mean.
+
+    A prior on a network's weights would leave its logits free, and one that has once said that all is free hears of no
+    wall any more: what people do changes by P(blocked) (1 − P(blocked)) with each logit.
+    """
+
+    field: Field
+    places: Float[Array, "places dimensions"]
+    each: Normal
+
+    def log_density(self, parameters: PyTree[Float[Array, "..."]]) -> Float[Array, ""]:
+        """That of the logits at the places."""
+        return self.each.log_density(jax.vmap(lambda place: self.field.logit(place, parameters))(self.places))
+
+
 Learned = tuple[Float[np.ndarray, "rows columns"], int, bool, str]
 """P(blocked) in small cells, how many parameters there are, whether the fit converged, and why it ended."""
 
@@ -95,9 +111,10 @@ def _by_basis_functions(world: Room, demonstrations: Demonstrations, seed: int, 
 
 
 def _by_network(world: Room, demonstrations: Demonstrations, seed: int, report: Report) -> Learned:
-    """The weights' prior is N(0, 20): a network that is all zeros says `PRIOR_MEAN` everywhere."""
-    field = network_field(jax.random.key(seed), world.dynamics.low, world.dynamics.high, logit=PRIOR_MEAN)
-    prior = Normal(0.0, PRIOR_VARIANCE)
+    """The prior is that of the basis functions, on what the network says where their centres are."""
+    low, high = world.dynamics.low, world.dynamics.high
+    field = network_field(jax.random.key(seed), low, high, logit=PRIOR_MEAN)
+    prior = Said(field, radial_field(low, high, (CENTRES, CENTRES)).centres, Normal(PRIOR_MEAN, PRIOR_VARIANCE))
     found = learned(world, field, prior, demonstrations, seed, report=_saying(report, "network"), rate=0.02)
     count = sum(leaf.size for leaf in jax.tree.leaves(field.parameters))
     return blocked_in(found.dynamics, world), count, found.converged, found.message

@@ -26,7 +26,7 @@ from sidestep.continuous.simulation import simulate
 from sidestep.continuous.tasks import task_at
 from sidestep.demonstrations import Demonstrations
 from sidestep.domains.rooms import Room, room, walks_without_collisions
-from sidestep.inference.priors import Normal
+from sidestep.inference.priors import Normal, Prior
 from sidestep.io.files import write_json
 from sidestep.plotting.maps import Panel, figure_learned, save
 from sidestep.tabular.backups import Behavior, LogSumExp
@@ -65,7 +65,7 @@ def demonstrated(world: Room, seed: int) -> tuple[Demonstrations, int]:
 def learned(
     world: Room,
     field: Field,
-    prior: Normal,
+    prior: Prior,
     demonstrations: Demonstrations,
     seed: int,
     terms: tuple[Term, ...] = ALL_TERMS,
