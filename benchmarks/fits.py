@@ -8,7 +8,7 @@ A share of the wall cells, drawn at random, is hidden from the learner, and as m
 all of these are unknown to it, the rest of the map is known. Walkers take shortest ways (ties at random) at a step cost
 of 1 and no discount. Scored are the unknown cells: how well P(blocked) ranks the hidden walls that matter (those whose
 opening alone would have shortened somebody's way) above the free cells, beside the ranking by how rarely they were
-visited.
+visited. `--lines` is what it is worth to a blocked cell, in nats, to lie between two others: walls are lines.
 """
 
 import argparse
@@ -110,7 +110,7 @@ def run(arguments: argparse.Namespace) -> None:
         arguments.goals, arguments.walks = 4, 40
     records = [measure(name, truth, arguments) for name, truth in maps.items()]
     print_table(
-        f"{arguments.backup}, β={arguments.beta:g}, prior N({arguments.prior_mean:g}, {arguments.prior_variance:g}); "
+        f"{arguments.backup}, β={arguments.beta:g}, prior N({arguments.prior_mean:g}, {arguments.prior_variance:g}), lines {arguments.lines:g}; "
         f"{arguments.share:.0%} of the wall cells hidden",
         ("map", "cells", "goals", "walks", "that matter", "AP", "by visits", "iterations", "converged", "s", "GiB"),
         [
@@ -146,7 +146,7 @@ def _arguments() -> argparse.Namespace:
     add("--beta", type=float, default=5.0)
     add("--prior-mean", type=float, default=0.0)
     add("--prior-variance", type=float, default=8.0)
-    add("--lines", type=float, default=0.0)
+    add("--lines", type=float, default=1.0)
     add("--iterations", type=int, help="at most this many")
     add("--memory", type=float, default=2.0, help="GiB for the fit's arrays")
     add("--seed", type=int, default=0)
