@@ -110,7 +110,8 @@ def run(arguments: argparse.Namespace) -> None:
         arguments.goals, arguments.walks = 4, 40
     records = [measure(name, truth, arguments) for name, truth in maps.items()]
     print_table(
-        f"{arguments.backup}, β={arguments.beta:g}, prior N({arguments.prior_mean:g}, {arguments.prior_variance:g}), lines {arguments.lines:g}; "
+        f"{arguments.backup}, β={arguments.beta:g}, prior N({arguments.prior_mean:g}, {arguments.prior_variance:g}), "
+        f"lines {arguments.lines:g}; "
         f"{arguments.share:.0%} of the wall cells hidden",
         ("map", "cells", "goals", "walks", "that matter", "AP", "by visits", "iterations", "converged", "s", "GiB"),
         [
