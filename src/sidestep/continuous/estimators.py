@@ -1,12 +1,12 @@
 """Estimates of ∇_θ Q^π by roll-outs (eq. 11), for a policy that is held fixed.
 
-With Q̂_i = R_i + γ W_{i+1}, what a roll-out says of Q^π(s_i, a_i) (see `rollouts`), the **score** estimate is
+With Q̂_i = R_i − z_i + γ W_{i+1}, what a roll-out says of Q^π(s_i, a_i) (see `rollouts`), the **score** estimate is
 
-    ∇_θ Q^π(s_0, a_0) = E [ Σ_i ∇_θ ln T_θ(s_i, a_i, s_{i+1}) γ^i (Q̂_i − E_i) ].
+    ∇_θ Q^π(s_0, a_0) = E [ Σ_i ∇_θ ln T_θ(s_i, a_i, s_{i+1}) γ^i (Q̂_i + z_i − E_i) ].
 
 It is eq. 11 without the terms that average to nothing: rewards that were paid before a transition do not depend on it.
 E_i may be any function of s_i and a_i, for ∇_θ ln T_θ averages to nothing given these; here it is the critic's guess of
-Q^π, that is V_w(s_i) − b_i.
+Q^π, that is V_w(s_i) − b_i. What a move led to is what its own score is about, so its surprise z_i is put back.
 
 The **pathwise** estimate is the derivative of Q̂_0 along the path, with the random numbers held fixed. It needs dynamics
 that are reparameterised and smooth rewards, and is far less noisy then. Where the policy draws from a finite set, its

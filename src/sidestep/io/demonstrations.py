@@ -1,7 +1,5 @@
 """From walks in metres to demonstrations on a grid."""
 
-from dataclasses import replace
-
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
@@ -10,7 +8,7 @@ from sidestep.errors import InputError
 from sidestep.io.gridding import Moves, grid_walks
 from sidestep.io.walks import Walks
 from sidestep.scoring import walkable_graph
-from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.grid import Grid
 from sidestep.tasks import reach, stack_tasks
 
 
@@ -55,8 +53,7 @@ def demonstrations_of_moves(
 
 def _refuse_walled_off(moves: Moves, grid: Grid) -> None:
     """Nobody can be on the way to a goal that known obstacles wall off."""
-    passable = replace(grid, known=np.where(grid.known == Cell.OCCUPIED, Cell.OCCUPIED, Cell.FREE))
-    part = connected_components(walkable_graph(passable), directed=False)[1]
+    part = connected_components(walkable_graph(grid.passable()), directed=False)[1]
     stranded = part[moves.states] != part[moves.goals[moves.walk]]
     if stranded.any():
         row = int(moves.rows[np.argmax(stranded)])

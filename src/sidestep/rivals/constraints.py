@@ -68,7 +68,7 @@ def _logits(
 
 
 def _people(grid: Grid, forbidden: list[int], demonstrations: Demonstrations, settings: Settings) -> _People:
-    known = np.where(grid.known == Cell.OCCUPIED, Cell.OCCUPIED, Cell.FREE)
+    known = grid.passable().known
     known.flat[forbidden] = Cell.OCCUPIED
     model = true_model(replace(grid, known=known))
     visits, total = np.zeros(grid.size), 0.0

@@ -6,7 +6,7 @@ fail. The costs maximise the likelihood of what people did, and are the same for
 the log-sum-exp, whatever the settings say of how people value states; their β counts.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -22,7 +22,7 @@ from sidestep.evaluation import Reward
 from sidestep.inference.priors import Normal
 from sidestep.rivals.learned import Learned
 from sidestep.tabular.backups import Behavior, LogSumExp
-from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import ObstacleGrid, true_model
 from sidestep.tasks import Task
@@ -40,12 +40,12 @@ class CostlyReward(Reward):
     def reach(self, grid: Grid, goal: int) -> Task:
         """The task of reaching a state, less what the cells cost that moves aim at."""
         task = super().reach(grid, goal)
-        return task if self.costs is None else _with_costs(task, true_model(_free(grid)), jnp.asarray(self.costs))
+        return task if self.costs is None else _with_costs(task, true_model(grid.passable()), jnp.asarray(self.costs))
 
 
 def by_costs(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> Learned:
     """A cost for every cell; the ranking is by costs."""
-    model, people = true_model(_free(grid)), Behavior(LogSumExp(), settings.beta)
+    model, people = true_model(grid.passable()), Behavior(LogSumExp(), settings.beta)
 
     @jax.jit
     @jax.value_and_grad
@@ -61,11 +61,6 @@ def by_costs(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> 
     costs = np.asarray(jax.nn.softplus(found.x))
     reward = CostlyReward(settings.discount, settings.step_cost, costs)
     return Learned(model, reward, people, costs.reshape(grid.shape))
-
-
-def _free(grid: Grid) -> Grid:
-    """The same map with everything free that it does not know to be occupied."""
-    return replace(grid, known=np.where(grid.known == Cell.OCCUPIED, Cell.OCCUPIED, Cell.FREE))
 
 
 def _with_costs(tasks: Task, model: ObstacleGrid, costs: Float[Array, " cells"]) -> Task:

@@ -92,6 +92,10 @@ class Grid:
         """The same grid with nothing known."""
         return replace(self, known=np.full_like(self.known, Cell.UNKNOWN))
 
+    def passable(self) -> "Grid":
+        """The same grid with everything free that is not known to be occupied."""
+        return replace(self, known=np.where(self.known == Cell.OCCUPIED, Cell.OCCUPIED, Cell.FREE))
+
     def contains(self, positions: Float[np.ndarray, "points 2"]) -> Bool[np.ndarray, " points"]:
         """Whether each position (metres) lies on the grid; a position that is not finite does not."""
         rows, columns = self.shape
