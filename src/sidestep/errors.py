@@ -26,11 +26,15 @@ class InputError(SidestepError):
         row: int | None = None,
         field: str | None = None,
     ):
-        self.source, self.row, self.field = source, row, field
+        self.message, self.source, self.row, self.field = message, source, row, field
         place = [str(source)] if source is not None else []
         place += [f"row {row}"] if row is not None else []
         place += [f"field '{field}'"] if field is not None else []
         super().__init__(f"{', '.join(place)}: {message}" if place else message)
+
+    def of(self, source: object) -> "InputError":
+        """The same complaint, about something that `source` holds."""
+        return InputError(self.message, source=source, field=self.field)
 
 
 def check_count(value: object, least: int, field: str) -> None:

@@ -1,7 +1,8 @@
-"""Walks along given lines and grids from drawings, for the tests of gridding."""
+"""Walks along given lines, walks at random, and grids from drawings, for the tests of walks and gridding."""
 
 import numpy as np
 import pyarrow as pa
+from hypothesis import strategies as st
 
 from sidestep.io.walks import walks_of_table
 from sidestep.tabular.grid import Cell, Connectivity, Grid
@@ -39,4 +40,31 @@ def grid_of(*drawing, connectivity: Connectivity = 4):
     return Grid(
         np.array([[cells[sign] for sign in row] for row in drawing], dtype=np.int64),
         connectivity=connectivity,
+    )
+
+
+position = st.floats(-1e9, 1e9, allow_nan=False)
+
+
+@st.composite
+def walk_tables(draw):
+    """Tables of up to four walks, with goals, failed moves and notes."""
+    lengths = draw(st.lists(st.integers(2, 4), min_size=1, max_size=4))
+    count = sum(lengths)
+    column = st.lists(position, min_size=count, max_size=count)
+    goals = draw(st.lists(st.tuples(position, position), min_size=len(lengths), max_size=len(lengths)))
+    failed = draw(st.lists(st.none() | st.tuples(position, position), min_size=count, max_size=count))
+    text = st.text("ab\"',\n é0", max_size=4)
+    return pa.table(
+        {
+            "walk": np.repeat(np.arange(len(lengths)), lengths),
+            "step": np.concatenate([np.arange(length) for length in lengths]),
+            "x": draw(column),
+            "y": draw(column),
+            "goal_x": np.repeat([x for x, _ in goals], lengths),
+            "goal_y": np.repeat([y for _, y in goals], lengths),
+            "failed_x": pa.array([pair and pair[0] for pair in failed], pa.float64()),
+            "failed_y": pa.array([pair and pair[1] for pair in failed], pa.float64()),
+            "note": ["note " + draw(text) for _ in range(count)],
+        }
     )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sidestep.errors import InputError
-from sidestep.io.files import read_whole, write_array, write_json, write_whole
+from sidestep.io.files import read_whole, write_array, write_json, write_whole, write_whole_folder
 
 
 def test_a_file_is_written_into_a_new_folder(tmp_path):
@@ -41,6 +41,29 @@ def test_a_file_in_the_place_of_the_folder_is_an_error(tmp_path):
     (tmp_path / "file").write_bytes(b"x")
     with pytest.raises(InputError, match="cannot be written"):
         write_whole(tmp_path / "file" / "note.txt", lambda file: file.write(b"done"))
+
+
+def test_a_whole_folder_takes_its_name_when_it_is_full(tmp_path):
+    def fill(folder):
+        assert not (tmp_path / "new").exists()
+        (folder / "note.txt").write_bytes(b"done")
+
+    write_whole_folder(tmp_path / "new", fill)
+    assert (tmp_path / "new" / "note.txt").read_bytes() == b"done"
+    with pytest.raises(InputError, match="new: is there already: expected a name that is free"):
+        write_whole_folder(tmp_path / "new", fill)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["new"]
+
+
+@pytest.mark.parametrize(("failure", "expected"), [(KeyboardInterrupt, KeyboardInterrupt), (OSError, InputError)])
+def test_a_folder_that_could_not_be_filled_is_gone(tmp_path, failure, expected):
+    def fail(folder):
+        (folder / "note.txt").write_bytes(b"half")
+        raise failure
+
+    with pytest.raises(expected):
+        write_whole_folder(tmp_path / "new", fail)
+    assert not list(tmp_path.iterdir())
 
 
 def test_json_keeps_its_order_and_takes_numpy_numbers(tmp_path):

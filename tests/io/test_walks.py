@@ -4,6 +4,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
+from drawn import walk_tables
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -263,33 +264,7 @@ def test_what_csv_cannot_hold_is_an_error_and_leaves_nothing(tmp_path):
     assert read_walks(tmp_path / "walks.parquet").metadata["tags"].to_pylist() == [["a"], []]
 
 
-position = st.floats(-1e9, 1e9, allow_nan=False)
-
-
-@st.composite
-def tables(draw):
-    lengths = draw(st.lists(st.integers(2, 4), min_size=1, max_size=4))
-    count = sum(lengths)
-    column = st.lists(position, min_size=count, max_size=count)
-    goals = draw(st.lists(st.tuples(position, position), min_size=len(lengths), max_size=len(lengths)))
-    failed = draw(st.lists(st.none() | st.tuples(position, position), min_size=count, max_size=count))
-    text = st.text("ab\"',\n é0", max_size=4)
-    return pa.table(
-        {
-            "walk": np.repeat(np.arange(len(lengths)), lengths),
-            "step": np.concatenate([np.arange(length) for length in lengths]),
-            "x": draw(column),
-            "y": draw(column),
-            "goal_x": np.repeat([x for x, _ in goals], lengths),
-            "goal_y": np.repeat([y for _, y in goals], lengths),
-            "failed_x": pa.array([pair and pair[0] for pair in failed], pa.float64()),
-            "failed_y": pa.array([pair and pair[1] for pair in failed], pa.float64()),
-            "note": ["note " + draw(text) for _ in range(count)],
-        }
-    )
-
-
-@given(tables(), st.sampled_from(["csv", "parquet"]))
+@given(walk_tables(), st.sampled_from(["csv", "parquet"]))
 def test_walks_come_back(tmp_path_factory, table, ending):
     walks, path = walks_of_table(table), tmp_path_factory.mktemp("walks") / f"walks.{ending}"
     write_walks(path, walks)

@@ -1,7 +1,9 @@
-"""Reading a file in full, and writing one so that it appears whole or not at all."""
+"""Reading a file in full, and writing a file or a folder so that it appears whole or not at all."""
 
+import io
 import json
 import os
+import shutil
 import uuid
 from collections.abc import Callable
 from contextlib import suppress
@@ -34,8 +36,7 @@ def write_whole(path: str | Path, write: Callable[[BinaryIO], object]) -> None:
     >>> write_whole("out/note.txt", lambda file: file.write(b"done"))  # doctest: +SKIP
     """
     path = Path(path)
-    # Not `tempfile`, whose files nobody else may read: this one gets the permissions that any new file gets.
-    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
+    partial = _beside(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with partial.open("xb") as file:
@@ -46,6 +47,28 @@ def write_whole(path: str | Path, write: Callable[[BinaryIO], object]) -> None:
     except BaseException as error:
         with suppress(OSError):  # The first error is the one to tell of.
             partial.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise InputError(f"cannot be written: {_reason(error)}", source=path) from error
+        raise
+
+
+def write_whole_folder(path: str | Path, fill: Callable[[Path], object]) -> None:
+    """Write a folder that appears whole or not at all.
+
+    `fill` is called with an empty folder beside `path`, which takes the name `path` once `fill` has returned; if
+    anything fails before that, it is removed. Raises `InputError` for a folder that is there already, or where the file
+    system refuses, and passes on what `fill` raises.
+    """
+    path = Path(path)
+    partial = _beside(path)
+    try:
+        if path.exists():
+            raise InputError("is there already: expected a name that is free", source=path)
+        partial.mkdir(parents=True)
+        fill(partial)
+        os.rename(partial, path)
+    except BaseException as error:
+        shutil.rmtree(partial, ignore_errors=True)
         if isinstance(error, OSError):
             raise InputError(f"cannot be written: {_reason(error)}", source=path) from error
         raise
@@ -76,6 +99,27 @@ def read_json(path: str | Path) -> Any:
 def write_array(path: str | Path, array: np.ndarray) -> None:
     """Write an array of numbers as a `.npy` file, whole or not at all."""
     write_whole(path, lambda file: np.save(file, array, allow_pickle=False))
+
+
+def read_array(path: str | Path, kinds: str) -> np.ndarray:
+    """The array in a `.npy` file; `kinds` are those of its dtype ("f" floats, "iu" whole numbers).
+
+    Raises `InputError` for a file that holds no such array.
+    """
+    content = read_whole(path)
+    try:
+        array = np.load(io.BytesIO(content), allow_pickle=False)
+    except Exception as error:  # what is not an array raises errors of many kinds
+        raise InputError(f"expected a NumPy array: {error}", source=path) from error
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in kinds:
+        raise InputError("expected a NumPy array of numbers", source=path)
+    return array
+
+
+def _beside(path: Path) -> Path:
+    """A hidden name beside a path, for what is not whole yet."""
+    # Not `tempfile`, whose files nobody else may read: this one gets the permissions that any new file gets.
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
 
 
 def _plain(value: object) -> object:

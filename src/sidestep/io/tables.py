@@ -2,13 +2,15 @@
 
 import csv
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.parquet
+from jaxtyping import Float
 
 from sidestep.errors import InputError
 from sidestep.io.files import read_whole, write_whole
@@ -46,6 +48,52 @@ def write_table(path: str | Path, table: pa.Table) -> None:
         write_whole(path, lambda file: write(table, file))
     except pa.ArrowException as error:
         raise InputError(f"the table cannot be written: {error}", source=path) from error
+
+
+def check_columns(table: pa.Table, names: Sequence[str], source: str) -> None:
+    """Raises `InputError` for the first of these columns that a table does not have."""
+    for name in names:
+        if name not in table.column_names:
+            raise InputError(f"the column is missing; found {', '.join(table.column_names)}", source=source, field=name)
+
+
+def number_column(table: pa.Table, name: str, source: str) -> Float[np.ndarray, " rows"]:
+    """A column as numbers, NaN where a cell is empty; `InputError`, with the row, for infinity and no number."""
+    column = table[name]
+    kinds = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal, pa.types.is_string)
+    if not any(is_kind(column.type) for is_kind in (*kinds, pa.types.is_large_string, pa.types.is_null)):
+        raise InputError(f"expected numbers, found {column.type}", source=source, field=name)
+    try:
+        # Not safe, because whole numbers beyond 2^53 may lose their last digits here.
+        numbers = column.cast(pa.float64(), safe=False).to_numpy()
+    except pa.ArrowInvalid:
+        row, cell = next((row, cell) for row, cell in enumerate(column, start=1) if not _is_number(cell))
+        raise InputError(f"expected a number, found {cell.as_py()!r}", source=source, row=row, field=name) from None
+    infinite = np.isinf(numbers)
+    if infinite.any():
+        row = int(np.argmax(infinite)) + 1
+        raise InputError("expected a finite number, found infinity", source=source, row=row, field=name)
+    return numbers
+
+
+def _is_number(cell: pa.Scalar) -> bool:
+    """Whether a cell can be read as a number."""
+    try:
+        cell.cast(pa.float64())
+    except pa.ArrowInvalid:
+        return False
+    return True
+
+
+def finite_column(table: pa.Table, name: str, source: str) -> Float[np.ndarray, " rows"]:
+    """A column of numbers that may not be empty anywhere; `InputError` as for `number_column`."""
+    numbers = number_column(table, name, source)
+    missing = np.isnan(numbers)
+    if missing.any():
+        row = int(np.argmax(missing)) + 1
+        found = "an empty cell" if not table[name][row - 1].is_valid else "NaN"
+        raise InputError(f"expected a finite number, found {found}", source=source, row=row, field=name)
+    return numbers
 
 
 def _by_ending(path: str | Path, choices: dict[str, Callable]) -> Callable:

@@ -11,23 +11,29 @@ A table holds one row a position, in columns
 - `failed_x`, `failed_y` (optional): filled only in rows that mark a failed move: the person tried to step
   to this position, could not, and stayed at `x`, `y`,
 
-and any other column is metadata, carried along. Rows are counted as people count them: the first under the
+and any other column is metadata, carried along. A Minari dataset, `minari:ID`, is such a table too, whose rows
+are all its positions (`sidestep.io.minari.walks`). Rows are counted as people count them: the first under the
 header is 1.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
+from functools import partial
+from pathlib import Path, PurePath
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from jaxtyping import Bool, Float, Int, Integer, Real
 
 from sidestep.errors import InputError
-from sidestep.io.tables import read_table, write_table
+from sidestep.io.minari.walks import read_positions, write_positions
+from sidestep.io.tables import check_columns, finite_column, number_column, read_table, write_table
 
 _REQUIRED = ("walk", "step", "x", "y")
 _OPTIONAL = ("goal_x", "goal_y", "failed_x", "failed_y")
+_STORES = {"minari": (read_positions, write_positions)}
+"""Where else than in files walks are kept, by what stands before the colon: how they are read and written."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,17 +91,20 @@ class Walks:
 
 
 def read_walks(path: str | Path) -> Walks:
-    """The walks in a `.csv` or `.parquet` file; see the module for the columns and `walks_of_table` for the
-    errors.
+    """The walks in a `.csv` or `.parquet` file, or in a local Minari dataset, `minari:ID`.
+
+    See the module for the columns, `walks_of_table` and `read_positions` for the errors.
 
     >>> walks = read_walks("walks.csv")  # doctest: +SKIP
     """
-    return walks_of_table(read_table(path, labels=("walk",)), source=str(path))
+    read, _, name = _kept(path)
+    return walks_of_table(read(name), source=str(path))
 
 
 def write_walks(path: str | Path, walks: Walks) -> None:
-    """Write walks as `.csv` or `.parquet`, whole or not at all, walk by walk, for `read_walks`."""
-    write_table(path, table_of_walks(walks))
+    """Write walks as `.csv`, `.parquet` or `minari:ID`, whole or not at all, walk by walk, for `read_walks`."""
+    _, write, name = _kept(path)
+    write(name, table_of_walks(walks))
 
 
 def walks_of_table(table: pa.Table, source: str = "walks") -> Walks:
@@ -116,11 +125,11 @@ def walks_of_table(table: pa.Table, source: str = "walks") -> Walks:
     order = np.argsort(walk_of_row, kind="stable")
     walk, rows = walk_of_row[order], order + 1
     offsets = np.searchsorted(walk, np.arange(len(encoded.dictionary) + 1))
-    positions = np.stack([_finite(table, "x", source), _finite(table, "y", source)], axis=1)[order]
+    positions = np.stack([finite_column(table, "x", source), finite_column(table, "y", source)], axis=1)[order]
     steps = _steps(table, source)[order]
     _refuse(np.diff(steps) <= 0, walk, rows, source, "step", "expected steps that increase within a walk")
     if "t" in table.column_names:
-        times = _finite(table, "t", source)[order]
+        times = finite_column(table, "t", source)[order]
         _refuse(np.diff(times) < 0, walk, rows, source, "t", "expected times that never decrease within a walk")
     if (np.diff(offsets) == 1).any():
         index = int(np.argmax(np.diff(offsets) == 1))
@@ -157,12 +166,16 @@ def table_of_walks(walks: Walks) -> pa.Table:
     return pa.table(columns | {name: walks.metadata[name] for name in walks.metadata.column_names})
 
 
+def _kept(path: str | Path) -> tuple[Callable[[Any], pa.Table], Callable[[Any, pa.Table], None], str | Path]:
+    """How walks are read and written there, and under which name."""
+    store, _, name = PurePath(path).as_posix().partition(":")
+    return (*_STORES[store], name) if store in _STORES else (partial(read_table, labels=("walk",)), write_table, path)
+
+
 def _check_columns(table: pa.Table, source: str) -> None:
     """Refuse tables without rows or without a column they need."""
+    check_columns(table, _REQUIRED, source)
     names = table.column_names
-    for name in _REQUIRED:
-        if name not in names:
-            raise InputError(f"the column is missing; found {', '.join(names)}", source=source, field=name)
     for first, second in (("goal_x", "goal_y"), ("failed_x", "failed_y")):
         if (first in names) != (second in names):
             absent = second if first in names else first
@@ -182,48 +195,9 @@ def _labels(table: pa.Table, source: str) -> pa.DictionaryArray:
     return column.dictionary_encode()
 
 
-def _numbers(table: pa.Table, name: str, source: str) -> Float[np.ndarray, " rows"]:
-    """A column as numbers, NaN where a cell is empty; infinities are refused."""
-    column = table[name]
-    kinds = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal, pa.types.is_string)
-    if not any(is_kind(column.type) for is_kind in (*kinds, pa.types.is_large_string, pa.types.is_null)):
-        raise InputError(f"expected numbers, found {column.type}", source=source, field=name)
-    try:
-        # Not safe, because whole numbers beyond 2^53 may lose their last digits here.
-        numbers = column.cast(pa.float64(), safe=False).to_numpy()
-    except pa.ArrowInvalid:
-        row, cell = next((row, cell) for row, cell in enumerate(column, start=1) if not _is_number(cell))
-        raise InputError(f"expected a number, found {cell.as_py()!r}", source=source, row=row, field=name) from None
-    infinite = np.isinf(numbers)
-    if infinite.any():
-        row = int(np.argmax(infinite)) + 1
-        raise InputError("expected a finite number, found infinity", source=source, row=row, field=name)
-    return numbers
-
-
-def _is_number(cell: pa.Scalar) -> bool:
-    """Whether a cell can be read as a number."""
-    try:
-        cell.cast(pa.float64())
-    except pa.ArrowInvalid:
-        return False
-    return True
-
-
-def _finite(table: pa.Table, name: str, source: str) -> Float[np.ndarray, " rows"]:
-    """A column of numbers that may not be empty anywhere."""
-    numbers = _numbers(table, name, source)
-    missing = np.isnan(numbers)
-    if missing.any():
-        row = int(np.argmax(missing)) + 1
-        found = "an empty cell" if not table[name][row - 1].is_valid else "NaN"
-        raise InputError(f"expected a finite number, found {found}", source=source, row=row, field=name)
-    return numbers
-
-
 def _steps(table: pa.Table, source: str) -> Real[np.ndarray, " rows"]:
     """The steps, whole numbers where all are (nanoseconds would not fit a float), else as they are."""
-    numbers = _finite(table, "step", source)
+    numbers = finite_column(table, "step", source)
     try:
         return table["step"].cast(pa.int64()).to_numpy()
     except pa.ArrowInvalid:
@@ -234,7 +208,7 @@ def _pair(table: pa.Table, first: str, second: str, source: str) -> Float[np.nda
     """Two optional columns of numbers, both filled or both empty (NaN) in each row."""
     if first not in table.column_names:
         return np.full((len(table), 2), np.nan)
-    pair = np.stack([_numbers(table, first, source), _numbers(table, second, source)], axis=1)
+    pair = np.stack([number_column(table, first, source), number_column(table, second, source)], axis=1)
     empty = np.isnan(pair)
     half = empty[:, 0] != empty[:, 1]
     if half.any():

@@ -156,26 +156,41 @@ BACKUPS: Mapping[str, Callable[[], Backup]] = MappingProxyType(
 
 
 class Behavior(eqx.Module):
-    """How people act: the backup they value states with, and how sharply they choose.
+    """How people act: the backup they value states with, how sharply they choose, and how often they lapse.
 
-    The probability of an action is ∝ exp(β Q(s, a)) (eqs. 2 and 3). `beta` is in units of one over reward, above 0.
-    Raises `InputError` for β ≤ 0 or not finite.
+    The probability of an action is ∝ exp(β Q(s, a)) (eqs. 2 and 3). With the probability `lapse` people do anything at
+    all instead; they do not reckon with that when they value states.
+
+    - `beta`: β in units of one over reward, above 0.
+    - `lapse`: a share of actions, at least 0 and below 1; None for none.
+
+    Raises `InputError` for β ≤ 0 or not finite, and for a share of lapses out of that range.
 
     >>> people = Behavior(BoltzmannAverage(), beta=10.0)
     """
 
     backup: Backup
     beta: Float[Array, ""]
+    lapse: Float[Array, ""] | None
 
-    def __init__(self, backup: Backup, beta: float | Float[Array, ""] = 10.0):
+    def __init__(
+        self, backup: Backup, beta: float | Float[Array, ""] = 10.0, lapse: float | Float[Array, ""] | None = None
+    ):
         self.backup = backup
         self.beta = jnp.asarray(beta, dtype=jnp.result_type(float))
+        self.lapse = None if lapse is None else jnp.asarray(lapse, dtype=jnp.result_type(float))
         if not isinstance(self.beta, Tracer) and not (jnp.isfinite(self.beta) and self.beta > 0):
             raise InputError(f"expected a finite number above 0, found {beta}", field="beta")
+        if self.lapse is not None and not isinstance(self.lapse, Tracer) and not 0 <= self.lapse < 1:
+            raise InputError(f"expected a share, at least 0 and below 1, found {lapse}", field="lapse")
 
     def log_policy(self, q: ActionValues) -> ActionValues:
         """log π(a | s) from action values."""
-        return jax.nn.log_softmax(self.beta.astype(q.dtype) * _below_best(q), axis=-1)
+        chosen = jax.nn.log_softmax(self.beta.astype(q.dtype) * _below_best(q), axis=-1)
+        if self.lapse is None:
+            return chosen
+        lapse = self.lapse.astype(q.dtype)
+        return jnp.logaddexp(chosen + jnp.log1p(-lapse), jnp.log(lapse / q.shape[-1]))
 
 
 def _below_best(q: ActionValues) -> ActionValues:

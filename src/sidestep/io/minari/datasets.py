@@ -1,0 +1,167 @@
+"""Minari datasets on this machine: read episode by episode, and written whole or not at all.
+
+A dataset has an id, `NAME-vVERSION` or `NAMESPACE/NAME-vVERSION`, under which Minari keeps it in the folder that
+`MINARI_DATASETS_PATH` names (by default `~/.minari/datasets`). One that lies elsewhere is named by its path: a `Path`,
+or text that is no id, such as `./office-v0`. Nothing is ever downloaded.
+"""
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from sidestep.errors import InputError, SidestepError
+from sidestep.io.files import write_whole_folder
+
+_ID = re.compile(r"(?:(?P<namespace>[-\w]+(?:/[-\w]+)*)/)?[-\w]+?(?P<version>-v\d+)?")
+
+
+class Episode(NamedTuple):
+    """One episode: what was seen, and between each two sights what was done and what it paid.
+
+    - `observations`: an array, or by name several, one row more than there are moves.
+    - `terminated`: whether it ended in a terminal state, rather than being cut.
+    - `infos`: what else is known of each observation; `metadata`: of the whole episode.
+    - `source`: the dataset and Minari's number of the episode (the first is 0), for error messages.
+    """
+
+    observations: Any
+    actions: Any
+    rewards: Float[np.ndarray, " moves"]
+    terminated: bool
+    infos: Mapping[str, Any]
+    metadata: Mapping[str, Any]
+    source: str = ""
+
+
+class Dataset(NamedTuple):
+    """A dataset in memory: Gymnasium's spaces, the metadata of the whole, and its episodes, at least one."""
+
+    observation_space: Any
+    action_space: Any
+    metadata: Mapping[str, Any]
+    episodes: list[Episode]
+
+
+def require_minari(dataset: str | Path) -> None:
+    """Raises `InputError` where the library Minari is not installed."""
+    try:
+        import minari  # noqa: F401
+    except ImportError as error:
+        message = "a Minari dataset, but Minari is not installed: expected pip install 'sidestep[minari]' to have run"
+        raise InputError(message, source=dataset) from error
+
+
+def read_dataset(dataset: str | Path, check_spaces: Callable[[Any, Any], None]) -> Dataset:
+    """A dataset on this machine, by its id or its path.
+
+    - `check_spaces`: refuses spaces of observations and actions, before any episode is read (images fill the memory).
+
+    Raises `InputError` for a dataset that is not there, broken or empty, and for an episode without a move or with
+    another number of observations than one more than its moves.
+    """
+    require_minari(dataset)
+    with _told(dataset, "read"):
+        from minari import MinariDataset
+        from minari.storage import get_dataset_path
+
+        by_id = isinstance(dataset, str) and _ID.fullmatch(dataset)
+        folder = get_dataset_path(str(dataset)) if by_id else Path(dataset)
+        data = folder / "data" if (folder / "data").is_dir() else folder
+        if not (data / "metadata.json").is_file():
+            raise InputError(
+                "there is no such dataset here: expected one that `minari list local` shows, or the path of one",
+                source=dataset,
+            )
+        opened = MinariDataset(data)
+        check_spaces(opened.observation_space, opened.action_space)
+        found = list(opened.iterate_episodes())
+        metadata = list(opened.storage.get_episode_metadata(opened.episode_indices))
+        spaces, about = (opened.observation_space, opened.action_space), opened.storage.metadata
+    if not found:
+        raise InputError("expected at least one episode, found none", source=dataset)
+    episodes = [
+        Episode(
+            each.observations,
+            each.actions,
+            each.rewards,
+            bool(each.terminations[-1:].any()),
+            each.infos or {},
+            known,
+            f"{dataset}, episode {each.id}",
+        )
+        for each, known in zip(found, metadata, strict=True)
+    ]
+    for episode in episodes:
+        _check_lengths(episode)
+    return Dataset(*spaces, about, episodes)
+
+
+def write_dataset(dataset: str, found: Dataset) -> None:
+    """Write a dataset under an id, whole or not at all.
+
+    Raises `InputError` for an id that is not one or is taken, and for what Minari cannot hold.
+    """
+    require_minari(dataset)
+    parts = _ID.fullmatch(dataset)
+    if parts is None or parts["version"] is None:
+        raise InputError("expected an id with a version, such as office/walks-v0", source=dataset)
+    with _told(dataset, "written"):
+        from minari.namespace import create_namespace, list_local_namespaces
+        from minari.storage import get_dataset_path
+
+        write_whole_folder(get_dataset_path(dataset), lambda partial: _fill(partial / "data", dataset, found))
+        if parts["namespace"] is not None and parts["namespace"] not in list_local_namespaces():
+            create_namespace(parts["namespace"])
+
+
+def _fill(data: Path, dataset: str, found: Dataset) -> None:
+    """A new dataset in a folder."""
+    from minari import __version__
+    from minari.data_collector import EpisodeBuffer
+    from minari.dataset.minari_storage import MinariStorage
+
+    storage = MinariStorage.new(data, found.observation_space, found.action_space)
+    storage.update_metadata({"dataset_id": dataset, "minari_version": __version__, **found.metadata})
+    storage.update_episodes([EpisodeBuffer(**_buffered(episode)) for episode in found.episodes])
+    storage.update_episode_metadata([dict(episode.metadata) for episode in found.episodes])
+
+
+def _buffered(episode: Episode) -> dict[str, Any]:
+    """An episode in Minari's words: it is terminated or truncated at its last move."""
+    last = np.arange(len(episode.rewards)) == len(episode.rewards) - 1
+    return {
+        "observations": episode.observations,
+        "actions": episode.actions,
+        "rewards": episode.rewards,
+        "terminations": last & episode.terminated,
+        "truncations": last & (not episode.terminated),
+        "infos": dict(episode.infos),
+    }
+
+
+def _check_lengths(episode: Episode) -> None:
+    moves = len(episode.rewards)
+    if moves == 0:
+        raise InputError("expected at least one move, found none", source=episode.source, field="rewards")
+    seen = episode.observations
+    for name, values in seen.items() if isinstance(seen, Mapping) else [("observations", seen)]:
+        if len(values) != moves + 1:
+            message = f"expected {moves + 1} observations around {moves} moves, found {len(values)}"
+            raise InputError(message, source=episode.source, field=name)
+
+
+@contextmanager
+def _told(dataset: str | Path, done: Literal["read", "written"]) -> Iterator[None]:
+    """Whatever Minari, its formats and their libraries raise (assertions among it), as `InputError`."""
+    try:
+        yield
+    except SidestepError:
+        raise
+    except Exception as error:
+        message = f"the dataset cannot be {done}: {type(error).__name__}: {error}"
+        raise InputError(message, source=dataset) from error

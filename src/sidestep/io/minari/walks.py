@@ -1,0 +1,189 @@
+"""Walks as Minari datasets, in the form of point mazes, and datasets of positions as tables of walks.
+
+Observations are a `Dict` with `achieved_goal`, the positions, and `desired_goal`, the goal, the same all along. Or they
+are a `Box`, the positions; the goal then is that of the episode's metadata (`goal`), and without one the last position.
+Of positions and goals, the first two numbers are x and y in metres, and others are left out. The metadata's `walk` is a
+walk's label, by default Minari's number of the episode. `infos` that hold one number or text for every position become
+columns of that name, meaning what they mean to `sidestep.io.walks`: `step` (by default 0, 1, …), `t`, `failed_x`,
+`failed_y`, or metadata.
+
+Walks are written so that this gives them back. An action is how far the walker tried to go from a position, in metres;
+the last one pays 1 if it arrives at the goal, and nothing else is paid.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Float, Shaped
+
+from sidestep.errors import InputError
+from sidestep.io.minari.datasets import Dataset, Episode, read_dataset, require_minari, write_dataset
+
+_OWN = ("walk", "x", "y", "goal_x", "goal_y")
+"""Columns that are not from `infos`."""
+_FAILED = ("failed_x", "failed_y")
+
+
+def read_positions(dataset: str) -> pa.Table:
+    """The walks of a local Minari dataset, by its id or its path: a table as in `sidestep.io.walks`.
+
+    Raises `InputError` for a dataset that is not there, broken or empty, has no positions in its observations, or
+    labels two walks alike, and, naming the episode and the field, for positions and goals that are not finite or of
+    another shape, and for goals that change.
+    """
+    found = read_dataset(dataset, lambda observed, _: _check_space(observed, dataset))
+    tables = [
+        _table(episode, label) for episode, label in zip(found.episodes, _labels(found.episodes, dataset), strict=True)
+    ]
+    try:
+        return pa.concat_tables(tables, promote_options="permissive")
+    except pa.ArrowException as error:
+        message = f"expected infos of the same kind in all episodes: {error}"
+        raise InputError(message, source=dataset, field="infos") from error
+
+
+def write_positions(dataset: str, table: pa.Table) -> None:
+    """Write a table of walks, as `table_of_walks` makes it, as a local Minari dataset, whole or not at all.
+
+    Raises `InputError` for an id that is malformed or taken, a table without rows, and a column that is neither numbers
+    nor text, or has gaps.
+    """
+    require_minari(dataset)
+    if len(table) == 0:
+        raise InputError("expected at least one walk, found none", source=dataset)
+    from gymnasium.spaces import Box, Dict
+
+    plane = Box(-np.inf, np.inf, (2,), np.float64)
+    seen = Dict({"observation": plane, "achieved_goal": plane, "desired_goal": plane})
+    write_dataset(dataset, Dataset(seen, plane, {}, list(_episodes(table, dataset))))
+
+
+def _episodes(table: pa.Table, dataset: str) -> Iterator[Episode]:
+    """The episode of each walk."""
+    infos = {name: _info(table[name], name, dataset) for name in table.column_names if name not in _OWN}
+    positions, goals = _pair(table, "x", "y"), _pair(table, "goal_x", "goal_y")
+    aims = positions
+    if _FAILED[0] in infos:
+        failed = np.stack([infos[name] for name in _FAILED], axis=1)
+        aims = np.where(np.isnan(failed), positions, failed)
+    labels = table["walk"].to_pylist()
+    starts = [row for row in range(1, len(labels)) if labels[row] != labels[row - 1]]
+    for rows in np.split(np.arange(len(labels)), starts):
+        path, goal = positions[rows], goals[rows[0]]
+        arrived = bool((path[-1] == goal).all())
+        rewards = np.append(np.zeros(len(rows) - 2), float(arrived))
+        observations = {"observation": path, "achieved_goal": path, "desired_goal": goals[rows]}
+        metadata = {"walk": labels[rows[0]], "goal": goal.tolist()}
+        own = {name: values[rows] for name, values in infos.items()}
+        yield Episode(observations, aims[rows[1:]] - path[:-1], rewards, arrived, own, metadata)
+
+
+def _info(column: pa.ChunkedArray, name: str, dataset: str) -> Shaped[np.ndarray, " rows"]:
+    """A column as `infos` hold it."""
+    if name in _FAILED:  # Empty but where a move failed, and NaN says so.
+        return column.to_numpy()
+    kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
+    if pa.types.is_string(kind) or pa.types.is_large_string(kind):
+        values = np.asarray(column.to_pylist(), dtype=object)
+    elif pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind):
+        values = column.to_numpy()
+    else:
+        raise InputError(f"expected numbers or text, found {kind}; leave the column out", source=dataset, field=name)
+    if column.null_count:
+        row = column.is_null().to_pylist().index(True) + 1
+        message = "a Minari dataset holds no empty cells; fill it, or leave the column out"
+        raise InputError(message, source=dataset, row=row, field=name)
+    return values
+
+
+def _pair(table: pa.Table, first: str, second: str) -> Float[np.ndarray, "rows 2"]:
+    return np.stack([table[first].to_numpy(), table[second].to_numpy()], axis=1)
+
+
+def _check_space(space: Any, dataset: str) -> None:
+    """Refuse observations that hold no positions."""
+    from gymnasium.spaces import Box, Dict
+
+    if isinstance(space, Dict) and "achieved_goal" not in space.spaces:
+        message = f"expected achieved_goal among the observations, found {', '.join(space.spaces)}"
+        raise InputError(message, source=dataset, field="observation_space")
+    for name, each in _places(space.spaces if isinstance(space, Dict) else space).items():
+        if not (isinstance(each, Box) and len(each.shape) == 1 and each.shape[0] >= 2):
+            raise InputError(f"expected a Box of at least two numbers x, y, found {each}", source=dataset, field=name)
+
+
+def _places(seen: Any) -> dict[str, Any]:
+    """The part of observations, or of their space, that holds positions, and then the part that holds goals."""
+    if not isinstance(seen, Mapping):
+        return {"observations": seen}
+    return {name: seen[name] for name in ("achieved_goal", "desired_goal") if name in seen}
+
+
+def _labels(episodes: Sequence[Episode], dataset: str) -> list[Any]:
+    """The label of each walk, or, unless all episodes have one, Minari's numbers of the episodes."""
+    labels = [episode.metadata.get("walk") for episode in episodes]
+    if any(label is None for label in labels):
+        return list(range(len(labels)))
+    labels = [label.item() if isinstance(label, np.generic) else label for label in labels]
+    if len(set(labels)) < len(labels):
+        twice = next(label for label in labels if labels.count(label) > 1)
+        raise InputError(f"expected different walks, found {twice!r} more than once", source=dataset, field="walk")
+    return labels
+
+
+def _table(episode: Episode, label: object) -> pa.Table:
+    """One walk, a row a position."""
+    rows = len(episode.rewards) + 1
+    places = {
+        name: _plane(values, rows, episode.source, name) for name, values in _places(episode.observations).items()
+    }
+    positions, goal = next(iter(places.values())), _goal(episode, places.get("desired_goal"))
+    columns = {"walk": pa.array([label] * rows), "step": np.arange(rows), "x": positions[:, 0], "y": positions[:, 1]}
+    if goal is not None:
+        columns |= {"goal_x": np.full(rows, goal[0]), "goal_y": np.full(rows, goal[1])}
+    return pa.table(columns | _columns(episode.infos, rows))
+
+
+def _goal(episode: Episode, seen: Float[np.ndarray, "rows 2"] | None) -> Float[np.ndarray, " 2"] | None:
+    """Where an episode wants to go, if it says so."""
+    if seen is not None:
+        changed = (seen != seen[0]).any(axis=1)
+        if changed.any():
+            message = f"expected one goal, found another at step {int(np.argmax(changed))}"
+            raise InputError(message, source=episode.source, field="desired_goal")
+        return seen[0]
+    told = episode.metadata.get("goal")
+    return None if told is None else _plane([told], 1, episode.source, "goal")[0]
+
+
+def _plane(values: Any, rows: int, source: str, field: str) -> Float[np.ndarray, "rows 2"]:
+    """x and y, the first two numbers of each row."""
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"expected numbers: {error}", source=source, field=field) from error
+    if array.ndim != 2 or len(array) != rows or array.shape[1] < 2:
+        message = f"expected x and y in each of {rows} rows, found shape {array.shape}"
+        raise InputError(message, source=source, field=field)
+    places = array[:, :2]
+    wrong = ~np.isfinite(places).all(axis=1)
+    if wrong.any():
+        step = int(np.argmax(wrong))
+        message = f"expected finite numbers, found {places[step].tolist()} at step {step}"
+        raise InputError(message, source=source, field=field)
+    return places
+
+
+def _columns(infos: Mapping[str, Any], rows: int) -> dict[str, pa.Array]:
+    """The infos that say one thing of every position; text comes as bytes."""
+    columns = {}
+    for name, values in infos.items():
+        if name in _OWN or not isinstance(values, np.ndarray) or values.shape != (rows,):
+            continue
+        if values.dtype.kind in "biuf":
+            columns[name] = pa.array(values)
+        elif all(isinstance(each, str | bytes) for each in values):
+            columns[name] = pa.array([each.decode() if isinstance(each, bytes) else str(each) for each in values])
+    return columns

@@ -1,0 +1,424 @@
+"""Demonstrations as Minari datasets: they come back, others can read them, and what others wrote is read or refused."""
+
+import gc
+import json
+import os
+import re
+import sys
+import warnings
+from pathlib import Path
+
+import equinox as eqx
+import gymnasium
+import jax.numpy as jnp
+import minari
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Discrete
+from hypothesis import given
+from hypothesis import strategies as st
+from minari.namespace import list_local_namespaces
+from stored import buffer, fresh, store
+
+from sidestep.demonstrations import Trajectory, gather
+from sidestep.errors import InputError
+from sidestep.inference.fit import fit
+from sidestep.inference.priors import Normal
+from sidestep.io.gymnasium import collect, from_gymnasium, slippery
+from sidestep.io.minari.demonstrations import read_demonstrations, write_demonstrations
+from sidestep.tabular.backups import Behavior, BoltzmannAverage
+from sidestep.tabular.graph import Graph
+from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.planning import plan
+from sidestep.tasks import Task, reach, stack_tasks
+
+pytestmark = pytest.mark.usefixtures("datasets", "unoptimised")
+
+DISCOUNT = 0.97
+SPACES = Discrete(6), Discrete(4)
+GRID = Grid.unknown(2, 3)
+DOCS = Path(__file__).parents[2] / "docs" / "files.md"
+
+
+def complete(states, actions):
+    """A graph in which every action may lead anywhere."""
+    successors = np.broadcast_to(np.arange(states), (states, actions, states))
+    return Graph(jnp.asarray(successors, jnp.int32), jnp.ones((1, 1)))
+
+
+sizes = st.tuples(st.integers(2, 3), st.integers(1, 2), st.integers(1, 2), st.integers(1, 3), st.integers(0, 2**32))
+"""How many states, actions, tasks and walks there are, and the seed of all else."""
+
+
+def pursuits(states, actions, tasks, walks, seed):
+    """A graph, and walks towards tasks on it, whose rewards have full and short axes."""
+    random = np.random.default_rng(seed)
+    wanted, walked = [], []
+    for _ in range(tasks):
+        terminal = jnp.asarray(np.arange(states) >= random.integers(1, states + 1))  # at times there is none
+        reward = random.normal(size=(random.choice([1, states]), random.choice([1, actions])))
+        final = random.normal(size=random.choice([1, states]))
+        wanted.append(Task(jnp.asarray(reward), jnp.asarray(final), terminal, jnp.asarray(random.uniform(0.1, 1.0))))
+    for task in random.integers(tasks, size=walks):
+        moves = random.integers(1, 5)
+        acting = np.flatnonzero(~np.asarray(wanted[task].terminal))
+        path = np.append(random.choice(acting, moves), random.integers(states))
+        walked.append(Trajectory(path, random.integers(actions, size=moves), int(task)))
+    return complete(states, actions), gather(walked, wanted)
+
+
+@given(sizes)
+def test_demonstrations_come_back_bit_by_bit(size):
+    world, demonstrations = pursuits(*size)
+    dataset = fresh("ours/back")
+    write_demonstrations(dataset, demonstrations, world)
+    assert eqx.tree_equal(read_demonstrations(dataset, world), demonstrations)
+
+
+@given(sizes)
+def test_returns_are_what_tasks_pay(size):
+    """Σ γ^t r_t of an episode: R of every move, and the final reward one move after the last."""
+    world, demonstrations = pursuits(*size)
+    dataset, tasks = fresh("ours/paid"), demonstrations.tasks
+    write_demonstrations(dataset, demonstrations, world)
+    trajectory = np.asarray(demonstrations.trajectory)
+    for episode, path in zip(minari.load_dataset(dataset), demonstrations.paths(), strict=True):
+        own = np.flatnonzero(trajectory == episode.id)
+        task = int(demonstrations.task[own[0]])
+        discount, reward, final = float(tasks.discount[task]), tasks.reward[task], tasks.final_reward[task]
+        expected = 0.0
+        for t, (state, action) in enumerate(zip(path, np.asarray(demonstrations.actions)[own], strict=False)):
+            expected += discount**t * reward[min(state, len(reward) - 1), min(action, reward.shape[1] - 1)]
+        arrived = bool(tasks.terminal[task, path[-1]])
+        expected += arrived * discount ** len(own) * final[min(path[-1], len(final) - 1)]
+        found = (discount ** np.arange(len(own)) * episode.rewards).sum()
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+        assert episode.terminations.tolist() == [False] * (len(own) - 1) + [arrived]
+        assert episode.truncations.tolist() == [False] * (len(own) - 1) + [not arrived]
+
+
+def towards(*goals, discount=0.95):
+    """One walk from cell 0 along the top of the grid towards each goal, each of a task of its own."""
+    walks = [Trajectory(np.array([0, 1, 2]), np.array([3, 3]), index) for index in range(len(goals))]
+    return gather(walks, [reach(GRID, goal, discount=discount) for goal in goals])
+
+
+def test_others_see_states_actions_goals_and_discounts():
+    dataset = fresh("ours/seen")
+    write_demonstrations(dataset, towards(2, 5), GRID)
+    found = minari.load_dataset(dataset)
+    assert (found.observation_space, found.action_space) == SPACES
+    assert dataset in minari.list_local_datasets()
+    assert "ours" in list_local_namespaces()
+    assert [episode.observations.tolist() for episode in found] == [[0, 1, 2]] * 2
+    assert [episode.actions.tolist() for episode in found] == [[3, 3]] * 2
+    told = list(found.storage.get_episode_metadata([0, 1]))
+    assert [(each["goal"], each["discount"], each["task"]) for each in told] == [(2, 0.95, 0), (5, 0.95, 1)]
+
+
+# A frozen lake
+
+
+def lake_policy(world, people):
+    return np.asarray(plan(world.model, world.task, people).policy)
+
+
+def test_a_lake_s_slip_is_learned_alike_from_what_was_read():
+    env, people = gymnasium.make("FrozenLake-v1"), Behavior(BoltzmannAverage(), 30.0)
+    world = from_gymnasium(env, DISCOUNT)
+    policy = lake_policy(world, people)
+    walked = collect(env, world, lambda state, random: random.choice(4, p=policy[state]), 50, seed=0)
+    demonstrations, dataset = gather(walked, [world.task]), fresh("lake/people")
+    write_demonstrations(dataset, demonstrations, world.model.graph)
+    again = read_demonstrations(dataset, world.model.graph)
+    first, second = (
+        fit(slippery(world, -3.0), each, people, prior=Normal(0.0, 10.0)) for each in (demonstrations, again)
+    )
+    assert first.final.objective == second.final.objective
+    assert first.converged
+
+
+def record(env, act, episodes):
+    """The id of a dataset that Minari's own collector recorded."""
+    dataset = fresh("others/collected")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # that nobody tells the author
+        warnings.simplefilter("ignore", ResourceWarning)  # that temporary folders are left to the collection of garbage
+        collector = minari.DataCollector(env)
+        for seed in range(episodes):
+            state, _ = collector.reset(seed=seed)
+            over = False
+            while not over:
+                state, _, terminated, truncated, _ = collector.step(act(int(state)))
+                over = terminated or truncated
+        collector.create_dataset(dataset)
+        del collector
+        gc.collect()
+    return dataset
+
+
+def test_episodes_of_minari_s_collector_are_read_and_paid_as_the_environment_paid():
+    env = gymnasium.make("FrozenLake-v1", max_episode_steps=30)
+    world, draw = from_gymnasium(env, DISCOUNT), np.random.default_rng(0)
+    policy = lake_policy(world, Behavior(BoltzmannAverage(), 30.0))
+    dataset = record(env, lambda state: int(draw.choice(4, p=policy[state])), 20)
+    demonstrations = read_demonstrations(dataset, world.model.graph, task=world.task)
+    again = fresh("ours/again")
+    write_demonstrations(again, demonstrations, world.model.graph)
+    ours, recorded = minari.load_dataset(again), minari.load_dataset(dataset)
+    assert {float(episode.rewards.sum()) for episode in recorded} == {0.0, 1.0}
+    assert any(episode.truncations[-1] for episode in recorded)
+    for expected, found in zip(recorded, ours, strict=True):
+        for field in ("observations", "actions", "rewards", "terminations"):
+            np.testing.assert_allclose(getattr(found, field), getattr(expected, field), atol=1e-12)
+    (told,) = ours.storage.get_episode_metadata([0])
+    assert told["goal"] == 15  # the present, though holes end the task too
+
+
+def test_ends_with_states_of_their_own_are_the_environment_s_in_datasets():
+    name = max(name for name in gymnasium.registry if name.startswith("Taxi-"))
+    env = gymnasium.make(name)
+    world = from_gymnasium(env, DISCOUNT)
+    best = lake_policy(world, Behavior(BoltzmannAverage(), 30.0)).argmax(axis=1)
+    dataset = record(env, lambda state: int(best[state]), 5)
+    demonstrations = read_demonstrations(dataset, world.model.graph, task=world.task, ends=world.ends)
+    assert {int(path[-1]) for path in demonstrations.paths()} <= set(world.ends.values())
+    again = fresh("ours/trips")
+    write_demonstrations(again, demonstrations, world.model.graph, ends=world.ends)
+    ours, recorded = minari.load_dataset(again), minari.load_dataset(dataset)
+    assert ours.observation_space == recorded.observation_space == Discrete(500)
+    for expected, found in zip(recorded, ours, strict=True):
+        np.testing.assert_array_equal(found.observations, expected.observations)
+        np.testing.assert_allclose(found.rewards, expected.rewards, atol=1e-9)
+    assert eqx.tree_equal(read_demonstrations(again, world.model.graph, ends=world.ends), demonstrations)
+    state = min(world.ends)
+    flags = {"terminations": np.array([False]), "truncations": np.array([True])}
+    cut = store((Discrete(500), Discrete(6)), buffer([state, state], [0], **flags))
+    (path,) = read_demonstrations(cut, world.model.graph, task=world.task, ends=world.ends).paths()
+    assert path.tolist() == [state, state]  # time was up there, and nothing ended
+
+
+def test_the_example_of_the_docs_runs():
+    section, found = DOCS.read_text().split("## Minari")[1], {}
+    exec(section.split("```python\n")[1].split("```")[0], found)
+    assert found["again"].trajectories == found["demos"].trajectories
+
+
+# What others wrote
+
+WALK = buffer(np.array([0, 1, 2]), np.array([3, 3]))
+
+
+@pytest.mark.parametrize("data_format", ["hdf5", "arrow", "parquet"])
+def test_goals_and_discounts_of_others_are_tasks(data_format):
+    told = [{"goal": 2, "discount": 0.9}, {"goal": 5, "discount": 0.9}, {"goal": 2, "discount": 0.9}]
+    dataset = store(SPACES, WALK, WALK, WALK, metadata=told, data_format=data_format)
+    found = read_demonstrations(dataset, GRID, step_cost=1.0)
+    assert found.task.tolist() == [0, 0, 1, 1, 0, 0]
+    assert found.states.tolist() == [0, 1] * 3
+    assert found.actions.tolist() == [3, 3] * 3
+    expected = stack_tasks([reach(GRID, goal, discount=0.9, step_cost=1.0) for goal in (2, 5)])
+    assert eqx.tree_equal(found.tasks, expected)
+
+
+def test_what_episodes_do_not_tell_comes_from_arguments():
+    dataset = store(SPACES, WALK, WALK, metadata=[{"goal": 2}, {"goal": 2, "discount": 0.5}])
+    found = read_demonstrations(dataset, GRID, discount=0.9)
+    np.testing.assert_allclose(found.tasks.discount, [0.9, 0.5])
+    bare = store(SPACES, WALK)
+    own = reach(GRID, 5)
+    assert eqx.tree_equal(read_demonstrations(bare, GRID, task=own).tasks, stack_tasks([own]))
+
+
+def test_a_dataset_is_found_by_its_path(datasets, tmp_path, monkeypatch):
+    dataset = store(SPACES, WALK, metadata=[{"goal": 2, "discount": 0.9}])
+    os.rename(datasets / dataset, tmp_path / "moved")
+    monkeypatch.chdir(tmp_path)
+    for path in (tmp_path / "moved", Path("moved") / "data", "./moved", str(tmp_path / "moved")):
+        assert len(read_demonstrations(path, GRID)) == 2
+    with pytest.raises(InputError, match=r"^moved: there is no such dataset here"):
+        read_demonstrations("moved", GRID)
+
+
+def refused(dataset, message, world=GRID, **arguments):
+    """Reading a dataset raises an error that begins with the dataset, and then says this."""
+    with pytest.raises(InputError, match=f"^{re.escape(str(dataset))}{message}"):
+        read_demonstrations(dataset, world, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [
+        ({"discount": 0.9}, "field 'goal': the episode does not tell it, and nor did an argument"),
+        ({"goal": 2}, "field 'discount': the episode does not tell it, and nor did an argument"),
+        ({"goal": 6, "discount": 0.9}, r"field 'goal': expected a state in 0…5, found 6"),
+        ({"goal": -1, "discount": 0.9}, r"field 'goal': expected a state in 0…5, found -1"),
+        ({"goal": 2.5, "discount": 0.9}, r"field 'goal': expected a whole number, found 2.5"),
+        ({"goal": "door", "discount": 0.9}, "field 'goal': expected a number, found 'door'"),
+        ({"goal": [2, 5], "discount": 0.9}, "field 'goal': expected a number, found array"),
+        ({"goal": float("nan"), "discount": 0.9}, "field 'goal': expected a whole number, found nan"),
+        ({"goal": 2, "discount": 0.0}, "field 'discount': expected a number above 0 and at most 1, found 0.0"),
+        ({"goal": 2, "discount": 1.5}, "field 'discount': expected a number above 0 and at most 1, found 1.5"),
+        ({"goal": 2, "discount": float("nan")}, "field 'discount': expected a number above 0 and at most 1, found nan"),
+        ({"goal": 2, "discount": 1.0}, "field 'discount': a goal that pays 1 needs a discount below 1"),
+        ({"goal": 1, "discount": 0.9}, "goes on after a terminal state of its task"),
+    ],
+)
+def test_metadata_that_are_no_task_are_refused(told, message):
+    dataset = store(SPACES, WALK, WALK, metadata=[{"goal": 2, "discount": 0.9}, told])
+    separator = ": " if "goes on" in message else ", "
+    refused(dataset, f", episode 1{separator}{message}")
+
+
+def test_goals_in_known_obstacles_are_refused():
+    known = np.full((2, 3), Cell.UNKNOWN)
+    known[0, 2] = Cell.OCCUPIED
+    dataset = store(SPACES, WALK, metadata=[{"goal": 2, "discount": 0.9}])
+    refused(dataset, r", episode 0, field 'goal': the goal \(state 2\) lies in a known obstacle", Grid(known))
+
+
+@pytest.mark.parametrize(
+    ("walk", "message"),
+    [
+        (buffer([0, 1], [3, 3]), "field 'observations': expected 3 observations around 2 moves, found 2"),
+        (buffer([0, 1, 2], [3, 3], rewards=[0.0]), "field 'observations': expected 2 observations around 1 moves"),
+        (
+            buffer([0, 1, 2], [3], rewards=[0.0, 0.0]),
+            r"field 'actions': expected 2 whole numbers, .* \(1,\)",
+        ),
+        (
+            buffer(np.array([[0], [1], [2]]), [3, 3]),
+            r"field 'observations': expected 3 whole numbers, .* \(3, 1\)",
+        ),
+        (buffer([0, 1.5, 2], [3, 3]), "field 'observations': expected 3 whole numbers, found float64"),
+        (buffer([0, 1, 2], [3, np.nan]), "field 'actions': expected 2 whole numbers, found float64"),
+        (buffer([0, 6, 2], [3, 3]), "field 'observations': expected a whole number in 0…5, found 6 at step 1"),
+        (buffer([0, 1, -1], [3, 3]), "field 'observations': expected a whole number in 0…5, found -1 at step 2"),
+        (buffer([0, 1, 2], [3, 4]), "field 'actions': expected a whole number in 0…3, found 4 at step 1"),
+    ],
+)
+def test_episodes_that_do_not_fit_are_refused(walk, message):
+    told = {"goal": 2, "discount": 0.9}
+    dataset = store(SPACES, WALK, walk, metadata=[told, told])
+    refused(dataset, f", episode 1, {message}")
+
+
+def test_an_episode_without_a_move_is_refused():
+    nothing = buffer([0], [], rewards=np.zeros(0), terminations=np.zeros(0, bool), truncations=np.zeros(0, bool))
+    dataset = store(SPACES, WALK, nothing, data_format="arrow")
+    refused(dataset, ", episode 1, field 'rewards': expected at least one move, found none", task=reach(GRID, 2))
+
+
+def test_an_empty_dataset_is_refused():
+    refused(store(SPACES), ": expected at least one episode, found none")
+
+
+@pytest.mark.parametrize(
+    ("spaces", "message"),
+    [
+        ((Discrete(7), Discrete(4)), r", field 'observation_space': expected Discrete\(6\).*found Discrete\(7\)"),
+        ((Discrete(6, start=1), Discrete(4)), r", field 'observation_space': .*found Discrete\(6, start=1\)"),
+        ((Box(0, 5, (1,)), Discrete(4)), r", field 'observation_space': .*found Box"),
+        ((Discrete(6), Discrete(8)), r", field 'action_space': expected Discrete\(4\).*found Discrete\(8\)"),
+    ],
+)
+def test_other_spaces_are_refused(spaces, message):
+    seen = np.zeros((3, 1), np.float32) if isinstance(spaces[0], Box) else [1, 2, 3]
+    refused(store(spaces, buffer(seen, [3, 3])), message, task=reach(GRID, 5))
+
+
+def test_a_task_of_another_world_is_refused():
+    with pytest.raises(InputError, match=r"'task': expected one task of 6 states, found \(9,\)"):
+        read_demonstrations(store(SPACES, WALK), GRID, task=reach(Grid.unknown(3, 3), 2))
+
+
+def test_what_is_no_dataset_is_refused(datasets, tmp_path):
+    refused("nowhere/walks-v0", ": there is no such dataset here: expected one that `minari list local` shows")
+    refused(tmp_path, ": there is no such dataset here")
+    broken = store(SPACES, WALK)
+    (datasets / broken / "data" / "main_data.hdf5").write_bytes(b"no HDF5")
+    refused(broken, ": the dataset cannot be read: OSError")
+    (datasets / broken / "data" / "metadata.json").write_text("{")
+    refused(broken, ": the dataset cannot be read: JSONDecodeError")
+
+
+def edited(folder, dataset, edit):
+    """Change the metadata of a whole dataset by hand."""
+    path = folder / dataset / "data" / "metadata.json"
+    metadata = json.loads(path.read_text())
+    edit(metadata)
+    path.write_text(json.dumps(metadata))
+
+
+def set_in_task(**values):
+    return lambda metadata: metadata["tasks"][1].update(values)
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda metadata: metadata.update(tasks=[]), ", field 'tasks': expected a list of tasks"),
+        (lambda metadata: metadata.update(tasks=3), ", field 'tasks': expected a list of tasks"),
+        (lambda metadata: metadata["tasks"].pop(), ", episode 1, field 'task': expected a task in 0…0, found 1"),
+        (lambda metadata: metadata["tasks"][1].pop("reward"), ", task 1: expected discount, terminal"),
+        (set_in_task(discount=1.5), ", task 1, field 'discount': expected a number above 0 and at most 1"),
+        (set_in_task(discount="high"), ", task 1, field 'discount': expected a number, found 'high'"),
+        (set_in_task(discount=0.5), ", episode 1, field 'discount': expected 0.5 as in task 1, found 0.95"),
+        (set_in_task(terminal=[4]), r", episode 1, field 'goal': expected \[4\] as in task 1, found 5"),
+        (set_in_task(terminal=[6]), ", task 1, field 'terminal': expected a list of states in 0…5"),
+        (set_in_task(terminal=[0.5]), ", task 1, field 'terminal': expected a list of states in 0…5"),
+        (set_in_task(reward=[[0.0, 1.0]]), r", task 1, field 'reward': .*\(6, 4\), found shape \(1, 2\)"),
+        (set_in_task(reward=[[float("nan")]]), ", task 1, field 'reward': expected finite numbers"),
+        (set_in_task(reward=[[0], [0, 1]]), ", task 1, field 'reward': expected a table of numbers"),
+        (set_in_task(final_reward=[[1.0]]), r", task 1, field 'final_reward': .*\(6,\), found shape \(1, 1\)"),
+    ],
+)
+def test_tasks_that_were_spoiled_are_refused(datasets, edit, message):
+    dataset = fresh("ours/spoiled")
+    write_demonstrations(dataset, towards(2, 5), GRID)
+    edited(datasets, dataset, edit)
+    refused(dataset, message)
+
+
+# Writing
+
+
+@pytest.mark.parametrize("dataset", ["office", "office/../walks-v0", "/walks-v0", "", "a b-v0", "walks-v", "x//y-v0"])
+def test_ids_that_are_none_are_refused(dataset):
+    with pytest.raises(InputError, match=f"^{re.escape(dataset)}: expected an id with a version"):
+        write_demonstrations(dataset, towards(2), GRID)
+
+
+def test_a_dataset_that_is_there_stays_as_it_is():
+    dataset = fresh("ours/kept")
+    write_demonstrations(dataset, towards(2), GRID)
+    with pytest.raises(InputError, match=f"{dataset}: is there already: expected a name that is free"):
+        write_demonstrations(dataset, towards(5), GRID)
+    found = read_demonstrations(dataset, GRID)
+    assert found.visited()[:, 1].tolist() == [2, 2]
+
+
+def test_demonstrations_of_another_world_are_refused():
+    message = "expected demonstrations in a world of 9 states and 4 actions, found 6 states and action 3"
+    with pytest.raises(InputError, match=message):
+        write_demonstrations(fresh(), towards(2), Grid.unknown(3, 3))
+    with pytest.raises(InputError, match="6 states and 2 actions, found 6 states and action 3"):
+        write_demonstrations(fresh(), towards(2), complete(6, 2))
+
+
+def test_trajectories_with_gaps_are_refused_and_leave_nothing(datasets):
+    walks = towards(2, 5)
+    gap = eqx.tree_at(lambda each: each.next_states, walks, jnp.asarray([1, 2, 4, 2]))
+    turn = eqx.tree_at(lambda each: each.task, walks, jnp.asarray([0, 0, 0, 1]))
+    message = "trajectory, row 2: expected moves that each start where the last one led, towards one task"
+    for broken in (gap, turn):
+        with pytest.raises(InputError, match=message):
+            write_demonstrations(fresh("gaps/gap"), broken, GRID)
+    assert not (datasets / "gaps").exists()
+
+
+def test_without_minari_the_error_says_how_to_install_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "minari", None)
+    for call in (lambda: read_demonstrations("a-v0", GRID), lambda: write_demonstrations("a-v0", towards(2), GRID)):
+        with pytest.raises(InputError, match=r"^a-v0: .*Minari is not installed.*pip install 'sidestep\[minari\]'"):
+            call()
