@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 
 from measuring import argument_parser, main, note, number, peak_bytes, print_table, write_records
-from sidestep.commands.learn import Settings, fit_map
 from sidestep.commands.simulate import Walkers, walk
 from sidestep.demonstrations import Demonstrations, gather
 from sidestep.domains.offices import office
 from sidestep.inference.climb import Progress
 from sidestep.io.maps import read_map
 from sidestep.scoring import relevant_obstacles, score_map, visit_ranking
+from sidestep.settings import Settings, fit_map
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tasks import reach

@@ -2,6 +2,7 @@
 
     python benchmarks/real_people.py
     python benchmarks/real_people.py --set beta=5 prior_mean=-2
+    python benchmarks/real_people.py --behavior auto
     python benchmarks/real_people.py --animal rats --json rats.json
 
 Tartarus (de Cothi et al. 2022): twelve mazes of 10×10 cells of which the learner is told nothing. The layout is learned
@@ -15,31 +16,33 @@ import argparse
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any
 
 import numpy as np
-import yaml
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
 import measuring
-from sidestep.commands.learn import Settings, fit_map
+from settings import add_set_option, changed, described
+from sidestep.commands.behavior import choose_behavior
 from sidestep.errors import InputError
 from sidestep.io.demonstrations import demonstrations
 from sidestep.io.files import write_json
+from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map
 from sidestep.io.walks import Walks, read_walks
 from sidestep.scoring import relevant_obstacles, score_map, visit_ranking
+from sidestep.settings import Settings, fit_map
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "tartarus"
 TRIALS = (5, 10)
-HINTS = {name: hint for name, hint in get_type_hints(Settings).items() if name not in ("sample", "seed")}
-"""The settings that may be changed, with their types; how many walks are drawn is this script's own business."""
+OWN = ("sample", "seed", "unknown")
+"""Settings that are this script's own business: how many walks are drawn, and what `--behavior` learns of people."""
 SCORES = ("auc", "average_precision", "auc_relevant", "average_precision_relevant")
 
 
@@ -79,9 +82,11 @@ def draws(maze: Maze, count: int, seeds: int) -> Iterator[tuple[int, Walks]]:
         yield seed, maze.walks.select(np.sort(drawn))
 
 
-def score(maze: Maze, walks: Walks, settings: Settings) -> dict[str, Any]:
+def score(maze: Maze, walks: Walks, settings: Settings, auto: bool) -> dict[str, Any]:
     """The scores of the map learned from some walks, and of the ranking by visits."""
     started = time.perf_counter()
+    if auto:
+        settings = choose_behavior(maze.blank, grid_walks(walks, maze.blank), settings).settings
     demos = demonstrations(walks, maze.blank, discount=settings.discount, step_cost=settings.step_cost)
     found = fit_map(ObstacleGrid(maze.blank, settings.prior_mean), demos, settings)
     seconds = time.perf_counter() - started
@@ -97,20 +102,23 @@ def score(maze: Maze, walks: Walks, settings: Settings) -> dict[str, Any]:
         "learned": scores["learned"],
         "visits": {key: scores["visits"][key] for key in SCORES},
         "moves": len(demos),
+        "behavior": {name: getattr(settings, name) for name in ("beta", "discount", "step_cost", "tempering")},
         "iterations": found.final.iteration,
         "converged": found.converged,
         "seconds": round(seconds, 3),
     }
 
 
-def measure(mazes: Sequence[Maze], counts: Sequence[int], seeds: int, settings: Settings) -> list[dict[str, Any]]:
+def measure(
+    mazes: Sequence[Maze], counts: Sequence[int], seeds: int, settings: Settings, auto: bool
+) -> list[dict[str, Any]]:
     """One record for every maze, number of walks and seed."""
     work = [(maze, count, *draw) for count in counts for maze in mazes for draw in draws(maze, count, seeds)]
     records = []
     with Progress(console=Console(stderr=True), transient=True) as bar:
         for maze, count, seed, walks in bar.track(work, description="learning"):
             label = {"maze": maze.name, "walks": count, "walks_found": len(walks), "seed": seed}
-            records.append({**label, **score(maze, walks, settings)})
+            records.append({**label, **score(maze, walks, settings, auto)})
     return records
 
 
@@ -148,42 +156,14 @@ def print_summary(rows: Sequence[dict[str, Any]], title: str) -> None:
     Console().print(table)
 
 
-def changed(settings: Settings, overrides: Sequence[str]) -> Settings:
-    """Settings with some fields changed, each given as `field=value`; `null` is None."""
-    values = {}
-    for override in overrides:
-        name, _, text = override.partition("=")
-        if name not in HINTS:
-            raise InputError(f"expected one of {', '.join(HINTS)} and a value, found {override!r}", source="--set")
-        values[name] = yaml.safe_load(text)
-        if not _fits(values[name], HINTS[name]):
-            raise InputError(f"cannot be {text!r}", source="--set", field=name)
-    return replace(settings, **values)
-
-
-def _fits(value: object, hint: Any) -> bool:
-    """Whether a value is of a setting's type; whole numbers pass for others."""
-    if get_origin(hint) is Literal:
-        return value in get_args(hint)
-    if get_args(hint):
-        return any(_fits(value, one) for one in get_args(hint))
-    return isinstance(value, (int, float) if hint is float else hint) and not isinstance(value, bool)
-
-
-def _described(settings: Settings) -> str:
-    """What differs from the shipped defaults."""
-    names = [field.name for field in fields(Settings)]
-    different = [f"{n}={getattr(settings, n)}" for n in names if getattr(settings, n) != getattr(Settings(), n)]
-    return ", ".join(different) or "shipped defaults"
-
-
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Maps learned from real walks, against the truth.")
     parser.add_argument("--data", type=Path, default=DATA, metavar="DIR", help="maze_*/ with walks and maps")
     parser.add_argument("--walks", type=int, nargs="+", default=[10, 40, 150], metavar="N", help="how many to draw")
     parser.add_argument("--seeds", type=int, default=3, help="how many draws")
     parser.add_argument("--animal", choices=("humans", "rats"), default="humans")
-    parser.add_argument("--set", nargs="+", default=[], metavar="FIELD=VALUE", help=f"settings: {', '.join(HINTS)}")
+    parser.add_argument("--behavior", choices=("given", "auto"), default="given", help="as for `sidestep learn`")
+    add_set_option(parser, Settings, OWN)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the means and every record")
     parser.add_argument("--quick", action="store_true", help="every fourth maze, 10 walks, one draw")
     arguments = parser.parse_args()
@@ -196,20 +176,22 @@ def _arguments() -> argparse.Namespace:
 
 def run(arguments: argparse.Namespace) -> None:
     """Measures, prints and writes what the arguments ask for."""
-    settings = changed(Settings(), arguments.set)
+    chosen = changed(Settings(), arguments.set, OWN)
     folders = sorted(arguments.data.glob("maze_*"))[:: 4 if arguments.quick else 1]
     if not folders:
         raise InputError(
             "expected folders maze_01, maze_02, …; give the right folder with --data", source=arguments.data
         )
-    mazes = [read_maze(folder, arguments.animal, settings) for folder in folders]
-    records = measure(mazes, arguments.walks, arguments.seeds, settings)
+    mazes = [read_maze(folder, arguments.animal, chosen) for folder in folders]
+    auto = arguments.behavior == "auto"
+    records = measure(mazes, arguments.walks, arguments.seeds, chosen, auto)
     rows = summarise(records, arguments.walks)
-    print_summary(rows, f"{arguments.animal}, {len(mazes)} mazes, {_described(settings)}")
+    people = f"{arguments.animal}, behavior {arguments.behavior}"
+    print_summary(rows, f"{people}, {len(mazes)} mazes, {described(chosen)}")
     if not all(row["converged"] for row in rows):
         Console(stderr=True).print("warning: some fits have not converged; see the records")
     if arguments.json:
-        write_json(arguments.json, {"settings": asdict(settings), "means": rows, "records": records})
+        write_json(arguments.json, {"settings": asdict(chosen), "means": rows, "records": records})
 
 
 if __name__ == "__main__":

@@ -237,8 +237,8 @@ def test_a_fit_that_fails_on_its_way_writes_no_map(here, capsys, monkeypatch):
     def broken(progress):
         print(1 / (2 - progress.iteration))
 
-    def learn(walks, map_file, folder, settings, _, resume):
-        return whole(walks, map_file, folder, settings, broken, resume)
+    def learn(walks, map_file, folder, settings, _, *others):
+        return whole(walks, map_file, folder, settings, broken, *others)
 
     whole = cli.learn
     monkeypatch.setattr(cli, "learn", learn)

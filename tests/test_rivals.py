@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.commands.learn import Settings
 from sidestep.demonstrations import Trajectory, gather
 from sidestep.rivals.constraints import by_constraints
 from sidestep.rivals.costs import by_costs
 from sidestep.rivals.learned import by_behavior, by_transitions, by_visits
+from sidestep.settings import Settings
 from sidestep.simulation import simulate
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.grid import Grid
@@ -54,7 +54,7 @@ def test_visits_are_counted():
 
 
 def test_transitions_alone_say_nothing_of_what_nobody_touched(walks):
-    blocked = np.asarray(by_transitions(BLANK, walks, Settings()).model.blocked)
+    blocked = np.asarray(by_transitions(BLANK, walks, Settings(lines=0.0)).model.blocked)
     prior = 1 / (1 + np.exp(-Settings().prior_mean))
     np.testing.assert_allclose(blocked[WALL == 1], prior, atol=1e-4)
     assert blocked[WALL == 0].max() < prior

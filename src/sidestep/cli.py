@@ -24,14 +24,16 @@ from rich.table import Table
 
 from sidestep.commands.compare import compare
 from sidestep.commands.evaluate import evaluate_map
-from sidestep.commands.learn import Settings, Terms, learn, most_iterations
+from sidestep.commands.learn import learn
 from sidestep.commands.plan import plan_path
+from sidestep.commands.sensors import Sensor
 from sidestep.commands.simulate import Walkers, simulate_walks
 from sidestep.errors import SidestepError
-from sidestep.experiments import pendulum, representations, room
+from sidestep.experiments import motivation, pendulum, representations, room
 from sidestep.experiments.demo import demo
 from sidestep.experiments.reproduce import reproduce
 from sidestep.inference.climb import Progress as FitProgress
+from sidestep.settings import Settings, Terms, most_iterations
 
 app = typer.Typer(
     help="Learn the obstacles that nobody touched from the walks of people who knew them.",
@@ -44,7 +46,12 @@ console = Console(highlight=False, width=None if sys.stdout.isatty() else 140)
 errors = Console(stderr=True, highlight=False)
 
 BackupName = Literal["boltzmann", "max", "logsumexp", "mellowmax"]
-EXPERIMENTS = {"room": room.run, "pendulum": pendulum.run, "representations": representations.run}
+EXPERIMENTS = {
+    "room": room.run,
+    "pendulum": pendulum.run,
+    "representations": representations.run,
+    "motivation": motivation.run,
+}
 Folder = Annotated[Path, typer.Option("--out", help="The folder to write to.", metavar="DIR")]
 Seed = Annotated[int, typer.Option(help="Draws everything that is random.", min=0)]
 Connected = Annotated[Literal["4", "8"], typer.Option(help="Moves: 4 directions, or 8 with diagonals.")]
@@ -83,13 +90,16 @@ def reproduce_command(out: Folder = Path("sidestep-reproduce"), seed: Seed = 0) 
 @app.command(name="experiment", epilog="Example: sidestep experiment room --out room")
 def experiment_command(
     name: Annotated[
-        Literal["room", "pendulum", "representations"],
-        typer.Argument(help="A wall nobody touches; gravity from actions alone; three ways to say where walls are."),
+        Literal["room", "pendulum", "representations", "motivation"],
+        typer.Argument(
+            help="A wall nobody touches; gravity from actions alone; three ways to say where walls are; "
+            "costs of places against a model of moves, when the reward changes."
+        ),
     ],
     out: Annotated[Path | None, typer.Option("--out", help="The folder to write to.", metavar="DIR")] = None,
     seed: Seed = 0,
 ) -> None:
-    """Experiments in continuous worlds: a picture and summary.json."""
+    """Experiments beyond the paper's figures: a picture and summary.json."""
     out = out or Path(f"sidestep-{name}")
     with _working("starting") as say:
         summary = EXPERIMENTS[name](out, seed, say)
@@ -101,11 +111,26 @@ def experiment_command(
 
 @app.command(name="learn", epilog="Example: sidestep learn walks.csv --map office.yaml --out learned")
 def learn_command(
-    walks: Annotated[Path, typer.Argument(help="CSV or Parquet: walk, step, x, y and optionally goal_x, goal_y.")],
+    walks: Annotated[
+        Path, typer.Argument(help="A table with walk, step, x, y and optionally goal_x, goal_y: CSV, Parquet, minari:ID.")
+    ],
     map_file: Annotated[Path, typer.Option("--map", help="ROS map: what is already known.", metavar="MAP.yaml")],
     out: Folder,
+    behavior: Annotated[
+        Literal["given", "auto"],
+        typer.Option(help="auto: the reward, β, lapses and how much actions count are chosen by held-out walks."),
+    ] = "given",
     backup: Backup = Settings.backup,  # pyright: ignore[reportArgumentType]
     beta: Beta = Settings.beta,
+    lapse: Annotated[float | None, typer.Option(help="The share of actions at random; none by default.")] = None,
+    unknown: Annotated[
+        list[str] | None,
+        typer.Option(help="Learned of walkers with the map: sharpness, lapses, discount; repeat it for several."),
+    ] = None,
+    tempering: Annotated[
+        float,
+        typer.Option(help="How much actions count, above 0 and at most 1; below 1 where steps are not independent."),
+    ] = Settings.tempering,
     discount: Discount = Settings.discount,
     step_cost: StepCost = Settings.step_cost,
     prior_mean: Annotated[
@@ -117,6 +142,14 @@ def learn_command(
     lines: Annotated[
         float, typer.Option(help="What it is worth to a blocked cell to lie between two others, in nats.")
     ] = Settings.lines,
+    sensor_map: Annotated[
+        Path | None,
+        typer.Option(help="ROS map (mode scale or raw): P(occupied) where sensors looked.", metavar="MAP.yaml"),
+    ] = None,
+    sensor_variance: Annotated[
+        str,
+        typer.Option(help="a of what the sensors saw: a number, or a .npy file of one a cell.", metavar="A|FILE.npy"),
+    ] = "1",
     connectivity: Connected = "4",
     terms: Annotated[Terms, typer.Option(help="Which parts of the likelihood count.")] = Settings.terms,
     gradient: Annotated[
@@ -138,6 +171,9 @@ def learn_command(
     settings = Settings(
         backup=backup,
         beta=beta,
+        lapse=lapse,
+        unknown=tuple(unknown or ()),
+        tempering=tempering,
         discount=discount,
         step_cost=step_cost,
         prior_mean=prior_mean,
@@ -152,8 +188,10 @@ def learn_command(
         sample=sample,
         seed=seed,
     )
-    with _fitting(most_iterations(settings)) as report:
-        summary = learn(walks, map_file, out, settings, report, resume)
+    sensor = None if sensor_map is None else Sensor(sensor_map, _number_or_file(sensor_variance))
+    with _fitting(most_iterations(settings)) as (report, say):
+        choosing = say if behavior == "auto" else None
+        summary = learn(walks, map_file, out, settings, report, resume, sensor, choosing)
     data = summary["data"]
     console.print(
         f"{data['walks']} walks, {data['moves']} moves, {data['goals']} goals, {data['unknown_cells']} unknown cells"
@@ -163,6 +201,8 @@ def learn_command(
             f"left out: {data['walks_left_out']} walks that start at their goal, and {data['moves_left_out']} moves of "
             "walks that had arrived"
         )
+    for reason in summary["behavior"].get("reasons", ()):
+        console.print(reason, soft_wrap=True)
     for note in summary["notes"]:
         errors.print(f"note: {note}", soft_wrap=True)
     console.print(
@@ -210,7 +250,7 @@ def evaluate_command(
     name="compare", epilog="Example: sidestep compare walks.csv --map blank.yaml --truth office.yaml --out compared"
 )
 def compare_command(
-    walks: Annotated[Path, typer.Argument(help="CSV or Parquet, as for `sidestep learn`.")],
+    walks: Annotated[Path, typer.Argument(help="CSV, Parquet or minari:ID, as for `sidestep learn`.")],
     map_file: Annotated[Path, typer.Option("--map", help="ROS map: what is already known.", metavar="MAP.yaml")],
     truth: Annotated[Path, typer.Option(help="The true map.", metavar="TRUE.yaml")],
     out: Folder,
@@ -304,6 +344,13 @@ def _position(text: str, option: str) -> tuple[float, float]:
     return x, y
 
 
+def _number_or_file(text: str) -> float | Path:
+    try:
+        return float(text)
+    except ValueError:
+        return Path(text)
+
+
 @contextmanager
 def _working(text: str) -> Iterator[Callable[[str], None]]:
     """A spinner on a terminal, with a text that can be changed."""
@@ -312,8 +359,8 @@ def _working(text: str) -> Iterator[Callable[[str], None]]:
 
 
 @contextmanager
-def _fitting(iterations: int) -> Iterator[Callable[[FitProgress], None]]:
-    """A progress bar on a terminal for a fit of at most `iterations`, and how long these would take.
+def _fitting(iterations: int) -> Iterator[tuple[Callable[[FitProgress], None], Callable[[str], None]]]:
+    """A progress bar on a terminal for a fit of at most `iterations`, how long these would take, and what comes before.
 
     When a fit converges cannot be known; so the time is the longest that is left, at the pace of the last ten minutes.
     """
@@ -333,7 +380,7 @@ def _fitting(iterations: int) -> Iterator[Callable[[FitProgress], None]]:
             state = f"objective {progress.objective:.3f}, largest gradient {progress.gradient:.2g}"
             bar.update(task, completed=progress.iteration, state=state)
 
-        yield report
+        yield report, lambda text: bar.update(task, state=text)
 
 
 @contextmanager

@@ -6,7 +6,7 @@ from typing import Generic, NamedTuple, TypeVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, Shaped
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from sidestep.errors import InputError
 from sidestep.tasks import Task, stack_tasks
@@ -33,6 +33,7 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
     - `states`, `actions`, `next_states`: the moves; whole numbers in discrete worlds, in continuous ones vectors.
     - `task`, `trajectory`: which task (index into `tasks`) and which trajectory each move belongs to.
     - `tasks`: all tasks, stacked.
+    - `weight`: how much each move counts in the likelihood of discrete worlds; None where all count once.
     """
 
     states: Shaped[Array, "moves *state"]
@@ -41,6 +42,7 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
     task: Int[Array, " moves"]
     trajectory: Int[Array, " moves"]
     tasks: Tasks
+    weight: Float[Array, " moves"] | None = None
 
     def __len__(self) -> int:
         """The number of moves."""
@@ -50,6 +52,11 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
     def trajectories(self) -> int:
         """The number of trajectories."""
         return int(self.trajectory[-1]) + 1
+
+    def counting(self, trajectories: Bool[np.ndarray, " trajectories"]) -> "Demonstrations[Tasks]":
+        """The same moves, of which only those of some trajectories count."""
+        weight = np.asarray(trajectories, dtype=np.float64)[np.asarray(self.trajectory)]
+        return eqx.tree_at(lambda demos: demos.weight, self, jnp.asarray(weight), is_leaf=lambda leaf: leaf is None)
 
     def paths(self) -> list[Shaped[np.ndarray, "_ *state"]]:
         """The states along each trajectory, the last one included."""

@@ -9,7 +9,6 @@
 | `learned.png`  | the picture                                                                              |
 """
 
-import io
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from sidestep.errors import InputError
 from sidestep.evaluation import Reward
-from sidestep.io.files import read_json, read_whole, write_array, write_json
+from sidestep.io.files import read_array, read_json, write_array, write_json
 from sidestep.io.maps import read_map, write_map
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 from sidestep.tabular.models import ObstacleGrid
@@ -80,13 +79,13 @@ def read_learned_map(folder: Path) -> LearnedMap:
     """A learned map back from its folder; raises `InputError` for a file that is missing or does not fit."""
     connectivity, reward = _settings(folder / "summary.json")
     geometry = read_map(folder / "map.yaml", connectivity=connectivity)
-    blocked = _read_array(folder / "blocked.npy", kinds="f")
+    blocked = read_array(folder / "blocked.npy", kinds="f")
     if blocked.shape != geometry.shape or not ((blocked >= 0) & (blocked <= 1)).all():
         raise InputError(
             f"expected probabilities in the map's shape {geometry.shape}, found shape {blocked.shape}",
             source=folder / "blocked.npy",
         )
-    visited = _read_array(folder / "visited.npy", kinds="iu")
+    visited = read_array(folder / "visited.npy", kinds="iu")
     if visited.ndim != 2 or visited.shape[1] != 2 or not ((visited >= 0) & (visited < blocked.size)).all():
         raise InputError(
             f"expected pairs of states in 0…{blocked.size - 1}, found shape {visited.shape}",
@@ -117,15 +116,3 @@ def _settings(path: Path) -> tuple[Connectivity, Reward]:
     if step_cost is not None and not (isinstance(step_cost, int | float) and 0 < step_cost < np.inf):
         raise InputError(f"expected a number above 0, found {step_cost!r}", source=path, field="step_cost")
     return settings["connectivity"], Reward(float(discount), None if step_cost is None else float(step_cost))
-
-
-def _read_array(path: Path, kinds: str) -> np.ndarray:
-    """An array whose dtype is of one of `kinds` ("f" floats, "iu" whole numbers)."""
-    content = read_whole(path)
-    try:
-        array = np.load(io.BytesIO(content), allow_pickle=False)
-    except Exception as error:  # what is not an array raises errors of many kinds
-        raise InputError(f"expected a NumPy array: {error}", source=path) from error
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in kinds:
-        raise InputError("expected a NumPy array of numbers, as `sidestep learn` writes it", source=path)
-    return array

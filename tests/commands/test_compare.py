@@ -7,11 +7,11 @@ import pytest
 from office import call, write_office
 
 from sidestep.commands.compare import METHODS
-from sidestep.commands.learn import Settings, fit_map
 from sidestep.demonstrations import Demonstrations
 from sidestep.io.demonstrations import demonstrations
 from sidestep.io.maps import read_map
 from sidestep.io.walks import read_walks
+from sidestep.settings import Settings, fit_map
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import ObstacleGrid
@@ -54,7 +54,7 @@ def test_held_out_walks_are_judged_by_what_the_others_taught(office, compared):
     drawn = np.random.default_rng(3).permutation(80)
     own, others = (demonstrations(walks.select(np.sort(some)), grid) for some in (drawn[16:], drawn[:16]))
     assert isinstance(others, Demonstrations)
-    model = fit_map(ObstacleGrid(grid, 0.5), own, Settings()).model
+    model = fit_map(ObstacleGrid(grid, Settings().prior_mean), own, Settings()).model
     people = Behavior(BoltzmannAverage(), Settings.beta)
     expected = log_likelihood(model, others, people, terms=("actions",)).actions / len(others)
     assert compared["methods"]["behavior"]["heldout_log_likelihood"] == pytest.approx(float(expected), rel=1e-6)

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sidestep.commands import learn
-from sidestep.commands.learn import Settings, fit_map
+from sidestep import settings
 from sidestep.commands.simulate import Walkers, walk
 from sidestep.demonstrations import gather
 from sidestep.domains.offices import office
@@ -15,6 +14,7 @@ from sidestep.inference.fit import fit
 from sidestep.inference.optimisers import LBFGS, Ascent, Resilient
 from sidestep.inference.priors import Normal
 from sidestep.scoring import relevant_obstacles, score_map, visit_ranking
+from sidestep.settings import Settings, fit_map
 from sidestep.tabular.backups import Behavior, LogSumExp
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
@@ -22,7 +22,9 @@ from sidestep.tasks import reach
 
 TRUTH = office(20, 24, seed=0)
 UNKNOWN = Grid.unknown(20, 24)
-SETTINGS = Settings(backup="logsumexp", beta=5.0, discount=1.0, step_cost=1.0, prior_mean=0.5, prior_variance=8.0)
+SETTINGS = Settings(
+    backup="logsumexp", beta=5.0, discount=1.0, step_cost=1.0, prior_mean=0.5, prior_variance=8.0, lines=0.0
+)
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +36,7 @@ def demonstrations():
 @pytest.fixture
 def everything_is_large(monkeypatch):
     """For the choice of the optimiser, for solves that are only as exact as it needs, and for a batch for each task."""
-    for module in (learn, climb, batches):
+    for module in (settings, climb, batches):
         monkeypatch.setattr(module, "LARGE", 1)
     monkeypatch.setattr(batches, "cores", lambda: 1)
 
@@ -95,7 +97,7 @@ def test_taking_over_what_does_not_change_changes_nothing_but_the_work(monkeypat
 def test_it_ends_where_a_search_along_the_gradient_does(demonstrations, monkeypatch):
     """But for what the tolerance leaves: some thousandths of a nat a move."""
     by_search = fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, SETTINGS)
-    monkeypatch.setattr(learn, "LARGE", 1)
+    monkeypatch.setattr(settings, "LARGE", 1)
     from_above = fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, SETTINGS)
     assert len(from_above.history) < len(by_search.history)
     assert from_above.final.objective > by_search.final.objective - 5e-3 * len(demonstrations)
@@ -131,9 +133,9 @@ def test_what_the_map_knows_is_left_alone(demonstrations):
     ({"gradient": "fixed_policy"}, 10_000, Ascent),
 ])  # fmt: skip
 def test_who_climbs(options, cells, kind):
-    chosen = learn.optimiser_of(replace(SETTINGS, **options), cells, moves=2000)
+    chosen = settings.optimiser_of(replace(SETTINGS, **options), cells, moves=2000)
     assert isinstance(chosen, kind)
     if isinstance(chosen, Resilient):
         assert chosen.tolerance == pytest.approx(2.0)
-    assert learn.optimiser_of(replace(SETTINGS, **options, iterations=7), cells, moves=2000).iterations == 7
-    assert learn.most_iterations(replace(SETTINGS, **options)) == chosen.iterations
+    assert settings.optimiser_of(replace(SETTINGS, **options, iterations=7), cells, moves=2000).iterations == 7
+    assert settings.most_iterations(replace(SETTINGS, **options)) == chosen.iterations

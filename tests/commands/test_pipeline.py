@@ -13,6 +13,7 @@ from PIL import Image
 from sidestep import cli
 from sidestep.inference.checkpoints import Saver
 from sidestep.io.maps import read_map
+from sidestep.io.walks import read_walks, write_walks
 from sidestep.runs import read_learned_map
 from sidestep.tabular.grid import Cell
 
@@ -66,6 +67,18 @@ def test_learning_writes_a_map(learned):
     assert (settings["mode"], settings["resolution"], settings["origin"]) == ("scale", 0.5, [-1.0, 2.0, 0.0])
     with Image.open(learned / "learned.png") as picture:
         assert min(picture.size) > 100
+
+
+def test_a_minari_dataset_teaches_what_its_table_does(office, learned, datasets, capsys):
+    write_walks("minari:office/walks-v0", read_walks(office / "walks.csv"))
+    arguments = ("--map", office / "half.yaml", "--out", office / "from-minari")
+    assert call("learn", "minari:office/walks-v0", *arguments) == 0
+    np.testing.assert_array_equal(np.load(office / "from-minari" / "blocked.npy"), np.load(learned / "blocked.npy"))
+    capsys.readouterr()
+    assert call("learn", "minari:office/walks-v1", *arguments) == 1
+    assert "office/walks-v1: there is no such dataset here" in capsys.readouterr().err
+    assert call("simulate", office / "true.yaml", "--out", "minari:office/walks-v2", "--walks", 4) == 1
+    assert not (datasets / "office" / "walks-v2").exists()
 
 
 def test_learning_says_how_it_went(office, learned):
@@ -152,7 +165,7 @@ def test_eight_directions_parquet_and_the_paper_s_gradient(office, tmp_path):
 @pytest.mark.parametrize("options", [
     ("--discount", 1, "--step-cost", 1, "--beta", 3),
     ("--backup", "mellowmax", "--horizon", 12),
-    ("--terms", "transitions"),
+    ("--terms", "transitions", "--lines", 0),
 ])  # fmt: skip
 def test_other_people_and_rewards(office, tmp_path, options):
     assert call("learn", office / "walks.csv", "--map", office / "blank.yaml", "--out", tmp_path, *options) == 0
@@ -187,13 +200,13 @@ def test_an_interrupted_run_goes_on(office, tmp_path, monkeypatch, capsys):
     learn = ("learn", office / "walks.csv", "--map", office / "half.yaml", "--out", tmp_path)
     whole = cli.learn
 
-    def interrupted(walks, map_file, folder, settings, report, resume):
+    def interrupted(walks, map_file, folder, settings, report, *others):
         def stop(progress):
             report(progress)
             if progress.iteration == 4:
                 raise KeyboardInterrupt
 
-        return whole(walks, map_file, folder, settings, stop, resume)
+        return whole(walks, map_file, folder, settings, stop, *others)
 
     monkeypatch.setattr(Saver, "pause", lambda *_: 0.0)
     monkeypatch.setattr(cli, "learn", interrupted)
@@ -205,8 +218,8 @@ def test_an_interrupted_run_goes_on(office, tmp_path, monkeypatch, capsys):
 
     iterations = []
 
-    def watched(walks, map_file, folder, settings, _, resume):
-        return whole(walks, map_file, folder, settings, lambda now: iterations.append(now.iteration), resume)
+    def watched(walks, map_file, folder, settings, _, *others):
+        return whole(walks, map_file, folder, settings, lambda now: iterations.append(now.iteration), *others)
 
     monkeypatch.setattr(cli, "learn", watched)
     assert call(*learn, "--beta", 9, "--resume") == 1  # not the same fit

@@ -14,12 +14,13 @@ from sidestep.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.errors import InputError
 from sidestep.inference.checkpoints import Saver
 from sidestep.inference.fit import fit
-from sidestep.inference.objective import MEMORY, Objective, Problem, tasks_mesh
+from sidestep.inference.objective import MEMORY, Objective, Parameters, Problem, tasks_mesh
 from sidestep.inference.optimisers import LBFGS
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.likelihood import ALL_TERMS
 from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.people import People, Traits, people
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.solvers.ordered import Ordered
 from sidestep.tasks import reach
@@ -39,9 +40,14 @@ def model() -> ObstacleGrid:
     return ObstacleGrid(BLANK, -2.0)
 
 
-def people() -> Behavior:
+def walkers() -> People:
     """Who walked."""
-    return Behavior(BoltzmannAverage(), 10.0)
+    return people(Behavior(BoltzmannAverage(), 10.0))
+
+
+def at(theta: jax.Array) -> Parameters:
+    """θ of the model, where nothing of people is learned."""
+    return Parameters(theta, Traits())
 
 
 def demonstrations(repeats: int = 1) -> Demonstrations:
@@ -54,20 +60,20 @@ def demonstrations(repeats: int = 1) -> Demonstrations:
 def problem(name: str, repeats: int = 1) -> Problem:
     """What is to be solved."""
     solver = WAYS[name][0]
-    return Problem(model(), demonstrations(repeats), people(), Normal(), ALL_TERMS, None, "exact", solver)
+    return Problem(model(), walkers(), demonstrations(repeats), Normal(), ALL_TERMS, None, "exact", solver)
 
 
 def measured(name: str, mesh: jax.sharding.Mesh | None) -> dict[str, np.ndarray]:
     """The objective, its parts and its slope at two points, the second from the first one's starts; a short fit."""
     objective = Objective(problem(name), WAYS[name][1], mesh)
     start = model().parameters
-    here, starts = objective.evaluate(start, objective.cold_starts())
-    there, _ = objective.evaluate(start + BENT, starts)
+    here, starts = objective.evaluate(at(start), objective.cold_starts())
+    there, _ = objective.evaluate(at(start + BENT), starts)
     found = fitted(name, mesh)
     return {
         "batches": np.array(len(objective.batches)),
         "parts": np.array([here[:4], there[:4]]),
-        "slope": np.array([here.slope, there.slope]),
+        "slope": np.array([here.slope.model, there.slope.model]),
         "found": np.asarray(found.model.parameters),
         "sweeps": np.asarray(found.sweeps),
         "converged": np.asarray(found.task_converged),
@@ -78,7 +84,7 @@ def fitted(name, mesh, **settings):
     """A fit of a few iterations."""
     solver, memory = WAYS[name]
     settings |= {"solver": solver, "memory": memory, "mesh": mesh, "optimiser": LBFGS(iterations=ITERATIONS)}
-    return fit(model(), demonstrations(), people(), **settings)
+    return fit(model(), demonstrations(), walkers(), **settings)
 
 
 def resumed(name, mesh, checkpoint: Path) -> np.ndarray:

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from spread import BENT, GOALS, demonstrations
+from spread import BENT, GOALS, at, demonstrations
 from walled import BLANK
 
 from sidestep.inference import batches
@@ -16,6 +16,7 @@ from sidestep.tabular.graph import grid_graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import ALL_TERMS, log_likelihood
 from sidestep.tabular.models import ObstacleGrid, TabularModel
+from sidestep.tabular.people import people
 from sidestep.tabular.solvers.host import cores
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.solvers.ordered import Ordered
@@ -31,7 +32,7 @@ ONE_TASK = STATES * 4 * 2 * 8.0
 
 
 def problem_of(solver=SOLVERS["jacobi"], terms=ALL_TERMS, shown=None, model=MODEL):
-    return Problem(model, shown or demonstrations(), PEOPLE, PRIOR, terms, None, "exact", solver)
+    return Problem(model, people(PEOPLE), shown or demonstrations(), PRIOR, terms, None, "exact", solver)
 
 
 def directly(problem, parameters):
@@ -53,11 +54,11 @@ def directly(problem, parameters):
 def test_batches_add_up_to_the_likelihood_and_the_prior(name, memory):
     problem = problem_of(SOLVERS[name])
     objective = Objective(problem, memory)
-    found, _ = objective.evaluate(POINT, objective.cold_starts())
+    found, _ = objective.evaluate(at(POINT), objective.cold_starts())
     parts, slope = directly(problem, POINT)
     np.testing.assert_allclose([found.actions, found.transitions, found.prior], parts, rtol=1e-9)
     assert found.objective == pytest.approx(parts.sum(), rel=1e-9)
-    np.testing.assert_allclose(found.slope, slope, rtol=1e-9, atol=1e-9 * np.abs(slope).max())
+    np.testing.assert_allclose(found.slope.model, slope, rtol=1e-9, atol=1e-9 * np.abs(slope).max())
 
 
 def test_the_less_memory_the_more_batches():
@@ -86,9 +87,9 @@ def test_starts_are_dropped_where_there_is_no_room():
     roomy, tight = Objective(problem_of(), MEMORY), Objective(problem_of(), 1.0)
     assert (roomy.planned.keeps_starts, tight.planned.keeps_starts) == (True, False)
     cold = tight.cold_starts()
-    _, left = tight.evaluate(POINT, cold)
+    _, left = tight.evaluate(at(POINT), cold)
     assert left is cold
-    _, left = roomy.evaluate(POINT, roomy.cold_starts())
+    _, left = roomy.evaluate(at(POINT), roomy.cold_starts())
     assert np.isfinite(left[0].adjoint).all()
     assert (np.asarray(left[0].adjoint) != 0).any()
 
@@ -96,11 +97,13 @@ def test_starts_are_dropped_where_there_is_no_room():
 @pytest.mark.parametrize("name", SOLVERS)
 def test_where_solves_start_makes_no_difference(name):
     objective = Objective(problem_of(SOLVERS[name]), MEMORY)
-    cold, starts = objective.evaluate(POINT, objective.cold_starts())
-    warm, _ = objective.evaluate(POINT, starts)
+    cold, starts = objective.evaluate(at(POINT), objective.cold_starts())
+    warm, _ = objective.evaluate(at(POINT), starts)
     assert np.mean(warm.solved[0].sweeps) < np.mean(cold.solved[0].sweeps)
     np.testing.assert_allclose(warm[:4], cold[:4], rtol=1e-8)
-    np.testing.assert_allclose(warm.slope, cold.slope, rtol=1e-7, atol=1e-7 * np.abs(cold.slope).max())
+    np.testing.assert_allclose(
+        warm.slope.model, cold.slope.model, rtol=1e-7, atol=1e-7 * np.abs(cold.slope.model).max()
+    )
 
 
 @pytest.fixture
@@ -116,32 +119,32 @@ def a_task_a_batch(monkeypatch):
 
 def test_what_a_batch_added_at_the_same_point_is_taken_over(a_task_a_batch):
     objective, _ = a_task_a_batch
-    found, starts = objective.evaluate(POINT, objective.cold_starts())
+    found, starts = objective.evaluate(at(POINT), objective.cold_starts())
     assert sum(part.actions for part in found.parts) == found.actions
     marked = [part._replace(actions=2.0**index) for index, part in enumerate(found.parts)]
-    again, left = objective.evaluate(POINT, starts, known=marked)
+    again, left = objective.evaluate(at(POINT), starts, known=marked)
     assert again.actions == 31
-    np.testing.assert_array_equal(again.slope, found.slope)
+    np.testing.assert_array_equal(again.slope.model, found.slope.model)
     assert all(one is other for one, other in zip(left, starts, strict=True))
-    elsewhere, _ = objective.evaluate(POINT + 1e-9, starts, known=marked)
+    elsewhere, _ = objective.evaluate(at(POINT + 1e-9), starts, known=marked)
     assert elsewhere.actions == pytest.approx(found.actions, rel=1e-6)
 
 
 def test_only_batches_that_a_change_concerns_are_solved_anew(a_task_a_batch):
     """One parameter is moved by as much as would change one task's part by a nat, and others hardly."""
     objective, whole = a_task_a_batch
-    found, starts = objective.evaluate(POINT, objective.cold_starts())
-    slopes = np.abs([part.slope for part in found.parts])
+    found, starts = objective.evaluate(at(POINT), objective.cold_starts())
+    slopes = np.abs([part.slope.model for part in found.parts])
     rest = slopes.sum(axis=0) - slopes.max(axis=0)
     cell = np.argmin(np.where(slopes.max(axis=0) > 1e-3, rest / slopes.max(axis=0), np.inf))
     move = 1 / slopes[:, cell].max()
     moved = POINT.at[cell].add(move)
     concerned = slopes[:, cell] * move >= 0.1
     assert 0 < concerned.sum() < 5
-    again, _ = objective.evaluate(moved, starts, known=found.parts, negligible=0.1)
+    again, _ = objective.evaluate(at(moved), starts, known=found.parts, negligible=0.1)
     kept = [now is before for now, before in zip(again.parts, found.parts, strict=True)]
     np.testing.assert_array_equal(kept, ~concerned)
-    exact, _ = whole.evaluate(moved, whole.cold_starts())
+    exact, _ = whole.evaluate(at(moved), whole.cold_starts())
     assert abs(exact.actions - found.actions) > 0.5
     assert again.actions == pytest.approx(exact.actions, abs=0.1)
 
@@ -149,12 +152,12 @@ def test_only_batches_that_a_change_concerns_are_solved_anew(a_task_a_batch):
 def test_what_changed_since_is_counted_from_where_a_part_was_solved(a_task_a_batch):
     """A part that was taken over twice does not drift away by less than is negligible each time."""
     objective, _ = a_task_a_batch
-    found, starts = objective.evaluate(POINT, objective.cold_starts())
+    found, starts = objective.evaluate(at(POINT), objective.cold_starts())
     first = found.parts[0]
-    direction = 0.06 * np.sign(first.slope) / np.abs(first.slope).sum()
-    once, starts = objective.evaluate(POINT + direction, starts, known=found.parts, negligible=0.1)
+    direction = 0.06 * np.sign(first.slope.model) / np.abs(first.slope.model).sum()
+    once, starts = objective.evaluate(at(POINT + direction), starts, known=found.parts, negligible=0.1)
     assert once.parts[0] is first
-    twice, _ = objective.evaluate(POINT + 2 * direction, starts, known=once.parts, negligible=0.1)
+    twice, _ = objective.evaluate(at(POINT + 2 * direction), starts, known=once.parts, negligible=0.1)
     assert twice.parts[0] is not first
 
 
@@ -183,7 +186,7 @@ def test_transitions_alone_need_no_batches():
     problem = problem_of(terms=("transitions",))
     objective = Objective(problem, MEMORY)
     assert (objective.batches, objective.cold_starts()) == ([], [])
-    found, starts = objective.evaluate(POINT, [])
+    found, starts = objective.evaluate(at(POINT), [])
     transitions = log_likelihood(MODEL.with_parameters(POINT), problem.demonstrations, PEOPLE).transitions
     assert (found.actions, found.solved, starts) == (0.0, [], [])
     assert found.transitions == pytest.approx(float(transitions), rel=1e-12)
@@ -195,16 +198,16 @@ def test_32_bit_parameters(name):
     model = ObstacleGrid(BLANK, jnp.full(STATES, -2.0, jnp.float32))
     objective = Objective(problem_of(SOLVERS[name], model=model), MEMORY)
     parameters = POINT.astype(jnp.float32)
-    found, starts = objective.evaluate(parameters, objective.cold_starts())
-    assert found.slope.dtype == starts[0].values.dtype == starts[0].adjoint.dtype == np.float32
+    found, starts = objective.evaluate(at(parameters), objective.cold_starts())
+    assert found.slope.model.dtype == starts[0].values.dtype == starts[0].adjoint.dtype == np.float32
     parts, slope = directly(problem_of(), POINT)
     np.testing.assert_allclose([found.actions, found.transitions, found.prior], parts, rtol=1e-4)
-    np.testing.assert_allclose(found.slope, slope, atol=1e-3 * np.abs(slope).max())
+    np.testing.assert_allclose(found.slope.model, slope, atol=1e-3 * np.abs(slope).max())
 
 
 def test_a_solve_that_fails_makes_the_objective_nan():
     objective = Objective(problem_of(Jacobi(max_sweeps=2)), MEMORY)
-    found, _ = objective.evaluate(POINT, objective.cold_starts())
+    found, _ = objective.evaluate(at(POINT), objective.cold_starts())
     assert np.isnan(found.objective)
     assert not np.asarray(found.solved[0].converged).any()
 
@@ -212,7 +215,7 @@ def test_a_solve_that_fails_makes_the_objective_nan():
 def test_tasks_that_fill_up_a_batch_count_for_nothing():
     """Two batches of three tasks, of which there are five: the sixth has ended."""
     objective = Objective(problem_of(), 46 * ONE_TASK)
-    found, _ = objective.evaluate(POINT, objective.cold_starts())
+    found, _ = objective.evaluate(at(POINT), objective.cold_starts())
     last = found.solved[-1]
     assert (len(objective.batches), len(last.converged)) == (2, 3)
     assert np.asarray(objective.batches[-1].tasks.terminal)[-1].all()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sidestep.errors import InputError
-from sidestep.inference.priors import Lines, Normal, Smooth
+from sidestep.inference.priors import NEAREST, Lines, Normal, Smooth, sensed
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import borders
 
@@ -85,3 +85,36 @@ def test_strengths_that_are_none_are_refused(strength):
         Smooth(EACH, borders(Grid.unknown(2, 2)), strength)
     with pytest.raises(InputError, match="strength"):
         Lines(EACH, np.full((2, 2), -1), strength)
+
+
+NAN, INF = np.nan, np.inf
+
+
+def test_what_a_sensor_saw_is_the_mean_and_the_rest_stays_as_it_was():
+    prior = sensed(np.array([[0.5, 0.9], [NAN, 0.2]]), np.array([[2.0, 0.5], [1.0, INF]]), Normal(-1.0, 7.0))
+    np.testing.assert_allclose(prior.mean, [0, np.log(9), -1, -1], atol=1e-12)
+    np.testing.assert_allclose(prior.variance, [2, 0.5, 7, 7])
+    each = sensed(np.array([[NAN, 0.5]]), 3.0, Normal(jnp.array([4.0, 5.0]), jnp.array([6.0, 7.0])))
+    np.testing.assert_allclose([each.mean, each.variance], [[4, 0], [6, 3]], atol=1e-12)
+    nothing = sensed(np.array([[0.5, 0.9]]), np.array([[NAN, NAN]]), Normal(-1.0, 7.0))
+    np.testing.assert_allclose([nothing.mean, nothing.variance], [[-1, -1], [7, 7]])
+
+
+def test_no_sensor_is_so_sure_that_nobody_could_change_its_mind():
+    prior = sensed(np.array([[0.0, 1.0]]), 1.0, Normal())
+    np.testing.assert_allclose(jax.nn.sigmoid(prior.mean), [NEAREST, 1 - NEAREST], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("probability", "variance", "match"),
+    [
+        (0.5, 0.0, "'sensor variance': expected numbers above 0, found 0.0"),
+        (0.5, -1.0, "'sensor variance'.*found -1.0"),
+        (0.5, -INF, "'sensor variance'"),
+        (1.1, 1.0, "'sensor map': expected numbers from 0 to 1"),
+        (-0.1, 1.0, "'sensor map'"),
+    ],
+)
+def test_sensors_that_cannot_be(probability, variance, match):
+    with pytest.raises(InputError, match=match):
+        sensed(np.array([[0.5, probability]]), np.array([[1.0, variance]]), Normal())

@@ -21,6 +21,7 @@ from sidestep.tabular.models import (
     IMPOSSIBLE,
     FeaturedGrid,
     ObstacleGrid,
+    SlipperyGrid,
     TabularModel,
     TiedModel,
     TransitionModel,
@@ -222,12 +223,38 @@ def featured_problem() -> Problem:
     return Problem(model, dense, goal=1)
 
 
+SIDES = ((2, 3), (2, 3), (0, 1), (0, 1), (5, 6), (4, 7), (4, 7), (5, 6))
+"""The two moves at a right angle to each."""
+
+
+def slippery_problem(connectivity, rows=3, columns=4) -> Problem:
+    """A grid with two terrains, on which moves slip as often as each has it, and one row where they do not.
+
+    A move is a mixture of moves of the obstacle grid: ahead, and to either side.
+    """
+    theta = np.random.default_rng(8).normal(-1, 1.5, rows * columns + 2)
+    terrain = np.arange(rows * columns).reshape(rows, columns) % 2
+    terrain[1] = -1
+    model = SlipperyGrid(Grid.unknown(rows, columns, connectivity), theta[:-2], theta[-2:], terrain)
+
+    def dense(theta):
+        straight = dense_obstacles(theta[: rows * columns], rows, columns, connectivity)
+        aside = sum(straight[:, [sides[k] for sides in SIDES[:connectivity]]] for k in (0, 1)) / 2
+        odds = jnp.where(terrain.ravel() < 0, 0.0, jnp.exp(theta[rows * columns :])[terrain.ravel()])
+        slip = (odds / (1 + odds))[:, None, None]
+        return (1 - slip) * straight + slip * aside
+
+    return Problem(model, dense, goal=1)
+
+
 FAMILIES: dict[str, Problem] = {
     "tied": tied_problem(),
     "walls between cells": walled_problem(),
     "links": road_problem(by_turn=False),
     "turns": road_problem(by_turn=True),
     "features": featured_problem(),
+    "slips": slippery_problem(4),
+    "slips, 8-connected": slippery_problem(8),
 }
 """Models that are checked for their own gradients, not for every solver."""
 

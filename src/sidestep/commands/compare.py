@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sidestep.commands.learn import Settings
 from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError
 from sidestep.evaluation import evaluate
@@ -22,6 +21,7 @@ from sidestep.plotting.maps import Panel, figure_learned, save
 from sidestep.rivals.constraints import by_constraints
 from sidestep.rivals.costs import by_costs
 from sidestep.rivals.learned import Learned, Method, by_behavior, by_transitions, by_visits
+from sidestep.settings import Settings
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tasks import stack_tasks

@@ -12,8 +12,9 @@ from sidestep.domains.offices import connected_cells, places
 from sidestep.errors import InputError
 from sidestep.io.files import write_json
 from sidestep.io.maps import read_map
+from sidestep.io.tables import write_table
 from sidestep.io.trajectories import walks_of_trajectories
-from sidestep.io.walks import write_walks
+from sidestep.io.walks import table_of_walks
 from sidestep.simulation import simulate
 from sidestep.tabular.backups import BACKUPS, Behavior
 from sidestep.tabular.grid import Connectivity, Grid
@@ -48,7 +49,7 @@ def simulate_walks(map_file: Path, out: Path, walkers: Walkers) -> dict[str, Any
     """
     grid = read_map(map_file, connectivity=walkers.connectivity)
     trajectories, goals = walk(grid, walkers)
-    write_walks(out, walks_of_trajectories(trajectories, goals, grid))
+    write_table(out, table_of_walks(walks_of_trajectories(trajectories, goals, grid)))
     summary = {
         "command": "simulate",
         "map": str(map_file),

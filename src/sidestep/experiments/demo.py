@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from sidestep.commands.learn import Settings, fit_map
 from sidestep.commands.simulate import Walkers, walk
 from sidestep.domains.offices import office, places
 from sidestep.evaluation import Reward, evaluate, plan_paths
@@ -22,6 +21,7 @@ from sidestep.io.trajectories import walks_of_trajectories
 from sidestep.io.walks import write_walks
 from sidestep.plotting.maps import Panel, figure_learned, save
 from sidestep.runs import LearnedMap, write_learned_map
+from sidestep.settings import Settings, fit_map
 from sidestep.tabular.models import ObstacleGrid
 
 ROWS, COLUMNS = 14, 24

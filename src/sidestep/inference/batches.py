@@ -5,11 +5,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
 from sidestep.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import Choices, choices_of
 from sidestep.tabular.models import TransitionModel
+from sidestep.tabular.people import People
 from sidestep.tabular.solvers.host import cores
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.solvers.ordered import Ordered
@@ -26,9 +27,10 @@ _FIXED = 8
 
 
 class Batch(NamedTuple):
-    """Some tasks, and what was done in pursuit of them."""
+    """Some tasks, whose each is, and what was done in pursuit of it."""
 
     tasks: Task
+    person: Int[Array, " tasks"]
     choices: Choices
 
 
@@ -69,7 +71,7 @@ def planned(
     return Planned(devices * math.ceil(share / rounds), keeps_starts, takes_over)
 
 
-def batches_of(demonstrations: Demonstrations, together: int) -> list[Batch]:
+def batches_of(demonstrations: Demonstrations, people: People, together: int) -> list[Batch]:
     """Batches of that many tasks; the last is filled up with tasks that have ended, and nothing done."""
     tasks, choices = demonstrations.tasks, choices_of(demonstrations)
     count = len(tasks.terminal)
@@ -79,7 +81,8 @@ def batches_of(demonstrations: Demonstrations, together: int) -> list[Batch]:
         return jnp.concatenate([leaf, jnp.full((missing, *leaf.shape[1:]), value, leaf.dtype)])
 
     ended = Task(filled(tasks.reward), filled(tasks.final_reward), filled(tasks.terminal, True), filled(tasks.discount))
-    whole = Batch(ended, jax.tree.map(filled, choices))
+    person = jnp.zeros(count, jnp.int32) if people.person is None else people.person
+    whole = Batch(ended, filled(person), jax.tree.map(filled, choices))
     return [
         jax.tree.map(lambda leaf, first=first: leaf[first : first + together], whole)
         for first in range(0, count, together)

@@ -61,7 +61,7 @@ class Climb:
 
     def __init__(self, objective: Objective, optimiser: Optimiser, saver: Saver):
         self.objective, self.optimiser, self.saver = objective, optimiser, saver
-        start, self.to_parameters = ravel_pytree(objective.problem.model.parameters)
+        start, self.to_parameters = ravel_pytree(objective.problem.parameters)
         self.start = np.asarray(start)
         self.starts = objective.cold_starts()
         self.last = _Point(np.full_like(self.start, np.nan), np.zeros(4), np.zeros_like(self.start))

@@ -29,6 +29,7 @@ from sidestep.inference.priors import Normal, Prior
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, Gradient
 from sidestep.tabular.likelihood import ALL_TERMS, Term, transition_probabilities
 from sidestep.tabular.models import TransitionModel
+from sidestep.tabular.people import People, people
 from sidestep.tabular.solve import check_proper
 from sidestep.tabular.solvers.choice import solver_for
 from sidestep.tabular.solvers.process import Solver
@@ -40,12 +41,14 @@ class Fit(eqx.Module, Generic[Model]):
     """A learned model and how it was found.
 
     - `model`: the transition model at the θ that was found.
+    - `people`: what was given of them, and what was found where it was to be learned.
     - `history`: `Progress` before the first and after every iteration.
     - `sweeps`, `residual`, `task_converged`: the solve of every task under the learned model.
     - `converged`: whether the optimiser and every task converged; `message` says why it stopped.
     """
 
     model: Model
+    people: People
     history: tuple[Progress, ...] = eqx.field(static=True)
     sweeps: Int[Array, " tasks"]
     residual: Float[Array, " tasks"]
@@ -62,9 +65,10 @@ class Fit(eqx.Module, Generic[Model]):
 def fit(
     model: Model,
     demonstrations: Demonstrations,
-    behavior: Behavior,
+    behavior: Behavior | People,
     *,
     prior: Prior | None = None,
+    tempering: float = 1.0,
     terms: tuple[Term, ...] = ALL_TERMS,
     gradient: Gradient = "exact",
     horizon: int | None = None,
@@ -78,7 +82,9 @@ def fit(
 ) -> Fit[Model]:
     """The model of `model`'s family that maximises the posterior of `demonstrations`, starting at `model`.
 
-    - `prior`: over the parameters; by default the paper's N(−2, 4).
+    - `behavior`: how people behave; `people(...)` where that is to be learned too.
+    - `prior`: over the model's parameters; by default the paper's N(−2, 4).
+    - `tempering`: κ in (0, 1], how much the actions' log-likelihood counts; below 1 where steps depend on each other.
     - `terms`: which parts of the likelihood count, "actions", "transitions" or both.
     - `gradient`, `horizon`, `solver`: as for `solve`. On large maps, solves are only as exact as the optimiser needs
       until it has converged, and exact from then on; a solver with a tolerance of its own keeps to that.
@@ -96,17 +102,21 @@ def fit(
     start or stop converging on the way.
     """
     optimiser = optimiser or LBFGS()
-    _check_settings(terms, gradient, behavior, optimiser)
-    check_proper(demonstrations.tasks, behavior, model.graph.actions, horizon)
-    solver = solver or solver_for(behavior.backup, model.graph.states)
-    problem = Problem(model, demonstrations, behavior, prior or Normal(), terms, horizon, gradient, solver)
+    someone = people(behavior) if isinstance(behavior, Behavior) else behavior
+    _check_settings(terms, gradient, someone.behavior, optimiser)
+    if not 0 < tempering <= 1:
+        raise InputError(f"expected a share above 0 and at most 1, found {tempering}", field="tempering")
+    check_proper(someone.tasks_of(demonstrations.tasks), someone.behavior_of(), model.graph.actions, horizon)
+    solver = solver or solver_for(someone.behavior.backup, model.graph.states)
+    problem = Problem(model, someone, demonstrations, prior or Normal(), terms, horizon, gradient, solver, tempering)
     _check_moves(problem)
     saver = Saver(checkpoint, fingerprint((problem, optimiser.key)) if checkpoint is not None else "")
     climb = Climb(Objective(problem, memory, mesh, optimiser.looks_roughly), optimiser, saver)
     found = climb.run(report, resume)
     solved = _of_all_tasks(found.solved, len(demonstrations.tasks.terminal))
     return Fit(
-        model=model.with_parameters(found.parameters),
+        model=model.with_parameters(found.parameters.model),
+        people=someone.with_parameters(found.parameters.people),
         history=tuple(found.history),
         sweeps=solved.sweeps,
         residual=solved.residual,

@@ -1,6 +1,9 @@
 """The objective of a fit and its gradient, task by task: in batches that fit into memory, over one device or many.
 
-    log L(θ) + log prior(θ),        log L(θ) = Σ_tasks Σ_choices log π_θ(a | s)  +  Σ_moves ln T_θ(s, a, s′)
+    log L(θ) + log prior(θ),        log L(θ) = κ Σ_tasks Σ_choices log π_θ(a | s)  +  Σ_moves ln T_θ(s, a, s′)
+
+κ, the tempering, is 1 unless the steps of a walk are taken to say less than as many independent ones would. θ is all
+that is learned: of the transition model, and of people what is not known of them.
 
 The sum over tasks is the only costly part, and tasks have nothing to do with each other. So they are cut into batches
 of equal size, one compiled function serves them all, and with a mesh of devices each device takes its share of a
@@ -29,9 +32,10 @@ from sidestep.errors import InputError
 from sidestep.inference.batches import Batch, batches_of, planned
 from sidestep.inference.checkpoints import fingerprint
 from sidestep.inference.priors import Prior
-from sidestep.tabular.backups import Behavior, Gradient
+from sidestep.tabular.backups import Gradient
 from sidestep.tabular.likelihood import Choices, Term, choice_log_likelihood, transition_log_likelihood
 from sidestep.tabular.models import TransitionModel
+from sidestep.tabular.people import People, Traits
 from sidestep.tabular.solvers.process import Solver, Start, reachable
 from sidestep.tasks import Task
 
@@ -41,17 +45,30 @@ AXIS = "tasks"
 """The name of the axis of a mesh that tasks are spread over."""
 
 
+class Parameters(NamedTuple):
+    """All that is learned: θ of the transition model, and of people what is not known of them."""
+
+    model: PyTree
+    people: Traits
+
+
 class Problem(eqx.Module):
-    """All that the objective depends on, besides θ; arguments as for `fit`."""
+    """All that the objective depends on, besides what is learned; arguments as for `fit`."""
 
     model: TransitionModel
+    people: People
     demonstrations: Demonstrations
-    behavior: Behavior
     prior: Prior
     terms: tuple[Term, ...] = eqx.field(static=True)
     horizon: int | None = eqx.field(static=True)
     gradient: Gradient = eqx.field(static=True)
     solver: Solver
+    tempering: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
+
+    @property
+    def parameters(self) -> Parameters:
+        """What is learned, where it starts."""
+        return Parameters(self.model.parameters, self.people.parameters)
 
 
 class Solved(NamedTuple):
@@ -104,7 +121,11 @@ class Objective:
         devices = 1 if mesh is None else mesh.size
         self.planned = planned(problem.model, problem.solver, tasks, memory, devices, takes_over)
         _check_same(problem, mesh)
-        batches = batches_of(problem.demonstrations, self.planned.together) if "actions" in problem.terms else []
+        batches = (
+            batches_of(problem.demonstrations, problem.people, self.planned.together)
+            if "actions" in problem.terms
+            else []
+        )
         self.batches = [_shared_out(batch, mesh) for batch in batches]
         # devices need not hold what only the transitions depend on
         self.solving = _on_all(eqx.tree_at(lambda problem: problem.demonstrations, problem, None), mesh)
@@ -133,7 +154,7 @@ class Objective:
 
     def evaluate(
         self,
-        parameters: PyTree,
+        parameters: Parameters,
         starts: list[Start],
         tolerance: float | None = None,
         known: Sequence[Part] = (),
@@ -181,14 +202,15 @@ def _unchanged(part: Part, parameters: PyTree[np.ndarray], negligible: float) ->
 
 
 @eqx.filter_jit
-def _apart_from_actions(problem: Problem, parameters: PyTree) -> tuple[PyTree, tuple[Array, Array]]:
+def _apart_from_actions(problem: Problem, parameters: Parameters) -> tuple[PyTree, tuple[Array, Array]]:
     """The slope of the loss's other parts, and the parts: the transitions' log-likelihood and the log prior."""
 
-    def loss(parameters: PyTree) -> tuple[Array, tuple[Array, Array]]:
-        prior = problem.prior.log_density(parameters)
+    def loss(parameters: Parameters) -> tuple[Array, tuple[Array, Array]]:
+        prior = problem.prior.log_density(parameters.model)
         transitions = jnp.zeros_like(prior)
+        prior = prior + problem.people.with_parameters(parameters.people).log_density().astype(prior.dtype)
         if "transitions" in problem.terms:
-            model = problem.model.with_parameters(parameters)
+            model = problem.model.with_parameters(parameters.model)
             transitions = transition_log_likelihood(model, problem.demonstrations)
         return -transitions - prior, (transitions, prior)
 
@@ -210,15 +232,19 @@ def _of_actions(
 
 
 @eqx.filter_jit
-def _share(problem: Problem, parameters: PyTree, batch: Batch, starts: Start) -> tuple[Array, PyTree, Start, Solved]:
+def _share(
+    problem: Problem, parameters: Parameters, batch: Batch, starts: Start
+) -> tuple[Array, PyTree, Start, Solved]:
     """`_of_actions` on one device."""
 
-    def of_one(model: TransitionModel, task: Task, choices: Choices, start: Start) -> tuple[Array, tuple]:
+    def of_one(
+        model: TransitionModel, people: People, task: Task, person: Array, choices: Choices, start: Start
+    ) -> tuple[Array, tuple]:
         value, found = choice_log_likelihood(
             model,
-            task,
+            people.tasks_of(task),
             choices,
-            problem.behavior,
+            people.behavior_of(person),
             start,
             horizon=problem.horizon,
             gradient=problem.gradient,
@@ -227,11 +253,13 @@ def _share(problem: Problem, parameters: PyTree, batch: Batch, starts: Start) ->
         stuck = (choices.counts > 0) & ~reachable(found.values[choices.states])
         return value, (found.start, Solved(found.sweeps, found.residual, found.converged, stuck))
 
-    def loss(parameters: PyTree, adjoint: Array) -> tuple[Array, tuple]:
-        model = problem.model.with_parameters(parameters)
+    def loss(parameters: Parameters, adjoint: Array) -> tuple[Array, tuple]:
+        model = problem.model.with_parameters(parameters.model)
+        people = problem.people.with_parameters(parameters.people)
         given = starts._replace(adjoint=adjoint)
-        values, left = jax.vmap(of_one, in_axes=(None, 0, 0, 0))(model, batch.tasks, batch.choices, given)
-        return -values.sum(), left
+        each = jax.vmap(of_one, in_axes=(None, None, 0, 0, 0, 0))
+        values, left = each(model, people, batch.tasks, batch.person, batch.choices, given)
+        return -problem.tempering.astype(values.dtype) * values.sum(), left
 
     # the gradient by the old adjoint is the new one
     gradient = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)

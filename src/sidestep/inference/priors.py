@@ -20,6 +20,9 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from sidestep.errors import InputError
 
+NEAREST = 1 / 1020
+"""How close to 0 or 1 a sensor's probability is taken to be at most: a quarter of a grey level of its image."""
+
 
 class Prior(eqx.Module):
     """A density over parameters, up to a constant."""
@@ -59,6 +62,33 @@ class Normal(Prior):
             for leaf in jax.tree.leaves(parameters)
         ]
         return -jnp.sum(jnp.stack(penalties))
+
+
+def sensed(
+    probability: Float[np.ndarray, "rows columns"],
+    variance: float | Float[np.ndarray, "rows columns"],
+    elsewhere: Normal,
+) -> Normal:
+    """What a sensor's map says of each cell's logit: b = ln(p / (1 − p)), and so P(blocked) = p if nobody walks there.
+
+    - `probability`: p of each cell, from 0 to 1; NaN where the sensor saw nothing. p closer to 0 or 1 than `NEAREST`
+      counts as that close, for no finite logit is sure.
+    - `variance`: a, how surely p is known: one number or one of each cell, above 0. Where it is NaN or infinite,
+      nothing is known.
+    - `elsewhere`: what is known of the logits of all other cells.
+
+    Raises `InputError` for other probabilities and variances.
+    """
+    a = np.broadcast_to(np.asarray(variance, dtype=np.float64), probability.shape)
+    if (a <= 0).any():
+        raise InputError(f"expected numbers above 0, found {a[a <= 0][0]}", field="sensor variance")
+    if ((probability < 0) | (probability > 1)).any():
+        raise InputError("expected numbers from 0 to 1", field="sensor map")
+    seen = ~np.isnan(probability) & np.isfinite(a)
+    p = np.clip(np.where(seen, probability, 0.5), NEAREST, 1 - NEAREST)
+    mean, spread = (jnp.broadcast_to(each, seen.size) for each in (elsewhere.mean, elsewhere.variance))
+    seen, logit, a = seen.ravel(), (np.log(p) - np.log1p(-p)).ravel(), a.ravel()
+    return Normal(jnp.where(seen, logit, mean), jnp.where(seen, a, spread))
 
 
 class Smooth(Prior):

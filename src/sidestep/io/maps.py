@@ -8,7 +8,7 @@ anything else unknown. In `raw` mode v itself is the occupancy in percent, and a
 import math
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -32,16 +32,43 @@ robot.
 """
 
 
+class Raster(NamedTuple):
+    """What a ROS map's two files say, before anything is made of it.
+
+    - `occupancy`: of each cell, row 0 at the top, from 0 to 1; NaN where the map does not say.
+    - `mode`: trinary, scale or raw. `resolution`: metres. `origin`: metres and radians, of the lower-left corner.
+    - `occupied_above`, `free_below`: the thresholds.
+    """
+
+    occupancy: Float[np.ndarray, "rows columns"]
+    mode: str
+    resolution: float
+    origin: tuple[float, float, float]
+    occupied_above: float
+    free_below: float
+
+
 def read_map(path: str | Path, connectivity: Connectivity = 4) -> Grid:
     """The grid of a ROS map: geometry from its YAML file (metres, radians), known cells from its image.
 
-    The image is PGM or PNG, of 8 or 16 bits, grey or in colour (then the mean of the channels counts);
-    cells under fully transparent pixels are unknown. `connectivity` (4 or 8) is the walker's, no part of
-    the file. Raises `InputError`, naming file and key, for YAML that cannot be read, lacks keys or holds
-    values of the wrong kind, and for an image that lies outside the YAML's folder, has more than
-    `MOST_PIXELS` or cannot be decoded.
+    `connectivity` (4 or 8) is the walker's, no part of the file. Raises `InputError` as `read_raster` does.
 
     >>> grid = read_map("office.yaml")  # doctest: +SKIP
+    """
+    found = read_raster(path)
+    with np.errstate(invalid="ignore"):
+        free = np.where(found.occupancy < found.free_below, Cell.FREE, Cell.UNKNOWN)
+        known = np.where(found.occupancy > found.occupied_above, Cell.OCCUPIED, free)
+    return Grid(known, found.resolution, found.origin, connectivity)
+
+
+def read_raster(path: str | Path) -> Raster:
+    """What a ROS map's files say.
+
+    The image is PGM or PNG, of 8 or 16 bits, grey or in colour (then the mean of the channels counts); cells under
+    fully transparent pixels are unknown. Raises `InputError`, naming file and key, for YAML that cannot be read, lacks
+    keys or holds values of the wrong kind, and for an image that lies outside the YAML's folder, has more than
+    `MOST_PIXELS` or cannot be decoded.
     """
     path = Path(path)
     settings = _settings(path)
@@ -60,9 +87,7 @@ def read_map(path: str | Path, connectivity: Connectivity = 4) -> Grid:
     grey, transparent = _grey(_image_path(settings, path))
     occupancy = _occupancy(grey, negate, mode)
     occupancy[transparent] = np.nan
-    with np.errstate(invalid="ignore"):
-        known = np.where(occupancy > occupied, Cell.OCCUPIED, np.where(occupancy < free, Cell.FREE, Cell.UNKNOWN))
-    return Grid(known, resolution, origin, connectivity)
+    return Raster(occupancy, mode, resolution, origin, occupied, free)
 
 
 def write_map(path: str | Path, blocked: Float[np.ndarray, "rows columns"], grid: Grid) -> None:

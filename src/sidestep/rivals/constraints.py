@@ -18,9 +18,9 @@ from jaxtyping import Bool, Float
 from scipy.sparse import coo_array, eye_array
 from scipy.sparse.linalg import spsolve
 
-from sidestep.commands.learn import Settings
 from sidestep.demonstrations import Demonstrations
 from sidestep.rivals.learned import Learned, people_of, reward_of
+from sidestep.settings import Settings
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, true_model
 from sidestep.tabular.planning import Plan, plan

@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.optimize import minimize
 
-from sidestep.commands.learn import Settings
 from sidestep.demonstrations import Demonstrations
 from sidestep.errors import NotConverged
 from sidestep.evaluation import Reward
 from sidestep.inference.priors import Normal
 from sidestep.rivals.learned import Learned
+from sidestep.settings import Settings
 from sidestep.tabular.backups import Behavior, LogSumExp
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import log_likelihood

@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from sidestep.commands.learn import Settings, fit_map
 from sidestep.demonstrations import Demonstrations
 from sidestep.evaluation import Reward
 from sidestep.scoring import visit_ranking
-from sidestep.tabular.backups import BACKUPS, Behavior
+from sidestep.settings import Settings, fit_map
+from sidestep.tabular.backups import Behavior
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
 
@@ -41,7 +41,7 @@ Method = Callable[[Grid, Demonstrations, Settings], Learned]
 
 def people_of(settings: Settings) -> Behavior:
     """How people are taken to behave."""
-    return Behavior(BACKUPS[settings.backup](), settings.beta)
+    return settings.behavior()
 
 
 def reward_of(settings: Settings) -> Reward:

@@ -3,14 +3,14 @@
     log L(θ) = Σ_i Σ_t [ log π_θ(a_t | s_t)  +  ln T_θ(s_t, a_t, s_{t+1}) ],      log π_θ = βQ_θ − log Σ_a exp βQ_θ
 
 People plan with the dynamics that they know, so both terms depend on θ: the *actions* through the values, the observed
-*transitions* directly. Each can be left out.
+*transitions* directly. Each can be left out. Where demonstrations have weights, each move counts by its weight.
 """
 
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from sidestep.demonstrations import Demonstrations
 from sidestep.tabular.backups import Behavior, Gradient
@@ -70,22 +70,36 @@ def action_log_likelihood(
     solver: Solver | None = None,
 ) -> Float[Array, ""]:
     """Σ log π_θ(a | s) over all moves; NaN if a task's values did not converge."""
+    each = log_policies(model, demonstrations, behavior, horizon=horizon, gradient=gradient, solver=solver)
+    return _weighted(demonstrations, each)
+
+
+def log_policies(
+    model: TransitionModel,
+    demonstrations: Demonstrations,
+    behavior: Behavior,
+    *,
+    horizon: int | None = None,
+    gradient: Gradient = "exact",
+    solver: Solver | None = None,
+) -> Float[Array, " moves"]:
+    """log π_θ(a | s) of every move; NaN if a task's values did not converge."""
     tasks, task, states = demonstrations.tasks, demonstrations.task, demonstrations.states
     solution = solve(model, tasks, behavior, horizon=horizon, gradient=gradient, solver=solver)
-    q = _visited_action_values(model, tasks, solution.values, task, states)
+    q = visited_action_values(model, tasks, solution.values, task, states)
     # a factor, so that the gradient is NaN too
-    return _log_policy(behavior, q, demonstrations.actions).sum() * _nan_unless(solution.converged.all())
+    return _log_policy(behavior, q, demonstrations.actions) * _nan_unless(solution.converged.all())
 
 
 class Choices(NamedTuple):
-    """What was done in pursuit of a task: action `actions` in state `states`, `counts` times.
+    """What was done in pursuit of a task: action `actions` in state `states`, `counts` times, or by so much weight.
 
     With a leading `tasks` axis, for several tasks; shorter lists are filled up with counts of 0.
     """
 
     states: Int[Array, "*tasks choices"]
     actions: Int[Array, "*tasks choices"]
-    counts: Int[Array, "*tasks choices"]
+    counts: Shaped[Array, "*tasks choices"]
 
 
 def choice_log_likelihood(
@@ -122,16 +136,24 @@ def choice_log_likelihood(
 def choices_of(demonstrations: Demonstrations) -> Choices:
     """The moves of each task as choices, equal ones counted."""
     task, states, actions = (np.asarray(getattr(demonstrations, name)) for name in ("task", "states", "actions"))
-    different, counts = np.unique(np.stack([task, states, actions]), axis=1, return_counts=True)
+    different, which, counts = np.unique(
+        np.stack([task, states, actions]), axis=1, return_inverse=True, return_counts=True
+    )
+    if demonstrations.weight is not None:
+        counts = np.bincount(which.ravel(), np.asarray(demonstrations.weight))
     sizes = np.bincount(different[0], minlength=len(demonstrations.tasks.terminal))
     # rounded up to a power of two, so that fits of other data need not be compiled again
     filled = np.arange(2 ** int(np.ceil(np.log2(max(sizes.max(), 16))))) < sizes[:, None]
-    padded = np.zeros((3, *filled.shape), dtype=np.int32)
-    padded[:, filled] = np.stack([*different[1:], counts])
-    return Choices(*(jnp.asarray(part) for part in padded))
+
+    def padded(part: np.ndarray) -> Array:
+        whole = np.zeros(filled.shape, part.dtype if part.dtype.kind == "f" else np.int32)
+        whole[filled] = part
+        return jnp.asarray(whole)
+
+    return Choices(padded(different[1]), padded(different[2]), padded(counts))
 
 
-def _visited_action_values(
+def visited_action_values(
     model: TransitionModel,
     tasks: Task,
     values: Float[Array, "tasks states"],
@@ -151,13 +173,18 @@ def _log_policy(
     return jnp.take_along_axis(behavior.log_policy(q), actions[:, None], axis=-1)[:, 0]
 
 
+def _weighted(demonstrations: Demonstrations, parts: Float[Array, " moves"]) -> Float[Array, ""]:
+    """The sum over moves, each by its weight."""
+    return parts.sum() if demonstrations.weight is None else parts @ demonstrations.weight.astype(parts.dtype)
+
+
 def _nan_unless(condition: Bool[Array, ""]) -> Float[Array, ""]:
     return jnp.where(condition, 1.0, jnp.nan)
 
 
 def transition_log_likelihood(model: TransitionModel, demonstrations: Demonstrations) -> Float[Array, ""]:
     """Σ ln T_θ(s, a, s′) over all moves."""
-    return jnp.sum(jnp.log(transition_probabilities(model, demonstrations)))
+    return _weighted(demonstrations, jnp.log(transition_probabilities(model, demonstrations)))
 
 
 def transition_probabilities(model: TransitionModel, demonstrations: Demonstrations) -> Float[Array, " moves"]:

@@ -48,11 +48,11 @@ class ObstacleGrid(TransitionModel):
     @property
     def blocked(self) -> Float[Array, "rows columns"]:
         """P(blocked), one value a cell, row 0 at the top; exactly 0 or 1 where the map knows."""
-        return _blocked(self.parameters, self.known)
+        return blocked_of(self.parameters, self.known)
 
     def probabilities(self) -> Float[Array, "states actions outcomes"]:
         """(success, failure) of every move."""
-        return _moves(self.parameters, self.known, self.graph.actions)
+        return chances_of_moves(self.parameters, self.known, self.graph.actions)
 
 
 class FeaturedGrid(TransitionModel):
@@ -107,11 +107,11 @@ class FeaturedGrid(TransitionModel):
     @property
     def blocked(self) -> Float[Array, "rows columns"]:
         """P(blocked), as in `ObstacleGrid`."""
-        return _blocked(self.logits, self.known)
+        return blocked_of(self.logits, self.known)
 
     def probabilities(self) -> Float[Array, "states actions outcomes"]:
         """(success, failure) of every move."""
-        return _moves(self.logits, self.known, self.graph.actions)
+        return chances_of_moves(self.logits, self.known, self.graph.actions)
 
 
 def borders(grid: Grid) -> Int[np.ndarray, "borders 2"]:
@@ -141,13 +141,13 @@ def walled_grid(grid: Grid, logits: Float[Array | np.ndarray, " borders"] | floa
     return TiedModel(graph, index, jnp.broadcast_to(jnp.asarray(logits, jnp.result_type(float)), (len(between),)))
 
 
-def _blocked(logits: Float[Array, " cells"], known: Int[Array, "rows columns"]) -> Float[Array, "rows columns"]:
+def blocked_of(logits: Float[Array, " cells"], known: Int[Array, "rows columns"]) -> Float[Array, "rows columns"]:
     """P(blocked), exactly 0 or 1 where the map knows."""
     learned = jax.nn.sigmoid(logits).reshape(known.shape)
     return jnp.where(known == Cell.UNKNOWN, learned, (known == Cell.OCCUPIED).astype(learned.dtype))
 
 
-def _moves(
+def chances_of_moves(
     logits: Float[Array, " cells"], known: Int[Array, "rows columns"], actions: int
 ) -> Float[Array, "states actions outcomes"]:
     """(success, failure) of every move, from the logits of the cells."""

@@ -1,7 +1,8 @@
 """Road networks: states are links, an action is one of the turns out of a link, and some may be closed.
 
 A turn from link l onto link m succeeds unless m (or the turn itself) is closed, with P(closed) = σ(θ); who meets a
-closed one stays on l. Links differ in how many turns they have; what is not there stays put.
+closed one stays on l. Links differ in how many turns they have; what is not there stays put, and is as long as all
+links together, so that nobody tries it who pays by length.
 """
 
 import jax
@@ -45,7 +46,7 @@ def road_network(
     index[..., 1] = FIXED
     index[begin, action, 0] = FIXED
     index[begin, action, 1] = order if by_turn else onto
-    costs = np.repeat(lengths[:, None], successors.shape[1], axis=1)
+    costs = np.full(successors.shape[:2], lengths.sum())
     costs[begin, action] = lengths[onto]
     graph = Graph(jnp.asarray(successors, jnp.int32), jnp.asarray(costs))
     count = len(turns) if by_turn else links

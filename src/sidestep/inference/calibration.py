@@ -1,0 +1,78 @@
+"""How much the steps of a walk say: what people do is less independent than the likelihood of single actions has it.
+
+Who takes a long way because of a wrong turn takes many steps of it. If each counts as a decision of its own, the map is
+bent until it explains them all: behavior that is taken to be sharp (a large β) predicts actions better and puts walls
+where there are none. Whether it does shows in walks that were not learned from. With
+
+    u_t = ∂ log π(a_t | s_t) / ∂ log β  (Q held),       I = Σ_t Σ_a π(a | s_t) u(s_t, a)²,
+
+the score of a step and the information that the steps would have, were each drawn from π by itself, the sums of the
+scores over walks would vary by I as well (the information matrix equality; White 1982). If they vary more, by
+J = Σ_walks (Σ_{t in walk} (u_t − ū))², then
+
+    κ = I / J
+
+is the share of independent steps that theirs are worth. That is the adjustment of composite likelihoods (Varin, Reid
+and Firth 2011): log L^κ. A share above 1 says that people are more regular than they are taken to be.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from sidestep.demonstrations import Demonstrations
+from sidestep.tabular.backups import Behavior
+from sidestep.tabular.likelihood import visited_action_values
+from sidestep.tabular.models import TransitionModel
+from sidestep.tabular.solve import solve
+
+
+class Scores(NamedTuple):
+    """Of each move that counts: u, Σ_a π u², log π(a | s), and the trajectory that it belongs to."""
+
+    score: Float[np.ndarray, " moves"]
+    information: Float[np.ndarray, " moves"]
+    log_policy: Float[np.ndarray, " moves"]
+    trajectory: Int[np.ndarray, " moves"]
+
+
+def scores(model: TransitionModel, demonstrations: Demonstrations, behavior: Behavior) -> Scores:
+    """The scores of the moves whose weight is not 0, under a model that should not have been learned from them."""
+    values = solve(model, demonstrations.tasks, behavior).values
+    q = visited_action_values(model, demonstrations.tasks, values, demonstrations.task, demonstrations.states)
+    log_policy, by_log_beta = jax.jvp(
+        lambda log_beta: Behavior(behavior.backup, jnp.exp(log_beta), behavior.lapse).log_policy(q),
+        (jnp.log(behavior.beta),),
+        (jnp.ones_like(behavior.beta),),
+    )
+    information = np.asarray(jnp.sum(jnp.exp(log_policy) * by_log_beta**2, axis=-1))
+    moves, actions = np.arange(len(q)), np.asarray(demonstrations.actions)
+    weight = demonstrations.weight
+    counted = np.ones(len(q), dtype=bool) if weight is None else np.asarray(weight) > 0
+    return Scores(
+        np.asarray(by_log_beta)[moves, actions][counted],
+        information[counted],
+        np.asarray(log_policy)[moves, actions][counted],
+        np.asarray(demonstrations.trajectory)[counted],
+    )
+
+
+def effective_share(held_out: Sequence[Scores]) -> float:
+    """κ, from the scores of walks that were not learned from; infinite where scores do not vary."""
+    score, information, _, trajectory = (np.concatenate(part) for part in zip(*held_out, strict=True))
+    of_walks = np.bincount(trajectory, score - score.mean())
+    varies = float(np.sum(of_walks**2))
+    return float(information.sum()) / varies if varies > 0 else float("inf")
+
+
+def doubtful(share: float, walks: int, errors: float) -> tuple[bool, bool]:
+    """Whether κ from so many walks is below 1, and whether it is above, by more than so many standard errors.
+
+    A sum of n squares of normal numbers is off by the share √(2/n).
+    """
+    margin = errors * (2 / walks) ** 0.5
+    return bool(np.log(share) < -margin), bool(np.log(share) > margin)
