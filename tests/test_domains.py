@@ -2,8 +2,11 @@
 
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from sidestep.domains.flats import three_rooms, two_rooms
 from sidestep.domains.grids import WORLDS, block, wall
 from sidestep.domains.offices import office, places
 from sidestep.errors import InputError
@@ -56,18 +59,19 @@ def dilated(cells):
     return cells | padded[2:, 1:-1] | padded[:-2, 1:-1] | padded[1:-1, 2:] | padded[1:-1, :-2]
 
 
-@pytest.mark.parametrize("shape", [(10, 8), (20, 30), (28, 8), (30, 14), (45, 90), (60, 61)])
-def test_offices_are_walled_in_and_connected(shape):
-    for seed in range(25):
-        grid = office(*shape, seed=seed)
-        free = grid.known == Cell.FREE
-        assert grid.shape == shape
-        assert np.isin(grid.known, [Cell.FREE, Cell.OCCUPIED]).all()
-        assert not free[[0, -1]].any()
-        assert not free[:, [0, -1]].any()
-        label = connected_components(walkable_graph(grid), directed=False)[1]
-        assert len(np.unique(label[free.reshape(-1)])) == 1, seed
-        assert 0.3 < free.mean() < 0.9
+@given(rows=st.integers(10, 70), columns=st.integers(8, 100), seed=st.integers(0, 2**32 - 1))
+@example(rows=10, columns=8, seed=0)
+@example(rows=28, columns=8, seed=0)
+@example(rows=300, columns=9, seed=0)
+def test_offices_of_any_size_are_walled_in_and_connected(rows, columns, seed):
+    grid = office(rows, columns, seed=seed)
+    free = grid.known == Cell.FREE
+    assert grid.shape == (rows, columns)
+    assert np.isin(grid.known, [Cell.FREE, Cell.OCCUPIED]).all()
+    assert not free[[0, -1]].any()
+    assert not free[:, [0, -1]].any()
+    assert rooms_of(grid) == 1
+    assert 0.3 < free.mean() < 0.9
 
 
 def test_an_office_of_20_by_30_has_rooms_on_both_sides_of_a_corridor():
@@ -115,3 +119,51 @@ def test_places_lie_in_the_largest_connected_part():
     for count in (0, 3):
         with pytest.raises(InputError, match=r"'count': expected 1…2"):
             places(grid, count, seed=0)
+
+
+@pytest.mark.parametrize("connectivity", [4, 8])
+def test_rooms_in_a_row_are_joined_by_their_doors_alone(connectivity):
+    for rows, columns in ((1, 3), (4, 6), (7, 13)):
+        for door in range(rows):
+            check_rooms(two_rooms(rows, columns, door, connectivity), {(columns + 1) // 2 - 1: door})
+    for columns in range(5, 20):
+        for doors in ((0, 0), (3, 1)):
+            grid = three_rooms(4, columns, doors, connectivity)
+            left, right = np.flatnonzero((grid.known == Cell.OCCUPIED).any(axis=0))
+            check_rooms(grid, {left: doors[0], right: doors[1]})
+            widths = [left, right - left - 1, columns - right - 1]
+            assert max(widths) - min(widths) <= 1
+
+
+def check_rooms(grid, doors):
+    """Free but for walls in some columns, which have one free cell each; closing a door parts the rooms beside it."""
+    expected = np.zeros(grid.shape, dtype=int)
+    for column, row in doors.items():
+        expected[:, column] = 1
+        expected[row, column] = 0
+    np.testing.assert_array_equal(grid.known, expected)
+    assert rooms_of(grid) == 1
+    for column, row in doors.items():
+        closed = grid.known.copy()
+        closed[row, column] = Cell.OCCUPIED
+        assert rooms_of(Grid(closed, connectivity=grid.connectivity)) == 2
+
+
+def rooms_of(grid):
+    label = connected_components(walkable_graph(grid), directed=False)[1]
+    return len(np.unique(label[grid.known.reshape(-1) == Cell.FREE]))
+
+
+@pytest.mark.parametrize(
+    ("make", "arguments", "match"),
+    [
+        (two_rooms, (3, 2, 0), "'columns': expected at least 3, found 2"),
+        (two_rooms, (0, 3, 0), "'rows': expected at least 1, found 0"),
+        (two_rooms, (3, 3, 3), "'door': expected a row in 0…2, found 3"),
+        (three_rooms, (3, 4, (0, 0)), "'columns': expected at least 5, found 4"),
+        (three_rooms, (3, 5, (0, -1)), "'door': expected a row in 0…2, found -1"),
+    ],
+)
+def test_rooms_that_cannot_be_are_refused(make, arguments, match):
+    with pytest.raises(InputError, match=match):
+        make(*arguments)

@@ -7,6 +7,7 @@ import pytest
 
 from sidestep.demonstrations import gather
 from sidestep.domains.farm import Farm
+from sidestep.domains.flats import three_rooms, two_rooms
 from sidestep.domains.gravity import DIRECTIONS, Gravity, rule_of
 from sidestep.errors import InputError
 from sidestep.inference.fit import fit
@@ -14,9 +15,10 @@ from sidestep.inference.priors import Normal
 from sidestep.simulation import simulate
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.graph import Graph
-from sidestep.tabular.grid import Grid
-from sidestep.tabular.models import ObstacleGrid, closed, road_network, true_model, walled_grid
+from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.models import ObstacleGrid, SlipperyGrid, closed, road_network, true_model, walled_grid
 from sidestep.tabular.planning import plan
+from sidestep.tabular.solve import solve
 from sidestep.tasks import Task, reach
 
 UP, DOWN, LEFT, RIGHT = range(4)
@@ -27,6 +29,10 @@ def surely(model, state, action):
     chances = np.asarray(model.probabilities()[state, action])
     assert chances.max() > 1 - 1e-4
     return int(model.graph.successors[state, action, chances.argmax()])
+
+
+def logit(chance):
+    return np.log(chance) - np.log1p(-np.asarray(chance))
 
 
 def dense(model):
@@ -179,6 +185,16 @@ def test_a_closed_link_is_found_from_trips_around_it():
     assert chances[3] > 0.5
 
 
+def test_who_pays_by_length_does_not_try_turns_that_are_not_there():
+    """Link 0 leads onto three links, link 1 onto the goal alone: its other two actions are no turns."""
+    model = road_network(np.array([[0, 1], [0, 2], [0, 3], [1, 3], [2, 0]]), np.array([3.0, 1.0, 5.0, 0.5]), -20.0)
+    people = Behavior(BoltzmannAverage(), 2.0)
+    found = solve(model, reach(model.graph, 3, discount=1.0, step_cost=1.0), people)
+    assert found.converged
+    np.testing.assert_allclose(found.values[1], -0.5, atol=1e-6)
+    np.testing.assert_allclose(np.exp(people.log_policy(found.action_values[1]))[1:], 0, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("turns", "lengths", "match"),
     [
@@ -191,3 +207,67 @@ def test_a_closed_link_is_found_from_trips_around_it():
 def test_roads_that_are_none_are_refused(turns, lengths, match):
     with pytest.raises(InputError, match=match):
         road_network(np.array(turns), np.array(lengths))
+
+
+# Slips
+
+
+def test_a_slip_leads_to_either_side_and_fails_where_something_is_in_the_way():
+    """Along the lower of two rows, under a blocked cell."""
+    model = SlipperyGrid(Grid(np.array([[0, 1, 0], [0, 0, 0]])), slip=logit(0.2))
+    moves = dense(model)
+    np.testing.assert_allclose(moves[4, RIGHT], [0, 0, 0, 0, 0.2, 0.8], atol=1e-12)
+    np.testing.assert_allclose(moves[3, RIGHT], [0.1, 0, 0, 0.1, 0.8, 0], atol=1e-12)
+    np.testing.assert_allclose(moves[4, UP], [0, 0, 0, 0.1, 0.8, 0.1], atol=1e-12)
+    assert float(model.slip[0]) == pytest.approx(0.2)
+
+
+def test_where_nobody_slips_a_grid_is_an_obstacle_grid():
+    grid, theta = Grid.unknown(3, 3, connectivity=8), np.random.default_rng(0).normal(size=9)
+    terrain = np.full((3, 3), -1)
+    terrain[2, 2] = 0
+    slippery, plain = dense(SlipperyGrid(grid, theta, 0.0, terrain)), dense(ObstacleGrid(grid, theta))
+    np.testing.assert_allclose(slippery[:8], plain[:8], rtol=1e-12)
+    assert np.abs(slippery[8] - plain[8]).max() > 0.1
+
+
+@pytest.mark.parametrize("terrain", [np.zeros((2, 3), int), np.full((2, 2), -1), np.full((2, 2), 1), -np.eye(2) * 2])
+def test_terrain_that_is_none_is_refused(terrain):
+    with pytest.raises(InputError, match="terrain"):
+        SlipperyGrid(Grid.unknown(2, 2), terrain=terrain.astype(int))
+
+
+def learned_with_slips(flat, slips, terrain, goals):
+    """Walls and slips, from optimal walks of people who know both; and how often people moved on each terrain."""
+    world, random = SlipperyGrid(flat, slip=logit(slips), terrain=terrain), np.random.default_rng(0)
+    free = np.flatnonzero(flat.known.ravel() == Cell.FREE)
+    tasks = [reach(flat.forget(), goal, discount=1.0, step_cost=1.0) for goal in goals]
+    starts = [random.choice(np.setdiff1d(free, [goal]), 10) for goal in goals]
+    demos = gather(simulate(jax.random.key(0), world, tasks, starts), tasks)
+    people = Behavior(BoltzmannAverage(), 3.0)
+    found = fit(SlipperyGrid(flat.forget(), terrain=terrain), demos, people, prior=Normal(-2.0, 8.0))
+    assert found.converged
+    blocked, wall = np.asarray(found.model.blocked), flat.known == Cell.OCCUPIED
+    assert blocked[wall].min() > 0.8
+    assert blocked[wall].min() > blocked[~wall].max()
+    return np.asarray(found.model.slip), np.bincount(np.asarray(world.terrain)[np.asarray(demos.states)])
+
+
+def check_slips(found, slips, moves):
+    """Within four standard deviations of the share that moves on each terrain really slip."""
+    slips = np.asarray(slips)
+    assert (np.abs(found - slips) < 4 * np.sqrt(slips * (1 - slips) / moves)).all()
+
+
+def test_walls_and_slips_of_two_terrains_are_found_together():
+    terrain = np.zeros((7, 9), int)
+    terrain[:, 5:] = 1
+    slips, goals = [0.1, 0.4], [0, 21, 46, 8, 26, 62, 5]
+    found, moves = learned_with_slips(two_rooms(7, 9, door=6), slips, terrain, goals)
+    check_slips(found, slips, moves)
+
+
+def test_a_slip_that_all_cells_share_is_found_in_three_rooms():
+    goals = [0, 24, 4, 28, 10, 52, 31]
+    found, moves = learned_with_slips(three_rooms(5, 11, doors=(4, 0)), [0.2], None, goals)
+    check_slips(found, [0.2], moves)

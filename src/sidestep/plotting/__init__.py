@@ -1,1 +1,1 @@
-"""Every picture: of maps (`maps`), and of continuous worlds (`fields`)."""
+"""Every picture: of maps (`maps`), policies (`policies`) and physical systems (`physics`)."""

@@ -59,23 +59,45 @@ class Panel:
     goals: Sequence[int] | Places = ()
 
 
+def draw_cells(
+    axes: Axes, values: np.ndarray, grid: Grid, colours: str | ListedColormap, limits: tuple[float, float]
+) -> AxesImage:
+    """Draw a value a cell where the cells lie in the map's frame, and set the axes up in metres."""
+    rows, columns = grid.shape
+    x, y, yaw = grid.origin
+    extent = (0.0, columns * grid.resolution, 0.0, rows * grid.resolution)
+    image = axes.imshow(values, cmap=colours, vmin=limits[0], vmax=limits[1], extent=extent, origin="upper")
+    image.set_transform(Affine2D().rotate(yaw).translate(x, y) + axes.transData)
+    corners = grid.to_metres(np.array([[0, 0], [columns, 0], [columns, rows], [0, rows]], dtype=np.float64))
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x (m)", ylabel="y (m)")
+    if _is_small(grid):
+        axes.add_collection(LineCollection(_cell_lines(grid), colors="0.75", linewidths=0.4, zorder=1), autolim=False)
+    return image
+
+
 def draw_map(axes: Axes, grid: Grid) -> AxesImage:
     """Draw what a map knows: free cells white, occupied ones dark, unknown ones light grey."""
-    return _draw_cells(axes, grid.known, grid, _KNOWN_COLOURS, (float(Cell.UNKNOWN), float(Cell.OCCUPIED)))
+    return draw_cells(axes, grid.known, grid, _KNOWN_COLOURS, (float(Cell.UNKNOWN), float(Cell.OCCUPIED)))
 
 
 def draw_blocked(
     axes: Axes, blocked: Float[np.ndarray, "rows columns"], grid: Grid, truth: Grid | None = None
 ) -> AxesImage:
     """Draw P(blocked) as colours from 0 to 1, the true obstacles outlined; returns the image."""
-    image = _draw_cells(axes, blocked, grid, COLOURS, (0.0, 1.0))
+    image = draw_cells(axes, blocked, grid, COLOURS, (0.0, 1.0))
     if truth is not None:
-        segments = _borders(truth.known == Cell.OCCUPIED, truth)
-        width = _width(grid, 0.2, 1.6)
-        outline = LineCollection(segments, colors=_OUTLINE, linewidths=width, zorder=2, label="true obstacle")
-        outline.set(capstyle="projecting", path_effects=_halo(width))
-        axes.add_collection(outline, autolim=False)
+        draw_outlines(axes, truth)
     return image
+
+
+def draw_outlines(axes: Axes, truth: Grid) -> None:
+    """Outline the obstacles of a true map."""
+    segments = _borders(truth.known == Cell.OCCUPIED, truth)
+    width = _width(truth, 0.2, 1.6)
+    outline = LineCollection(segments, colors=_OUTLINE, linewidths=width, zorder=2, label="true obstacle")
+    outline.set(capstyle="projecting", path_effects=_halo(width))
+    axes.add_collection(outline, autolim=False)
 
 
 def draw_walks(axes: Axes, paths: Sequence[Places], grid: Grid, label: str = "walk") -> None:
@@ -137,12 +159,18 @@ def figure_fit(
     paths: Sequence[Integer[np.ndarray, " _"]],
     blocked: Float[np.ndarray, "rows columns"],
     objective: Float[np.ndarray, " iterations"],
+    seen: Float[np.ndarray, "rows columns"] | None = None,
 ) -> Figure:
-    """A figure of a fit: the walks that went in, the P(blocked) that came out, and the objective."""
+    """A figure of a fit: the walks that went in, the P(blocked) that came out, and the objective.
+
+    `seen` is P(blocked) as a sensor's map has it, NaN where that says nothing.
+    """
     width, height = _size(grid, 4.2)
     figure = Figure(figsize=(2 * width + 4.9, max(height, 2.2) + 1.2), layout="compressed")
     before, after, progress = figure.subplots(1, 3, width_ratios=[width, width, 2.8])
     draw_map(before, grid)
+    if seen is not None:
+        draw_cells(before, seen, grid, COLOURS, (0.0, 1.0))
     draw_walks(before, paths, grid)
     before.set_title(f"What was known, and {len(paths)} walks")
     _colour_bar(figure, draw_blocked(after, blocked, grid), [after])
@@ -183,23 +211,6 @@ def _draw_panel(axes: Axes, panel: Panel) -> AxesImage | None:
     draw_walks(axes, panel.paths, panel.grid, label="path")
     draw_places(axes, panel.starts, panel.goals, panel.grid)
     axes.set_title(panel.title)
-    return image
-
-
-def _draw_cells(
-    axes: Axes, values: np.ndarray, grid: Grid, colours: str | ListedColormap, limits: tuple[float, float]
-) -> AxesImage:
-    """Draw a value a cell where the cells lie in the map's frame, and set the axes up in metres."""
-    rows, columns = grid.shape
-    x, y, yaw = grid.origin
-    extent = (0.0, columns * grid.resolution, 0.0, rows * grid.resolution)
-    image = axes.imshow(values, cmap=colours, vmin=limits[0], vmax=limits[1], extent=extent, origin="upper")
-    image.set_transform(Affine2D().rotate(yaw).translate(x, y) + axes.transData)
-    corners = grid.to_metres(np.array([[0, 0], [columns, 0], [columns, rows], [0, rows]], dtype=np.float64))
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x (m)", ylabel="y (m)")
-    if _is_small(grid):
-        axes.add_collection(LineCollection(_cell_lines(grid), colors="0.75", linewidths=0.4, zorder=1), autolim=False)
     return image
 
 
