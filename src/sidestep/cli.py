@@ -112,7 +112,8 @@ def experiment_command(
 @app.command(name="learn", epilog="Example: sidestep learn walks.csv --map office.yaml --out learned")
 def learn_command(
     walks: Annotated[
-        Path, typer.Argument(help="A table with walk, step, x, y and optionally goal_x, goal_y: CSV, Parquet, minari:ID.")
+        Path,
+        typer.Argument(help="A table with walk, step, x, y and optionally goal_x, goal_y: CSV, Parquet, minari:ID."),
     ],
     map_file: Annotated[Path, typer.Option("--map", help="ROS map: what is already known.", metavar="MAP.yaml")],
     out: Folder,
