@@ -20,7 +20,7 @@ from sidestep.tabular.backups import BACKUPS, Behavior, Gradient
 from sidestep.tabular.grid import Cell, Connectivity
 from sidestep.tabular.likelihood import Term
 from sidestep.tabular.models import ObstacleGrid
-from sidestep.tabular.people import people
+from sidestep.tabular.people import People, people
 
 Terms = Literal["both", "actions", "transitions"]
 TERMS: dict[Terms, tuple[Term, ...]] = {
@@ -81,12 +81,16 @@ def fit_map(
     checkpoint: Path | None = None,
     resume: bool = False,
     each: Normal | None = None,
+    walkers: People | None = None,
 ) -> Fit[ObstacleGrid]:
-    """The fit that `settings` describe; `each` is the prior of cells' logits where it is not the settings' own."""
+    """The fit that `settings` describe.
+
+    `each` is the prior of cells' logits and `walkers` are the people, where they are not the settings' own.
+    """
     if not (np.isfinite(settings.memory) and settings.memory > 0):
         raise InputError(f"expected GiB above 0, found {settings.memory}", field="memory")
     discount = settings.discount if "discount" in settings.unknown else None
-    walkers = people(settings.behavior(), settings.unknown, discount=discount)
+    walkers = walkers or people(settings.behavior(), settings.unknown, discount=discount)
     prior = _prior_of(settings, model, each)
     optimiser = optimiser_of(settings, model.graph.states, len(demonstrations))
     if settings.terms == "both":

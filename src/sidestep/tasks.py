@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sidestep.errors import InputError
 from sidestep.tabular.graph import Graph
@@ -103,6 +103,18 @@ def stack_tasks(tasks: Sequence[Task]) -> Task:
         return jnp.stack([jnp.broadcast_to(leaf, shape) for leaf in leaves])
 
     return Task(stacked("reward"), stacked("final_reward"), stacked("terminal"), stacked("discount"))
+
+
+def with_costs(tasks: Task, costs: Float[Array, " states"], aimed_at: Int[Array, "states actions"]) -> Task:
+    """One task or a stack, in which a move also pays the cost of the state that it aims at.
+
+    >>> from sidestep.tabular.graph import grid_graph
+    >>> grid = Grid.unknown(rows=1, columns=3)
+    >>> aimed_at = grid_graph(grid).successors[..., 0]
+    >>> with_costs(reach(grid, 2), jnp.array([0.0, 0.25, 0.0]), aimed_at).reward[0].tolist()  # up, down, left, right
+    [0.0, 0.0, 0.0, -0.25]
+    """
+    return Task(tasks.reward - costs[aimed_at], tasks.final_reward, tasks.terminal, tasks.discount)
 
 
 def check_discount(discount: float) -> None:

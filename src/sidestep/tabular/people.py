@@ -6,11 +6,12 @@ Between the tasks that people pursue and what they do stand some numbers that no
     lapses      ε = σ(e)                                 the share of actions at random (see `Behavior`)
     discount    γ = σ(g)                                 of all tasks
     tastes      R(s, a) + Σ_f w_f φ_f(s, a)              what they like or dislike on the way, by features φ
+    costs       R(s, a) − ln(1 + exp k_c(s, a))          what it costs them to aim at place c(s, a), the same for all goals
 
 Each may be held to be known or be learned with θ, from the likelihood of the actions. What is learned has a normal
-prior around where it starts: the typical b and g, and e, with standard deviation 1, and the w with standard deviation
-`taste_spread`. One person's b differs from the typical one with standard deviation ½; so people are pooled, and who is
-seen little is taken to be like the others.
+prior around where it starts: the typical b and g, and e, with standard deviation 1, the w with standard deviation
+`taste_spread`, and the k with 2, around −4: a cost of .02, give or take a factor of seven. One person's b differs from
+the typical one with standard deviation ½; so people are pooled, and who is seen little is taken to be like the others.
 """
 
 from collections.abc import Sequence
@@ -25,7 +26,7 @@ from jaxtyping import Array, Float, Int
 
 from sidestep.errors import InputError
 from sidestep.tabular.backups import Behavior
-from sidestep.tasks import Task
+from sidestep.tasks import Task, with_costs
 
 TRAITS = ("sharpness", "lapses", "discount")
 """What may be learned of people, beside tastes."""
@@ -34,18 +35,22 @@ _PERSONS_DIFFER = 0.5
 """The standard deviation of one person's log β around that of all."""
 _A_FEW_LAPSES = 0.05
 """The share of lapses to start from where they are learned and none are given."""
+_COST, _COSTS_DIFFER = -4.0, 2.0
+"""The mean and the standard deviation of the k."""
 
 
 class Traits(NamedTuple):
     """The numbers that are learned; None for what is known.
 
     - `sharpness`: b of every person; one number where people are alike. `lapses`: e. `discount`: g. `tastes`: w.
+    - `costs`: k of every place.
     """
 
     sharpness: Float[Array, " persons"] | None = None
     lapses: Float[Array, ""] | None = None
     discount: Float[Array, ""] | None = None
     tastes: Float[Array, " features"] | None = None
+    costs: Float[Array, " states"] | None = None
 
 
 class People(eqx.Module):
@@ -55,6 +60,7 @@ class People(eqx.Module):
     - `parameters`: what is learned.
     - `person`: whose each task is, where people differ (see `apart` in `sidestep.demonstrations`).
     - `features`: φ(s, a); an axis of length 1 holds for all states or all actions.
+    - `aimed_at`: c(s, a), where places may cost something.
     """
 
     behavior: Behavior
@@ -62,11 +68,17 @@ class People(eqx.Module):
     start: Traits
     person: Int[Array, " tasks"] | None
     features: Float[Array, "#states #actions features"] | None
+    aimed_at: Int[Array, "states actions"] | None
     taste_spread: float = eqx.field(static=True)
 
     def with_parameters(self, parameters: Traits) -> "People":
         """The same people with other traits."""
         return eqx.tree_at(lambda people: people.parameters, self, parameters, is_leaf=lambda leaf: leaf is None)
+
+    @property
+    def costs(self) -> Float[Array, " states"] | None:
+        """What it costs to aim at each place, in units of reward; None where nothing does."""
+        return None if self.parameters.costs is None else jax.nn.softplus(self.parameters.costs)
 
     def behavior_of(self, person: Int[Array, ""] | int | None = None) -> Behavior:
         """How one person behaves; without a person, a typical one: the mean of log β."""
@@ -79,7 +91,9 @@ class People(eqx.Module):
         return Behavior(self.behavior.backup, beta, lapse)
 
     def tasks_of(self, tasks: Task) -> Task:
-        """What people pursue, one task or a stack, with their discount and their tastes."""
+        """What people pursue, one task or a stack, with their discount, their tastes and their costs."""
+        if self.costs is not None and self.aimed_at is not None:
+            tasks = with_costs(tasks, self.costs, self.aimed_at)
         reward, discount = tasks.reward, tasks.discount
         if self.parameters.tastes is not None and self.features is not None:
             reward = reward + self.features @ self.parameters.tastes
@@ -100,6 +114,8 @@ class People(eqx.Module):
             deviations.append((now.discount - start.discount)[None])
         if now.tastes is not None and start.tastes is not None:
             deviations.append((now.tastes - start.tastes) / self.taste_spread)
+        if now.costs is not None and start.costs is not None:
+            deviations.append((now.costs - start.costs) / _COSTS_DIFFER)
         return -0.5 * jnp.sum(jnp.concatenate(deviations) ** 2)
 
 
@@ -112,6 +128,7 @@ def people(
     features: Float[np.ndarray, "#states #actions features"] | None = None,
     tastes: Float[np.ndarray, " features"] | None = None,
     taste_spread: float = 1.0,
+    aimed_at: Int[np.ndarray, "states actions"] | None = None,
 ) -> People:
     """People who behave as `behavior` says, but for what is to be learned of them.
 
@@ -120,9 +137,11 @@ def people(
     - `person`: whose each task is, 0…persons − 1; then each has a sharpness of their own.
     - `features`: what people may like or dislike; `tastes` are the weights to start from, 0 by default, in units of
       reward for a feature of 1, and `taste_spread` is by how much they may differ from that.
+    - `aimed_at`: the state that each action aims at, if it costs something to aim at states and that is to be learned.
 
     Raises `InputError` for a trait that there is not, a discount that is to be learned and not between 0 and 1, persons
-    who are not numbered from 0, features that are not finite, and as many tastes as there are not features.
+    who are not numbered from 0, features that are not finite, as many tastes as there are not features, and aims that are not
+    states.
 
     >>> from sidestep.tabular.backups import BoltzmannAverage
     >>> float(people(Behavior(BoltzmannAverage(), 7.0), ["sharpness"]).behavior_of().beta)
@@ -140,10 +159,12 @@ def people(
         else None,
         discount=_logit_of(discount) if "discount" in learned else None,
         tastes=None if features is None else _tastes(features, tastes),
+        costs=None if aimed_at is None else _costs(aimed_at),
     )
     whose = None if person is None else jnp.asarray(person, jnp.int32)
     given = None if features is None else jnp.asarray(features, jnp.result_type(float))
-    return People(behavior, start, start, whose, given, taste_spread)
+    aims = None if aimed_at is None else jnp.asarray(aimed_at, jnp.int32)
+    return People(behavior, start, start, whose, given, aims, taste_spread)
 
 
 def _sharpness(behavior: Behavior, person: Int[np.ndarray, " tasks"] | None) -> Float[Array, " persons"]:
@@ -165,3 +186,9 @@ def _tastes(
     if weights.shape != features.shape[-1:] or not np.isfinite(weights).all():
         raise InputError(f"expected {features.shape[-1]} finite numbers, found {weights}", field="tastes")
     return jnp.asarray(weights, jnp.result_type(float))
+
+
+def _costs(aimed_at: Int[np.ndarray, "states actions"]) -> Float[Array, " states"]:
+    if aimed_at.min() < 0 or aimed_at.max() >= len(aimed_at):
+        raise InputError(f"expected states 0…{len(aimed_at) - 1}", field="aimed_at")
+    return jnp.full(len(aimed_at), _COST, jnp.result_type(float))

@@ -1,0 +1,30 @@
+"""Rewards and dynamics at once: a cost of every cell, and the probability that it is blocked (Herman et al. 2016).
+
+What people avoid may cost something or not be passable, and from their walks both are learned together, "inverse
+reinforcement learning with simultaneous estimation of rewards and dynamics": the likelihood of what they did and of
+what came of it,
+
+    Σ log π_{k,θ}(a | s)  +  Σ ln T_θ(s, a, s′),        R(s, a) = R₀(s, a) − ln(1 + exp k_c(s, a)),
+
+is climbed in the costs' k and the cells' logits θ together, with the prior of the costs (`tabular.people`) and the
+settings' own of the logits. As there, people act by maximum causal entropy, whatever backup the settings name: the one
+thing in which this differs from `costs` is then that moves may fail. And as there people know the true dynamics;
+Herman et al. also have people whose beliefs differ from them.
+"""
+
+import numpy as np
+
+from sidestep.demonstrations import Demonstrations
+from sidestep.rivals.costs import costly_reward, who_pay
+from sidestep.rivals.learned import Learned
+from sidestep.settings import Settings, fit_map
+from sidestep.tabular.grid import Grid
+from sidestep.tabular.models import ObstacleGrid
+
+
+def by_joint(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> Learned:
+    """A cost of every cell and P(blocked) of every unknown one; the ranking is by P(blocked)."""
+    model, walkers = ObstacleGrid(grid, settings.prior_mean), who_pay(grid, settings)
+    found = fit_map(model, demonstrations, settings, walkers=walkers)
+    reward = costly_reward(found.people, settings)
+    return Learned(found.model, reward, walkers.behavior, np.asarray(found.model.blocked, dtype=np.float64))
