@@ -22,8 +22,9 @@ from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import ObstacleGrid, TabularModel, true_model
 from sidestep.tabular.solve import check_proper, solve
 from sidestep.tabular.solvers.jacobi import Jacobi
+from sidestep.tabular.solvers.ordered import Ordered
 from sidestep.tabular.solvers.process import lowest
-from sidestep.tasks import Task, reach, stack_tasks, task
+from sidestep.tasks import Task, reach, stack_tasks, task, with_costs
 
 each_backup = pytest.mark.parametrize("name", BACKUPS)
 
@@ -382,3 +383,18 @@ def test_values_solve_the_bellman_equation(name, seed, cost, kind):
     found = solve_jit(model, wanted, people(name, beta))
     assert found.converged
     assert residual(name, found, wanted, beta) < 1e-8
+
+
+@pytest.mark.parametrize("solver", [Jacobi(), Ordered()], ids=["Jacobi", "Ordered"])
+@each_backup
+def test_values_that_were_far_too_high_come_down(name, solver):
+    """From those of a room where nothing costs anything to those of one where places cost much, on an open grid."""
+    grid = Grid.unknown(5, 5)
+    model = true_model(grid.passable())
+    costs = jnp.asarray(np.random.default_rng(2).uniform(0, 1, 25))
+    dear = with_costs(reach(grid, 0), costs, model.graph.successors[..., 0])
+    before = solve(model, reach(grid, 0), people(name, 7.0), solver=solver)
+    warm = solve(model, dear, people(name, 7.0), solver=solver, start=before.start)
+    cold = solve(model, dear, people(name, 7.0), solver=solver)
+    assert warm.converged
+    np.testing.assert_allclose(warm.values, cold.values, rtol=1e-6, atol=1e-8)

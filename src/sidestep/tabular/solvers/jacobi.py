@@ -185,7 +185,14 @@ def _own_equation(
     start = jnp.where(reachable(old), toward(old, escape), escape)
     advantage = (elsewhere - leaving * start).T
     divisor = _divisor(backup.weights(advantage, beta), backup.fixed_policy_weights(advantage, beta), leaving)
-    solved = toward(start + backup.value(advantage, beta) / divisor, escape)
+    value = backup.value(advantage, beta)
+    if backup.above_maximum:
+        # from above its root, a convex function's tangent leads below it, and two neighbours that take turns in doing
+        # so never settle: go by the chord, which ends above it
+        too_high = (value < 0) & (start > escape)
+        chord = backup.value((elsewhere - leaving * escape).T, beta) - value
+        divisor = jnp.where(too_high, chord / jnp.where(too_high, start - escape, 1), divisor)
+    solved = toward(start + value / divisor, escape)
     return jnp.where(reachable(escape), jnp.maximum(solved, bottom), bottom)
 
 
