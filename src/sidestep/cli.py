@@ -280,6 +280,7 @@ def compare_command(
         "average_precision_relevant": "of those\nthat matter",
         "legal_share": "legal\npaths",
         "regret": "regret",
+        "arriving_share": "arrive",
         "heldout_log_likelihood": "held-out\nnats a move",
         "seconds": "seconds",
     }

@@ -1,19 +1,22 @@
 """How good a learned map is: its cells and the paths planned in it, against the truth.
 
 `scoring` compares arrays and paths; here the paths are planned, between all pairs of free cells where the map is
-small and between sampled ones where it is large.
+small and between sampled ones where it is large. What has no map, but says what to do, is scored by its paths alone.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 
-from sidestep.replanning import lengths_with_bumps, world_of
+from sidestep.planners import InModel, Planner
+from sidestep.replanning import world_of
 from sidestep.scoring import (
+    MapScores,
     path_lengths,
     relevant_obstacles,
     score_lengths,
@@ -87,34 +90,50 @@ def evaluate(
     report: Report = lambda *_: None,
     ranking: Float[np.ndarray, "rows columns"] | None = None,
 ) -> Mapping[str, float | None]:
-    """All scores of a learned map, by name: those of `scoring.MapScores` and `scoring.PathScores`, and `regret`.
+    """All scores of a learned map: those of `evaluate_planner` for who plans in it optimally.
 
+    - `reward`: what planned paths pursue. `ranking`: what cells are ranked by, where that is not P(blocked).
+    """
+    planner = InModel(model, partial(reward.reach, truth.forget()))
+    blocked = np.asarray(model.blocked, dtype=np.float64) if ranking is None else ranking
+    return evaluate_planner(planner, blocked, truth, scored, visited, seed, report)
+
+
+def evaluate_planner(
+    planner: Planner,
+    ranking: Float[np.ndarray, "rows columns"] | None,
+    truth: Grid,
+    scored: Bool[np.ndarray, "rows columns"],
+    visited: Int[np.ndarray, "visits 2"],
+    seed: int = 0,
+    report: Report = lambda *_: None,
+) -> Mapping[str, float | None]:
+    """All scores, by name: those of `scoring.MapScores` and `scoring.PathScores`, `regret` and `arriving_share`.
+
+    - `ranking`: what cells are ranked by, higher for obstacles: P(blocked), where there is such a thing; None where
+      cells are not ranked.
     - `scored`: the cells that had to be learned.
     - `visited`: (state, goal) of the moves that were learned from; they tell which obstacles matter.
-    - `ranking`: what cells are ranked by, higher for obstacles, where that is not the model's P(blocked).
-    - `reward`: what planned paths pursue. `seed` draws their starts and goals on maps too large for all pairs (see
-      `sample_for`).
+    - `seed` draws starts and goals of paths on maps too large for all pairs (see `sample_for`).
 
-    The regret is by how much a robot that follows the plans goes farther than the shortest way, on average and in cell
-    sides: where it bumps into something it stays, having gone the length of the move, notes the obstacle and plans
-    again. Values are `None` where there is nothing to average; the regret also where the map is so wrong about cells
-    that it takes for known that the robot never arrives.
+    The regret is by how much a robot goes farther than the shortest way, on average and in cell sides: where it bumps
+    into something it stays, having gone the length of the move, notes the obstacle and goes on as its planner has it.
+    `arriving_share` is the share of pairs between which it arrives. Values are `None` where there is nothing to
+    average; the regret also where a robot never arrives: for it is so wrong about cells that it takes for known, or
+    goes round in circles.
     """
     report("finding the obstacles that matter", 0, 1)
-    blocked = np.asarray(model.blocked, dtype=np.float64)
     relevant = relevant_obstacles(truth, visited[:, 0], visited[:, 1])
     report("finding the obstacles that matter", 1, 1)
     # nobody can plan to where the learned map is known to be occupied, whatever the truth says
-    free = np.flatnonzero((truth.known == Cell.FREE) & (blocked < 1))
+    free = np.flatnonzero((truth.known == Cell.FREE) & planner.possible())
     random, sample = np.random.default_rng(seed), sample_for(truth.size)
     graph = walkable_graph(truth)
     pairs = _pairs_with_a_way(_some(free, sample.starts, random), _some(free, sample.goals, random), graph)
-    lengths = _planned_lengths(model, pairs, truth, graph, reward, report)
-    return {
-        **asdict(score_map(blocked if ranking is None else ranking, truth, scored, relevant)),
-        **asdict(score_lengths(lengths, pairs.shortest)),
-        "regret": _regret(model, pairs, lengths, truth, reward, sample.followed, random, report),
-    }
+    lengths = _planned_lengths(planner, pairs, graph, report)
+    cells = MapScores() if ranking is None else score_map(ranking, truth, scored, relevant)
+    bumps = _followed_with_bumps(planner, pairs, lengths, truth, sample.followed, random, report)
+    return {**asdict(cells), **asdict(score_lengths(lengths, pairs.shortest)), **bumps}
 
 
 def _some(states: Int[np.ndarray, " states"], most: int, random: np.random.Generator) -> Int[np.ndarray, " some"]:
@@ -129,20 +148,16 @@ def _pairs_with_a_way(starts: Int[np.ndarray, " starts"], goals: Int[np.ndarray,
     return _Pairs(own_starts[kept], own_goals[kept], shortest[kept])
 
 
-def _planned_lengths(
-    model: ObstacleGrid, pairs: _Pairs, truth: Grid, graph: csr_array, reward: Reward, report: Report
-) -> Float[np.ndarray, " pairs"]:
+def _planned_lengths(planner: Planner, pairs: _Pairs, graph: csr_array, report: Report) -> Float[np.ndarray, " pairs"]:
     """The lengths of the paths planned between pairs, infinite for those that are not legal.
 
     Only the paths to one goal are held at a time: all together may take gigabytes.
     """
-    geometry, lengths = truth.forget(), np.full(len(pairs.goals), np.inf)
-    goals = np.unique(pairs.goals)
+    lengths, goals = np.full(len(pairs.goals), np.inf), np.unique(pairs.goals)
     for done, goal in enumerate(goals):
         report(_PLANNING, done, len(goals))
         own = pairs.goals == goal
-        paths = plan(model, reward.reach(geometry, int(goal))).follow(pairs.starts[own])
-        lengths[own] = path_lengths(graph, paths, pairs.goals[own])
+        lengths[own] = path_lengths(graph, planner.pursue(int(goal)).follow(pairs.starts[own]), pairs.goals[own])
     report(_PLANNING, len(goals), len(goals))
     return lengths
 
@@ -150,44 +165,37 @@ def _planned_lengths(
 _PLANNING, _FOLLOWING = "planning to goals", "following paths that bump"
 
 
-def _regret(
-    model: ObstacleGrid,
+def _followed_with_bumps(
+    planner: Planner,
     pairs: _Pairs,
     lengths: Float[np.ndarray, " pairs"],
     truth: Grid,
-    reward: Reward,
     most: int,
     random: np.random.Generator,
     report: Report,
-) -> float | None:
-    """The mean over all pairs; of paths that are not legal, a sample is followed."""
+) -> dict[str, float | None]:
+    """The regret and the share that arrives, over all pairs; of paths that are not legal, a sample is followed."""
     if not len(lengths):
-        return None
+        return {"regret": None, "arriving_share": None}
     legal = np.isfinite(lengths)
     bumping = np.flatnonzero(~legal)
     followed = _some(bumping, most, random)
-    excess = _followed_lengths(model, pairs, followed, truth, reward, report) - pairs.shortest[followed]
+    excess = _followed_lengths(planner, pairs, followed, truth, report) - pairs.shortest[followed]
+    arriving = legal.sum() + (len(bumping) * np.isfinite(excess).mean() if len(excess) else 0.0)
     total = np.sum(lengths[legal] - pairs.shortest[legal]) + (len(bumping) * excess.mean() if len(excess) else 0.0)
-    return float(total / len(lengths)) if np.isfinite(total) else None
+    regret = float(total / len(lengths)) if np.isfinite(total) else None
+    return {"regret": regret, "arriving_share": float(arriving / len(lengths))}
 
 
 def _followed_lengths(
-    model: ObstacleGrid,
-    pairs: _Pairs,
-    followed: Int[np.ndarray, " followed"],
-    truth: Grid,
-    reward: Reward,
-    report: Report,
+    planner: Planner, pairs: _Pairs, followed: Int[np.ndarray, " followed"], truth: Grid, report: Report
 ) -> Float[np.ndarray, " followed"]:
     """How far a robot goes between some of the pairs; those to the same goal share the plan that it sets out with."""
-    world, geometry, lengths = world_of(truth), truth.forget(), np.zeros(len(followed))
-    goals = pairs.goals[followed]
+    world, lengths, goals = world_of(truth), np.zeros(len(followed)), pairs.goals[followed]
     for goal in np.unique(goals):
         report(_FOLLOWING, int((goals < goal).sum()), len(followed))
-        task = reward.reach(geometry, int(goal))
-        lengths[goals == goal] = lengths_with_bumps(
-            model, world, task, int(goal), pairs.starts[followed][goals == goal]
-        )
+        own = goals == goal
+        lengths[own] = planner.pursue(int(goal)).lengths_with_bumps(world, pairs.starts[followed][own])
     report(_FOLLOWING, len(followed), len(followed))
     return lengths
 

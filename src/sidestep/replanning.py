@@ -4,6 +4,9 @@ What a robot finds out closes one cell, or few, and changes the values of those 
 it. So a plan is mended: first, from the closed cell outwards, the states are found whose value nothing supports any
 more; then these are given values anew, from their border inwards, the best first (Ramalingam & Reps, 1996). Since no
 action has a value above that of where it leads, the best of them depends on none of the others.
+
+A robot that has only a policy has nothing to mend: it does not try again what it knows to fail, and goes on as its
+policy says. Without anything new it does the same in the same state, so who returns to one will never arrive.
 """
 
 from heapq import heappop, heappush
@@ -76,6 +79,45 @@ def lengths_with_bumps(
         return _Mind(chances.copy(), values.copy(), reward, float(task.discount), goal, tie)
 
     return np.array([_walked(world, mind(), start) for start in starts.tolist()])
+
+
+def lengths_by_policy(
+    policy: Float[np.ndarray, "states actions"], world: World, goal: int, starts: Int[np.ndarray, " starts"]
+) -> Float[np.ndarray, " starts"]:
+    """How far a robot goes from each start that takes the most probable action, and after a bump the next.
+
+    What has probability 0 is not tried. In cell sides, with moves that failed; infinite if the robot goes round in
+    circles, or has nothing left to try. Each robot sets out knowing nothing but the policy.
+    """
+    ranked = np.argsort(-policy, axis=-1, kind="stable")
+    return np.array([_walked_by(policy, ranked, world, goal, start) for start in starts.tolist()])
+
+
+@compiled()
+def _walked_by(policy, ranked, world, goal, start):  # pragma: no cover
+    """How far the robot goes from the start to the goal by the actions' rank in each state."""
+    here, length, since_a_bump = start, 0.0, 0
+    found = np.zeros(len(world.walls), np.bool_)
+    while here != goal:
+        action = -1
+        for a in ranked[here]:
+            if policy[here, a] > 0 and not found[world.needed[here, a]].any():
+                action = a
+                break
+        if action < 0 or since_a_bump > len(policy):
+            return np.inf
+        length += world.lengths[action]
+        since_a_bump += 1
+        bumped = False
+        for cell in world.needed[here, action]:
+            if world.walls[cell]:
+                found[cell] = True
+                bumped = True
+        if bumped:
+            since_a_bump = 0
+        else:
+            here = world.needed[here, action, 0]
+    return length
 
 
 @compiled()

@@ -34,14 +34,14 @@ class MapScores:
       both.
     """
 
-    auc: float | None
-    average_precision: float | None
-    auc_relevant: float | None
-    average_precision_relevant: float | None
-    recall: float | None
-    mean_obstacle: float | None
-    mean_free: float | None
-    max_probability: float | None
+    auc: float | None = None
+    average_precision: float | None = None
+    auc_relevant: float | None = None
+    average_precision_relevant: float | None = None
+    recall: float | None = None
+    mean_obstacle: float | None = None
+    mean_free: float | None = None
+    max_probability: float | None = None
 
 
 @dataclass(frozen=True)

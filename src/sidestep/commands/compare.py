@@ -8,23 +8,22 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError
-from sidestep.evaluation import evaluate
+from sidestep.evaluation import evaluate_planner
 from sidestep.io.demonstrations import demonstrations
 from sidestep.io.files import write_json
 from sidestep.io.maps import read_map
 from sidestep.io.walks import read_walks
 from sidestep.plotting.maps import Panel, figure_learned, save
+from sidestep.rivals.cloning import by_cloning
 from sidestep.rivals.constraints import by_constraints
 from sidestep.rivals.costs import by_costs
-from sidestep.rivals.learned import Learned, Method, by_behavior, by_transitions, by_visits
+from sidestep.rivals.joint import by_joint
+from sidestep.rivals.learned import Lesson, Method, by_behavior, by_transitions, by_visits
 from sidestep.settings import Settings
 from sidestep.tabular.grid import Cell, Grid
-from sidestep.tabular.likelihood import log_likelihood
-from sidestep.tasks import stack_tasks
 
 METHODS: Mapping[str, Method] = MappingProxyType(
     {
@@ -33,6 +32,8 @@ METHODS: Mapping[str, Method] = MappingProxyType(
         "visits": by_visits,
         "constraints": by_constraints,
         "costs": by_costs,
+        "joint": by_joint,
+        "cloning": by_cloning,
     }
 )
 """The methods by name: behavior-aware modeling first, then its rivals."""
@@ -52,8 +53,8 @@ def compare(
     - `hold_out`: the share of walks, drawn by the settings' seed, that are not learned from. How probable their actions
       are under what was learned, in nats a move, is `heldout_log_likelihood`.
 
-    The summary has `methods.<name>` with the scores of `evaluate`, that, and `seconds`. Raises `InputError` for files
-    that do not fit, and a share that leaves no walk to learn from or none to score.
+    The summary has `methods.<name>` with the scores of `evaluate_planner`, that, and `seconds`. Raises `InputError` for
+    files that do not fit, and a share that leaves no walk to learn from or none to score.
     """
     given, truth = (read_map(file, connectivity=settings.connectivity) for file in (map_file, truth_file))
     if given.shape != truth.shape or not np.isclose(given.resolution, truth.resolution):
@@ -74,13 +75,12 @@ def compare(
         learned = learn(given, own, settings)
         seconds = time.monotonic() - started
         report(f"scoring {name}")
-        scores = evaluate(
-            learned.model, truth, given.known == Cell.UNKNOWN, own.visited(), learned.reward, settings.seed,
-            ranking=learned.ranking,
-        )  # fmt: skip
-        heldout = _log_likelihood(learned, others, given)
+        scores = evaluate_planner(
+            learned, learned.ranking, truth, given.known == Cell.UNKNOWN, own.visited(), settings.seed
+        )
+        heldout = float(learned.log_policies(others).mean())
         methods[name] = {**scores, "heldout_log_likelihood": heldout, "seconds": round(seconds, 3)}
-        pictures.append(Panel(name, given, _as_shares(learned), truth))
+        pictures.append(_panel(name, learned, given, truth, own))
     summary = {
         "command": "compare",
         "files": {"walks": str(walks_file), "map": str(map_file), "truth": str(truth_file)},
@@ -96,17 +96,12 @@ def compare(
     return summary
 
 
-def _log_likelihood(learned: Learned, demos: Demonstrations, grid: Grid) -> float:
-    """Of the actions, in nats a move, by people who know what was learned."""
-    goals = np.asarray(demos.tasks.terminal).argmax(axis=-1)
-    tasks = stack_tasks([learned.reward.reach(grid, int(goal)) for goal in goals])
-    moves = (demos.states, demos.actions, demos.next_states, demos.task, demos.trajectory)
-    total = log_likelihood(learned.model, Demonstrations(*moves, tasks), learned.behavior, terms=("actions",))
-    return float(total.actions) / len(demos)
-
-
-def _as_shares(learned: Learned) -> Float[np.ndarray, "rows columns"]:
-    """P(blocked), or for those who know of none the ranking from 0 to 1."""
-    if np.ptp(learned.ranking) and (learned.ranking.max() > 1 or not np.ptp(np.asarray(learned.model.blocked))):
-        return (learned.ranking - learned.ranking.min()) / np.ptp(learned.ranking)
-    return np.asarray(learned.model.blocked, dtype=np.float64)
+def _panel(name: str, learned: Lesson, given: Grid, truth: Grid, shown: Demonstrations) -> Panel:
+    """What was learned of cells; of what knows nothing of them, the ways that it means to go from where people set out."""
+    if learned.shares is not None:
+        return Panel(name, given, learned.shares, truth)
+    goals = np.asarray(shown.tasks.terminal).argmax(axis=-1)
+    first = np.flatnonzero(np.diff(np.asarray(shown.trajectory), prepend=-1))
+    ends = np.unique(np.stack([np.asarray(shown.states)[first], goals[np.asarray(shown.task)[first]]]), axis=1)
+    paths = [path for goal in np.unique(ends[1]) for path in learned.pursue(int(goal)).follow(ends[0, ends[1] == goal])]
+    return Panel(f"{name}: its {len(paths)} ways", truth, paths=paths)

@@ -19,7 +19,7 @@ from scipy.sparse import coo_array, eye_array
 from scipy.sparse.linalg import spsolve
 
 from sidestep.demonstrations import Demonstrations
-from sidestep.rivals.learned import Learned, people_of, reward_of
+from sidestep.rivals.learned import Learned, reward_of
 from sidestep.settings import Settings
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, true_model
@@ -53,7 +53,7 @@ def by_constraints(grid: Grid, demonstrations: Demonstrations, settings: Setting
         found = after
     logits = _logits(possible, forbidden, found.visits)
     model = ObstacleGrid(grid, logits)
-    return Learned(model, reward_of(settings), people_of(settings), np.asarray(model.blocked, dtype=np.float64))
+    return Learned(model, reward_of(settings), settings.behavior(), np.asarray(model.blocked, dtype=np.float64))
 
 
 def _logits(
@@ -76,7 +76,7 @@ def _people(grid: Grid, forbidden: list[int], demonstrations: Demonstrations, se
     first = np.flatnonzero(np.diff(np.asarray(demonstrations.trajectory), prepend=-1))
     for index in range(len(demonstrations.tasks.terminal)):
         made = plan(
-            model, jax.tree.map(lambda leaf, index=index: leaf[index], demonstrations.tasks), people_of(settings)
+            model, jax.tree.map(lambda leaf, index=index: leaf[index], demonstrations.tasks), settings.behavior()
         )
         own = task == index
         total += float(np.log(np.asarray(made.policy)[states[own], actions[own]]).sum())

@@ -1,4 +1,4 @@
-"""What every method makes of walks: a model to plan in, a reward to plan for, and a ranking of cells.
+"""What every method makes of walks: what a robot does, how people are taken to act, and a ranking of cells.
 
 A method is a function of a map, demonstrations on it and settings (`Method`). Behavior-aware modeling is one of them;
 so are the simplest things that one could do instead: the likelihood of transitions alone, and counting visits.
@@ -6,25 +6,49 @@ so are the simplest things that one could do instead: the likelihood of transiti
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from functools import partial
+from typing import NamedTuple, Protocol, runtime_checkable
 
+import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from sidestep.demonstrations import Demonstrations
 from sidestep.evaluation import Reward
+from sidestep.planners import InModel, Planner, Pursuit
 from sidestep.scoring import visit_ranking
 from sidestep.settings import Settings, fit_map
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.grid import Grid
+from sidestep.tabular.likelihood import log_policies
 from sidestep.tabular.models import ObstacleGrid
+from sidestep.tasks import stack_tasks
 
 _SELDOM = 0.98
 """P(blocked) of a cell that nobody visited, to who only counts visits."""
 
 
+@runtime_checkable
+class Lesson(Planner, Protocol):
+    """What a method has learned from walks, as far as it is scored: what a robot does with it, and the rest here."""
+
+    @property
+    def ranking(self) -> Float[np.ndarray, "rows columns"] | None:
+        """Of cells, higher for those that are more surely obstacles; None where nothing is learned of cells."""
+        ...
+
+    @property
+    def shares(self) -> Float[np.ndarray, "rows columns"] | None:
+        """The same from 0 to 1, to be drawn: P(blocked), where there is such a thing."""
+        ...
+
+    def log_policies(self, demonstrations: Demonstrations) -> Float[np.ndarray, " moves"]:
+        """How probable every action of some demonstrations is taken to be, in nats."""
+        ...
+
+
 class Learned(NamedTuple):
-    """What a method has learned.
+    """What is learned by a method that has a model.
 
     - `model`: to plan in. `reward`: what plans pursue in it. `behavior`: how people are taken to act on it.
     - `ranking`: of cells, higher for those that are more surely obstacles; P(blocked) where there is such a thing.
@@ -35,13 +59,39 @@ class Learned(NamedTuple):
     behavior: Behavior
     ranking: Float[np.ndarray, "rows columns"]
 
+    @property
+    def shares(self) -> Float[np.ndarray, "rows columns"]:
+        """P(blocked), or for those who know of none the ranking from 0 to 1."""
+        blocked = np.asarray(self.model.blocked, dtype=np.float64)
+        if np.ptp(self.ranking) and (self.ranking.max() > 1 or not np.ptp(blocked)):
+            return (self.ranking - self.ranking.min()) / np.ptp(self.ranking)
+        return blocked
 
-Method = Callable[[Grid, Demonstrations, Settings], Learned]
+    def possible(self) -> Bool[np.ndarray, "rows columns"]:
+        """The cells that the model is not sure are blocked."""
+        return self._planner().possible()
+
+    def pursue(self, goal: int) -> Pursuit:
+        """The optimal plan in the model."""
+        return self._planner().pursue(goal)
+
+    def log_policies(self, demonstrations: Demonstrations) -> Float[np.ndarray, " moves"]:
+        """Of people who know the model and pursue the reward."""
+        goals = np.asarray(demonstrations.tasks.terminal).argmax(axis=-1)
+        tasks = stack_tasks([self.reward.reach(self._blank(), int(goal)) for goal in goals])
+        pursued = eqx.tree_at(lambda demos: demos.tasks, demonstrations, tasks)
+        return np.asarray(log_policies(self.model, pursued, self.behavior))
+
+    def _planner(self) -> InModel:
+        return InModel(self.model, partial(self.reward.reach, self._blank()))
+
+    def _blank(self) -> Grid:
+        """The model's grid with nothing known; goals in what it takes for obstacles are goals all the same."""
+        rows, columns = self.model.known.shape
+        return Grid.unknown(rows, columns, 4 if self.model.graph.actions == 4 else 8)
 
 
-def people_of(settings: Settings) -> Behavior:
-    """How people are taken to behave."""
-    return settings.behavior()
+Method = Callable[[Grid, Demonstrations, Settings], Lesson]
 
 
 def reward_of(settings: Settings) -> Reward:
@@ -52,7 +102,7 @@ def reward_of(settings: Settings) -> Reward:
 def by_behavior(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> Learned:
     """Behavior-aware modeling, as `sidestep learn` has it."""
     model = fit_map(ObstacleGrid(grid, settings.prior_mean), demonstrations, settings).model
-    return Learned(model, reward_of(settings), people_of(settings), np.asarray(model.blocked, dtype=np.float64))
+    return Learned(model, reward_of(settings), settings.behavior(), np.asarray(model.blocked, dtype=np.float64))
 
 
 def by_transitions(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> Learned:
@@ -65,4 +115,4 @@ def by_visits(grid: Grid, demonstrations: Demonstrations, settings: Settings) ->
     ranking = visit_ranking(np.concatenate(demonstrations.paths()), grid)
     blocked = np.clip(1 / (1 - ranking), None, _SELDOM).ravel()
     model = ObstacleGrid(grid, np.log(blocked) - np.log1p(-blocked))
-    return Learned(model, reward_of(settings), people_of(settings), ranking)
+    return Learned(model, reward_of(settings), settings.behavior(), ranking)

@@ -6,7 +6,7 @@ Between the tasks that people pursue and what they do stand some numbers that no
     lapses      ε = σ(e)                                 the share of actions at random (see `Behavior`)
     discount    γ = σ(g)                                 of all tasks
     tastes      R(s, a) + Σ_f w_f φ_f(s, a)              what they like or dislike on the way, by features φ
-    costs       R(s, a) − ln(1 + exp k_c(s, a))          what it costs them to aim at place c(s, a), the same for all goals
+    costs       R(s, a) − ln(1 + exp k_c(s, a))          what it costs to aim at place c(s, a), whatever the goal
 
 Each may be held to be known or be learned with θ, from the likelihood of the actions. What is learned has a normal
 prior around where it starts: the typical b and g, and e, with standard deviation 1, the w with standard deviation
@@ -140,8 +140,8 @@ def people(
     - `aimed_at`: the state that each action aims at, if it costs something to aim at states and that is to be learned.
 
     Raises `InputError` for a trait that there is not, a discount that is to be learned and not between 0 and 1, persons
-    who are not numbered from 0, features that are not finite, as many tastes as there are not features, and aims that are not
-    states.
+    who are not numbered from 0, features that are not finite, as many tastes as there are not features, and aims that are
+    not states.
 
     >>> from sidestep.tabular.backups import BoltzmannAverage
     >>> float(people(Behavior(BoltzmannAverage(), 7.0), ["sharpness"]).behavior_of().beta)

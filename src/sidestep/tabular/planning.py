@@ -50,8 +50,14 @@ class Plan(eqx.Module):
 
     def follow(self, starts: Int[np.ndarray, " starts"]) -> list[Int[np.ndarray, " _"]]:
         """The states that the plan means to pass from each start on: `path_from`, but also where there is no way."""
-        intended, terminal = np.asarray(self.intended), np.asarray(self.terminal)
-        return [_followed(intended, terminal, start) for start in starts.tolist()]
+        return followed(np.asarray(self.intended), np.asarray(self.terminal), starts)
+
+
+def followed(
+    intended: Int[np.ndarray, " states"], terminal: Bool[np.ndarray, " states"], starts: Int[np.ndarray, " starts"]
+) -> list[Int[np.ndarray, " _"]]:
+    """The states from each start on, `intended` after each; they end at a terminal one, or before one would repeat."""
+    return [_followed(intended, terminal, start) for start in starts.tolist()]
 
 
 def _followed(
