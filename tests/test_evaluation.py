@@ -35,6 +35,7 @@ def test_a_perfect_map(reward):
     expected = {
         "auc": 1, "average_precision": 1, "auc_relevant": 1, "average_precision_relevant": 1, "recall": 1,
         "mean_obstacle": 1, "mean_free": 0, "max_probability": 1, "legal_share": 1, "excess_length": 0, "regret": 0,
+        "arriving_share": 1,
     }  # fmt: skip
     assert found == expected
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sidestep.evaluation import Reward
-from sidestep.replanning import lengths_with_bumps, world_of
+from sidestep.replanning import lengths_by_policy, lengths_with_bumps, world_of
 from sidestep.tabular.graph import moves_into
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid
@@ -107,3 +107,44 @@ def test_mending_leads_as_far_as_planning_anew(reward, connectivity, walls):
         never += np.isinf(expected).sum()
         followed += len(starts)
     assert 0 < never < followed
+
+
+def ranked(states, *actions):
+    """A policy that takes these actions everywhere, the first with most probability, and the others never."""
+    policy = np.zeros((states, 4))
+    policy[:, actions] = np.arange(len(actions), 0, -1) / 10
+    return policy
+
+
+def test_who_has_but_a_policy_takes_the_next_action_after_a_bump():
+    """Right, else up: from 11 into the walls at 13 and 8, which are 2 moves lost, and right along the upper side."""
+    drawn = np.zeros((4, 5), dtype=int)
+    drawn[1:, 3] = 1
+    truth = world_of(Grid(drawn))
+    assert lengths_by_policy(ranked(20, 3, 0), truth, 4, np.array([11, 4, 3, 10])).tolist() == [7, 0, 1, 8]
+    # from 10: right to 12, a bump, up, a bump, up, right to 4; nobody needs to try 13 twice
+    assert lengths_by_policy(ranked(20, 3), truth, 4, np.array([11])).tolist() == [np.inf]
+
+
+def test_who_goes_round_in_circles_never_arrives():
+    truth = world_of(Grid(np.zeros((1, 4), dtype=int)))
+    policy = ranked(4, 3)
+    policy[2] = [0, 0, 1, 0]
+    assert lengths_by_policy(policy, truth, 3, np.array([0, 3])).tolist() == [np.inf, 0]
+    # a wall met on the way changes what they do
+    walled = world_of(Grid(np.array([[0, 0, 0, 0, 1]])))
+    policy = np.array([[0, 0, 0, 1.0]] * 4 + [[0, 0, 0, 1.0]])
+    policy[3] = [0, 0, 0.4, 0.6]
+    policy[2] = [0, 0, 0.6, 0.4]
+    assert lengths_by_policy(policy, walled, 0, np.array([3])).tolist() == [np.inf]
+    policy[1] = [0, 0, 1.0, 0]
+    assert lengths_by_policy(policy, walled, 0, np.array([3])).tolist() == [4]  # a bump, and three to the left
+
+
+def test_a_diagonal_that_a_policy_takes_needs_both_cells_beside_it():
+    truth = world_of(Grid(np.array([[0, 1], [0, 0]]), connectivity=8))
+    policy = np.zeros((4, 8))
+    policy[:, 7], policy[:, 1], policy[:, 3] = 0.6, 0.3, 0.1  # down right, else down, else right
+    policy[0] = [0, 0.3, 0, 0.1, 0, 0, 0, 0.6]
+    policy[2] = [0, 0, 0, 1, 0, 0, 0, 0]
+    assert lengths_by_policy(policy, truth, 3, np.array([0])).tolist() == [pytest.approx(ROOT_TWO + 2)]

@@ -97,7 +97,7 @@ def compare(
 
 
 def _panel(name: str, learned: Lesson, given: Grid, truth: Grid, shown: Demonstrations) -> Panel:
-    """What was learned of cells; of what knows nothing of them, the ways that it means to go from where people set out."""
+    """What was learned of cells; where that is nothing, the ways that it means to go from where people set out."""
     if learned.shares is not None:
         return Panel(name, given, learned.shares, truth)
     goals = np.asarray(shown.tasks.terminal).argmax(axis=-1)

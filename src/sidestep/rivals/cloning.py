@@ -27,6 +27,9 @@ from sidestep.tabular.grid import Grid
 
 _FREEDOM = (0.1, 1.0, 10.0)
 """The weights' variances that are tried; the middle one where there are too few walks to try them on."""
+_COMPASS, _SECTORS = 9, 27
+_DIRECTION = 3 + _SECTORS
+"""How many kinds of direction there are, coarsely and finely (some never occur), and how many features of it."""
 _FOLDS = 3
 _ITERATIONS = 2000
 
@@ -96,7 +99,7 @@ def _fitted(grid: Grid, demonstrations: Demonstrations, counts: Bool[np.ndarray,
 
     states, actions, goals = (part[counts] for part in _moves(demonstrations))
     features, every = _features(grid, states, goals), np.arange(grid.connectivity)
-    nowhere = csr_array((len(every), np.shape(features)[1]))
+    nowhere = csr_array((len(every), _DIRECTION + (1 + _COMPASS) * grid.size))
     regression = LogisticRegression(C=freedom, max_iter=_ITERATIONS)
     regression.fit(vstack([features, nowhere], format="csr"), np.append(actions, every))
     return Cloned(grid, regression.coef_, np.asarray(regression.intercept_))
@@ -118,9 +121,9 @@ def _features(grid: Grid, states: Int[np.ndarray, " visits"], goals: Int[np.ndar
     sector = 3 * compass + np.sign(np.abs(way[:, 0]) - np.abs(way[:, 1])) + 1
     parts = [
         csr_array(np.concatenate([way / distance, 1 / distance], axis=-1)),
-        _one_hot(sector, 27),
+        _one_hot(sector, _SECTORS),
         _one_hot(states, grid.size),
-        _one_hot(9 * states + compass, 9 * grid.size),
+        _one_hot(_COMPASS * states + compass, _COMPASS * grid.size),
     ]
     return csr_array(hstack(parts))
 

@@ -140,8 +140,8 @@ def people(
     - `aimed_at`: the state that each action aims at, if it costs something to aim at states and that is to be learned.
 
     Raises `InputError` for a trait that there is not, a discount that is to be learned and not between 0 and 1, persons
-    who are not numbered from 0, features that are not finite, as many tastes as there are not features, and aims that are
-    not states.
+    who are not numbered from 0, features that are not finite, as many tastes as there are not features, and aims that
+    are not states.
 
     >>> from sidestep.tabular.backups import BoltzmannAverage
     >>> float(people(Behavior(BoltzmannAverage(), 7.0), ["sharpness"]).behavior_of().beta)
