@@ -7,6 +7,7 @@ from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError
@@ -81,12 +82,17 @@ def fit_map(
     checkpoint: Path | None = None,
     resume: bool = False,
     each: Normal | None = None,
+    person: Int[np.ndarray, " tasks"] | None = None,
 ) -> Fit[ObstacleGrid]:
-    """The fit that `settings` describe; `each` is the prior of cells' logits where it is not the settings' own."""
+    """The fit that `settings` describe.
+
+    - `each`: the prior of cells' logits where it is not the settings' own.
+    - `person`: whose each task is, where each is to have a sharpness of their own (see `apart`).
+    """
     if not (np.isfinite(settings.memory) and settings.memory > 0):
         raise InputError(f"expected GiB above 0, found {settings.memory}", field="memory")
     discount = settings.discount if "discount" in settings.unknown else None
-    walkers = people(settings.behavior(), settings.unknown, discount=discount)
+    walkers = people(settings.behavior(), settings.unknown, discount=discount, person=person)
     prior = _prior_of(settings, model, each)
     optimiser = optimiser_of(settings, model.graph.states, len(demonstrations))
     if settings.terms == "both":
