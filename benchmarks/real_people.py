@@ -60,9 +60,7 @@ def read_maze(folder: Path, animal: str, settings: Settings) -> Maze:
     """The maze in a folder; raises `InputError` for missing files and walks without numbers of trials."""
     source = folder / f"{animal}.csv"
     walks = read_walks(source)
-    if "trial" not in walks.metadata.column_names:
-        raise InputError("expected this column", source=source, field="trial")
-    trial = np.asarray(walks.metadata["trial"])[walks.offsets[:-1]]
+    trial = np.asarray(walks.of_each("trial"))
     first, last = TRIALS
     return Maze(
         folder.name,

@@ -28,6 +28,7 @@ from sidestep.commands.learn import learn
 from sidestep.commands.plan import plan_path
 from sidestep.commands.sensors import Sensor
 from sidestep.commands.simulate import Walkers, simulate_walks
+from sidestep.commands.whose import Whose
 from sidestep.errors import SidestepError
 from sidestep.experiments import motivation, pendulum, representations, room
 from sidestep.experiments.demo import demo
@@ -128,6 +129,17 @@ def learn_command(
         list[str] | None,
         typer.Option(help="Learned of walkers with the map: sharpness, lapses, discount; repeat it for several."),
     ] = None,
+    person: Annotated[
+        str | None,
+        typer.Option(help="The column that names who walked: each has a β of their own.", metavar="COLUMN"),
+    ] = None,
+    candidates: Annotated[
+        Path | None,
+        typer.Option(
+            help="Where walks do not name their goals: a table of goal_x, goal_y that they may have had.",
+            metavar="GOALS.csv",
+        ),
+    ] = None,
     tempering: Annotated[
         float,
         typer.Option(help="How much actions count, above 0 and at most 1; below 1 where steps are not independent."),
@@ -192,7 +204,7 @@ def learn_command(
     sensor = None if sensor_map is None else Sensor(sensor_map, _number_or_file(sensor_variance))
     with _fitting(most_iterations(settings)) as (report, say):
         choosing = say if behavior == "auto" else None
-        summary = learn(walks, map_file, out, settings, report, resume, sensor, choosing)
+        summary = learn(walks, map_file, out, settings, report, resume, sensor, choosing, Whose(person, candidates))
     data = summary["data"]
     console.print(
         f"{data['walks']} walks, {data['moves']} moves, {data['goals']} goals, {data['unknown_cells']} unknown cells"

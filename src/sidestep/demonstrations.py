@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Generic, NamedTuple, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
@@ -69,6 +70,20 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         """The different (state, goal) pairs of all moves; the goal is the first terminal state of the task."""
         goals = np.asarray(self.tasks.terminal).argmax(axis=-1)[np.asarray(self.task)]
         return np.unique(np.stack([np.asarray(self.states), goals], axis=1), axis=0)
+
+
+def apart(
+    demonstrations: Demonstrations[Task], person: Int[np.ndarray, " trajectories"]
+) -> tuple[Demonstrations[Task], Int[np.ndarray, " tasks"]]:
+    """The same moves with a task of its own for every person who pursues it, and whose each task is.
+
+    - `person`: whose each trajectory is, 0…persons − 1.
+    """
+    whose = np.asarray(person)[np.asarray(demonstrations.trajectory)]
+    kinds, task = np.unique(np.stack([np.asarray(demonstrations.task), whose], axis=1), axis=0, return_inverse=True)
+    tasks = jax.tree.map(lambda leaf: leaf[kinds[:, 0]], demonstrations.tasks)
+    own = eqx.tree_at(lambda demos: (demos.task, demos.tasks), demonstrations, (flat_moves([task]), tasks))
+    return own, kinds[:, 1]
 
 
 def gather(trajectories: Sequence[Trajectory], tasks: Sequence[Task]) -> Demonstrations[Task]:

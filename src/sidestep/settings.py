@@ -7,6 +7,7 @@ from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError
@@ -72,6 +73,11 @@ class Settings:
             raise InputError(f"expected one of {', '.join(BACKUPS)}, found {self.backup!r}", field="backup")
         return Behavior(BACKUPS[self.backup](), self.beta, self.lapse)
 
+    def people(self, person: Int[np.ndarray, " tasks"] | None = None) -> People:
+        """People of whom is known what the settings say; `person`: whose each task is, where they differ (`apart`)."""
+        discount = self.discount if "discount" in self.unknown else None
+        return people(self.behavior(), self.unknown, discount=discount, person=person)
+
 
 def fit_map(
     model: ObstacleGrid,
@@ -89,8 +95,7 @@ def fit_map(
     """
     if not (np.isfinite(settings.memory) and settings.memory > 0):
         raise InputError(f"expected GiB above 0, found {settings.memory}", field="memory")
-    discount = settings.discount if "discount" in settings.unknown else None
-    walkers = walkers or people(settings.behavior(), settings.unknown, discount=discount)
+    walkers = walkers or settings.people()
     prior = _prior_of(settings, model, each)
     optimiser = optimiser_of(settings, model.graph.states, len(demonstrations))
     if settings.terms == "both":

@@ -10,20 +10,21 @@ from typing import Any
 import numpy as np
 
 from sidestep.commands.behavior import choose_behavior, told
-from sidestep.commands.sensors import Sensor, known_by
+from sidestep.commands.sensors import Known, Sensor, known_by
+from sidestep.commands.whose import ALIKE, Whose, fit_walks
 from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError
 from sidestep.evaluation import Reward
 from sidestep.inference.climb import Progress
 from sidestep.inference.fit import Fit
 from sidestep.inference.priors import Normal
-from sidestep.io.demonstrations import demonstrations_of_moves
-from sidestep.io.gridding import grid_walks
+from sidestep.io.gridding import Moves, grid_walks
 from sidestep.io.maps import read_map
 from sidestep.io.walks import Walks, read_walks
 from sidestep.plotting.maps import figure_fit, save
 from sidestep.runs import LearnedMap, write_learned_map
-from sidestep.settings import Settings, fit_map
+from sidestep.settings import Settings
+from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.people import People
 
@@ -37,46 +38,43 @@ def learn(
     resume: bool = False,
     sensor: Sensor | None = None,
     choosing: Callable[[str], None] | None = None,
+    whose: Whose = ALIKE,
 ) -> dict[str, Any]:
     """Learns a map, writes it to a folder (see `sidestep.runs`) and returns the summary.
 
     - `sensor`: what is known of unknown cells beforehand, where that is more than the settings' prior.
     - `choosing`: called with what is tried while it is chosen how people behave (`commands.behavior`); without it, they
       behave as the settings say.
+    - `whose`: who walked, and after what.
 
     While it runs, `fit.checkpoint` in the folder is kept up to date; with `resume` an interrupted run goes on from
-    there. Raises `InputError` for anything wrong with the files or settings.
+    there (not where goals are unknown). Raises `InputError` for anything wrong with the files or settings.
     """
     started = time.monotonic()
     grid = read_map(map_file, connectivity=settings.connectivity)
-    moves = grid_walks(_sampled(read_walks(walks), settings), grid)
+    shown = _sampled(read_walks(walks), settings)
+    moves = grid_walks(shown, grid)
     known = known_by(sensor, grid, Normal(settings.prior_mean, settings.prior_variance))
+    whose.check(choosing is not None, resume)
     choice = choose_behavior(grid, moves, settings, known.prior, choosing) if choosing else None
     settings = choice.settings if choice else settings
-    demonstrations = demonstrations_of_moves(moves, grid, discount=settings.discount, step_cost=settings.step_cost)
     checkpoint = folder / "fit.checkpoint"
     resumed = resume and checkpoint.exists()
     model = ObstacleGrid(grid, np.broadcast_to(known.prior.mean, grid.size))
-    found = fit_map(model, demonstrations, settings, report, checkpoint, resume, known.prior)
+    how = {"report": report, "checkpoint": checkpoint, "resume": resume}
+    found, demonstrations, told_of_people = fit_walks(
+        model, grid, shown, moves, whose, settings, known.prior, folder, **how
+    )
     blocked = np.asarray(found.model.blocked, dtype=np.float64)
     reward = Reward(settings.discount, settings.step_cost)
-    counts = {
-        "walks": demonstrations.trajectories,
-        "walks_left_out": len(moves.goals) - demonstrations.trajectories,
-        "moves": len(demonstrations),
-        "moves_left_out": len(moves.states) - len(demonstrations),
-        "goals": len(demonstrations.tasks.terminal),
-        "unknown_cells": int((grid.known == -1).sum()),
-        "sensed_cells": int(np.isfinite(known.seen).sum()),
-    }
     objective = np.array([progress.objective for progress in found.history])
     summary = {
         "command": "learn",
         "files": {"walks": str(walks), "map": str(map_file)},
         "sensor": sensor and sensor.told(),
         "settings": asdict(settings),
-        "behavior": {**_learned_of(found.people), **(told(choice) if choice else {})},
-        "data": counts,
+        "behavior": {**_learned_of(found.people), **told_of_people, **(told(choice) if choice else {})},
+        "data": {**_counts(moves, demonstrations), **_cells(grid, known)},
         "resumed": resumed,
         "notes": _notes(demonstrations, settings, resume and not resumed),
         **_outcome(found),
@@ -88,6 +86,21 @@ def learn(
     write_learned_map(folder, LearnedMap(grid, blocked, demonstrations.visited(), reward), summary)
     checkpoint.unlink(missing_ok=True)
     return summary
+
+
+def _counts(moves: Moves, demonstrations: Demonstrations) -> dict[str, int]:
+    return {
+        "walks": demonstrations.trajectories,
+        "walks_left_out": len(moves.goals) - demonstrations.trajectories,
+        "moves": len(demonstrations),
+        "moves_left_out": len(moves.states) - len(demonstrations),
+        "goals": len(np.unique(demonstrations.visited()[:, 1])),
+    }
+
+
+def _cells(grid: Grid, known: Known) -> dict[str, int]:
+    unknown = int((grid.known == Cell.UNKNOWN).sum())
+    return {"unknown_cells": unknown, "sensed_cells": int(np.isfinite(known.seen).sum())}
 
 
 def _learned_of(people: People) -> dict[str, float | None]:

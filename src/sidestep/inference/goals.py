@@ -111,10 +111,11 @@ def weighted(
     walks: Sequence[Trajectory], candidates: Sequence[Task], posterior: Float[np.ndarray, "walks candidates"]
 ) -> Demonstrations:
     """Every walk as a demonstration of every candidate that it may have been after, weighted by the posterior."""
-    pairs = np.argwhere(posterior > _NOTHING)
+    # however improbable a candidate: while the pairs stay the same, nothing is compiled anew
+    pairs = np.argwhere(posterior > 0)
     shown = gather([walks[walk]._replace(task=int(candidate)) for walk, candidate in pairs], candidates)
     lengths = [len(walks[walk].actions) for walk, _ in pairs]
-    weight = np.repeat(posterior[posterior > _NOTHING], lengths)
+    weight = np.repeat(posterior[posterior > 0], lengths)
     return Demonstrations(
         shown.states, shown.actions, shown.next_states, shown.task, shown.trajectory, shown.tasks, jnp.asarray(weight)
     )
@@ -136,7 +137,3 @@ def _if_after(
     each = np.asarray(log_policies(model, moves, behavior))
     ended = np.asarray(task.terminal)[np.asarray(moves.states)]
     return np.bincount(np.asarray(moves.trajectory), np.where(ended, -np.inf, each), minlength=len(walks))
-
-
-_NOTHING = 1e-12
-"""A posterior below this is taken for 0."""

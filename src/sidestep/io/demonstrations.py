@@ -1,6 +1,7 @@
 """From walks in metres to demonstrations on a grid."""
 
 import numpy as np
+from jaxtyping import Bool
 from scipy.sparse.csgraph import connected_components
 
 from sidestep.demonstrations import Demonstrations, flat_moves
@@ -32,13 +33,10 @@ def demonstrations_of_moves(
     `InputError` if no move is left, or for a goal that known obstacles wall off.
     """
     _refuse_walled_off(moves, grid)
-    goal = moves.goals[moves.walk]
-    arrivals = np.cumsum(moves.states == goal)
-    before_walk = np.searchsorted(moves.walk, moves.walk)
-    pursuing = arrivals == np.append(0, arrivals)[before_walk]
+    pursuing = pursuing_moves(moves)
     if not pursuing.any():
         raise InputError("every walk starts at its goal: expected moves towards one", source=moves.source)
-    goals, task = np.unique(goal[pursuing], return_inverse=True)
+    goals, task = np.unique(moves.goals[moves.walk][pursuing], return_inverse=True)
     _, trajectory = np.unique(moves.walk[pursuing], return_inverse=True)
     tasks = [reach(grid, int(state), discount=discount, step_cost=step_cost) for state in goals]
     return Demonstrations(
@@ -49,6 +47,13 @@ def demonstrations_of_moves(
         trajectory=flat_moves([trajectory]),
         tasks=stack_tasks(tasks),
     )
+
+
+def pursuing_moves(moves: Moves) -> Bool[np.ndarray, " moves"]:
+    """Which moves were made before their walk had reached its goal cell."""
+    arrivals = np.cumsum(moves.states == moves.goals[moves.walk])
+    before_walk = np.searchsorted(moves.walk, moves.walk)
+    return arrivals == np.append(0, arrivals)[before_walk]
 
 
 def _refuse_walled_off(moves: Moves, grid: Grid) -> None:

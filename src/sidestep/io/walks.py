@@ -68,6 +68,21 @@ class Walks:
         """The positions (metres) of each walk in turn."""
         return iter(np.split(self.positions, self.offsets[1:-1]))
 
+    def of_each(self, column: str) -> list[object]:
+        """What a column of the metadata says of each walk.
+
+        Raises `InputError` where there is no such column, nothing in it, or not the same in all rows of a walk.
+        """
+        check_columns(self.metadata, (column,), self.source)
+        said = self.metadata[column].to_pylist()
+        for row, first in enumerate(np.repeat(self.offsets[:-1], np.diff(self.offsets)).tolist()):
+            if said[row] is None or said[row] != said[first]:
+                expected = "expected the same in all rows of a walk and nowhere nothing"
+                raise InputError(
+                    f"{expected}, found {said[row]!r}", source=self.source, row=int(self.rows[row]), field=column
+                )
+        return [said[first] for first in self.offsets[:-1].tolist()]
+
     def select(self, chosen: Bool[np.ndarray, " walks"] | Integer[np.ndarray, " chosen"]) -> "Walks":
         """The walks that a mask or an array of indices chooses, in that order.
 

@@ -1,0 +1,90 @@
+"""Who walked, and after what: fits for walks that say more of it in a column, or less."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sidestep.commands.goals import fit_candidates, read_candidates, write_posterior
+from sidestep.demonstrations import Demonstrations, apart
+from sidestep.errors import InputError
+from sidestep.inference.fit import Fit
+from sidestep.inference.priors import Normal
+from sidestep.io.demonstrations import demonstrations_of_moves, pursuing_moves
+from sidestep.io.gridding import Moves
+from sidestep.io.walks import Walks
+from sidestep.settings import Settings, fit_map
+from sidestep.tabular.grid import Grid
+from sidestep.tabular.models import ObstacleGrid
+
+
+@dataclass(frozen=True)
+class Whose:
+    """What walks say in a column of their own of who walked, and what they do not say of their goals.
+
+    - `person`: the column that names who walked; then each has a β of their own, and people are pooled.
+    - `candidates`: a table of the goals that walks may have had, which then do not name their own.
+    """
+
+    person: str | None = None
+    candidates: Path | None = None
+
+    def check(self, choosing: bool, resume: bool) -> None:
+        """Raises `InputError` for what does not go together.
+
+        Where goals are unknown, people are taken to be known and alike, and nothing is kept to resume from.
+        """
+        if self.candidates is None:
+            return
+        for given, field in ((self.person is not None, "person"), (choosing, "behavior"), (resume, "resume")):
+            if given:
+                raise InputError("cannot be had together with candidates for goals", field=field)
+
+
+ALIKE = Whose()
+"""Walks name their goals, and people are alike."""
+
+
+class Found(NamedTuple):
+    """A fit, what it was made from, and what else it tells of people."""
+
+    fit: Fit[ObstacleGrid]
+    demonstrations: Demonstrations
+    told: dict[str, Any]
+
+
+def fit_walks(
+    model: ObstacleGrid,
+    grid: Grid,
+    walks: Walks,
+    moves: Moves,
+    whose: Whose,
+    settings: Settings,
+    prior: Normal,
+    folder: Path,
+    **how: Any,
+) -> Found:
+    """The fit of a map to walks, by whoever they are and whatever they were after.
+
+    `moves` are those of `walks`; `how` is for `fit_map`. Where goals are unknown, writes `goals.csv` to the folder.
+    """
+    if whose.candidates is not None:
+        guessed = fit_candidates(model, grid, moves, read_candidates(whose.candidates, grid), settings, prior)
+        write_posterior(folder / "goals.csv", guessed, walks.labels, grid)
+        return Found(guessed.fit, _demonstrations(guessed.moves, grid, settings), {"goals": guessed.told()})
+    demonstrations = _demonstrations(moves, grid, settings)
+    if whose.person is None:
+        return Found(fit_map(model, demonstrations, settings, each=prior, **how), demonstrations, {})
+    said = walks.of_each(whose.person)
+    names = [said[walk] for walk in np.unique(moves.walk[pursuing_moves(moves)]).tolist()]
+    persons = list(dict.fromkeys(names))
+    demonstrations, person = apart(demonstrations, np.array([persons.index(name) for name in names]))
+    settings = replace(settings, unknown=tuple({*settings.unknown, "sharpness"}))
+    found = fit_map(model, demonstrations, settings, each=prior, walkers=settings.people(person), **how)
+    betas = {str(name): float(found.people.behavior_of(index).beta) for index, name in enumerate(persons)}
+    return Found(found, demonstrations, {"persons": betas})
+
+
+def _demonstrations(moves: Moves, grid: Grid, settings: Settings) -> Demonstrations:
+    return demonstrations_of_moves(moves, grid, discount=settings.discount, step_cost=settings.step_cost)

@@ -1,0 +1,61 @@
+"""What a robot makes of a learned map: what it takes for known, and what it pursues.
+
+A learned map says how probable a move is to fail, each time anew. A robot may assume more: obstacles stay where they
+are. Then a cell through which somebody walked is free, and what failed once fails again, so that a bump costs the way
+back and around. Who tried until it works would expect two tries at a wall with P(blocked) = ½, and think little of it.
+So a robot that wants to arrive soon, and bumps into nothing if it can, pursues
+
+    R(s, a) = −length(a) − bump_cost · P(a leads nowhere from s),        γ = 1,
+
+in the model in which cells that people walked through are known to be free.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
+
+from sidestep.errors import InputError
+from sidestep.planners import InModel
+from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.models import ObstacleGrid
+from sidestep.tasks import Task, reach
+
+BUMP_COST = 10.0
+"""What a bump costs beside the move itself, in cell sides: about a way around."""
+
+
+def robot(
+    model: ObstacleGrid, walked: Int[np.ndarray, " visits"] | Sequence[int], bump_cost: float = BUMP_COST
+) -> InModel:
+    """Who plans so in a learned map, where people walked through some cells (states)."""
+    known = believed(model, walked)
+    return InModel(known, partial(careful, known, bump_cost=bump_cost))
+
+
+def believed(model: ObstacleGrid, walked: Int[np.ndarray, " visits"] | Sequence[int]) -> ObstacleGrid:
+    """The model, with the unknown cells (states) that people walked through known to be free."""
+    known = np.array(model.known).reshape(-1)
+    seen = np.asarray(walked, dtype=np.int64)
+    known[seen[known[seen] == Cell.UNKNOWN]] = Cell.FREE
+    return ObstacleGrid(_grid(model, known.reshape(model.known.shape)), model.parameters)
+
+
+def careful(model: ObstacleGrid, goal: int, bump_cost: float = BUMP_COST) -> Task:
+    """The task of reaching a state soon, and of bumping into little on the way.
+
+    - `bump_cost`: in cell sides, 0 or more. Raises `InputError` for another, or a goal that is not a state.
+    """
+    if not (np.isfinite(bump_cost) and bump_cost >= 0):
+        raise InputError(f"expected a number of at least 0, found {bump_cost}", field="bump_cost")
+    # what the model takes for an obstacle may be a goal all the same
+    task = reach(_grid(model, np.full(model.known.shape, Cell.UNKNOWN)), goal, discount=1.0, step_cost=1.0)
+    states = jnp.arange(model.graph.states)[:, None, None]
+    nowhere = jnp.sum(jnp.where(model.graph.successors == states, model.probabilities(), 0), axis=-1)
+    return Task(task.reward - bump_cost * nowhere, task.final_reward, task.terminal, task.discount)
+
+
+def _grid(model: ObstacleGrid, known: Int[np.ndarray, "rows columns"]) -> Grid:
+    return Grid(known, connectivity=4 if model.graph.actions == 4 else 8)

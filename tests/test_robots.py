@@ -1,0 +1,51 @@
+"""What robots take for known and what they pursue, on maps small enough to plan by hand."""
+
+import numpy as np
+import pytest
+
+from sidestep.errors import InputError
+from sidestep.robots import believed, careful
+from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.planning import plan
+
+
+def test_a_corridor_costs_its_tries_and_its_bumps():
+    """Each of three cells that may be blocked takes 1/(1−p) tries, of which a share p bumps."""
+    p, bump_cost = 0.25, 6.0
+    model = ObstacleGrid(Grid.unknown(1, 4), float(np.log(p / (1 - p))))
+    values = plan(model, careful(model, 3, bump_cost)).solution.values
+    np.testing.assert_allclose(values, -np.arange(3, -1, -1) * (1 + bump_cost * p) / (1 - p), rtol=1e-9)
+
+
+def test_a_move_off_the_map_is_a_bump_like_any_other():
+    model = ObstacleGrid(Grid(np.full((1, 3), Cell.FREE)))
+    task = careful(model, 2, 4.0)
+    up, down, left, right = np.asarray(task.reward)[0].tolist()
+    assert (up, down, left, right) == (-5, -5, -5, -1)
+
+
+def test_people_have_shown_what_is_free():
+    grid = Grid(np.array([[Cell.UNKNOWN, Cell.UNKNOWN, Cell.OCCUPIED, Cell.FREE, Cell.UNKNOWN]]))
+    model = ObstacleGrid(grid, np.array([0.0, 1.0, 0.0, 0.0, 2.0]))
+    blocked = believed(model, np.array([0, 0, 2])).blocked
+    np.testing.assert_allclose(blocked, [[0, 1 / (1 + np.exp(-1)), 1, 0, 1 / (1 + np.exp(-2))]])
+
+
+def test_a_robot_keeps_to_where_people_walked_if_that_is_not_far():
+    """Up the middle the second cell may well be blocked; people went around by the right, two cells longer."""
+    logits = np.full((3, 3), -1.0)
+    logits[1, 1], logits[1, 0], logits[:, 2] = 0.0, 5.0, -1.0
+    model = ObstacleGrid(Grid.unknown(3, 3), logits.reshape(-1))
+    walked = [7, 8, 5, 2, 1]
+    assert plan(model, careful(model, 1, 0.0)).path_from(7).tolist() == [7, 4, 1]
+    known = believed(model, walked)
+    assert plan(known, careful(known, 1)).path_from(7).tolist() == walked
+    # with little to lose it takes its chance, whatever people did: 1/(1 − ½) = 2 tries and one move against four
+    assert plan(known, careful(known, 1, 0.5)).path_from(7).tolist() == [7, 4, 1]
+
+
+@pytest.mark.parametrize("bump_cost", [-1.0, np.nan, np.inf])
+def test_bumps_cost_something_finite(bump_cost):
+    with pytest.raises(InputError, match="bump_cost"):
+        careful(ObstacleGrid(Grid.unknown(1, 3)), 2, bump_cost)
