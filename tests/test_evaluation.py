@@ -52,6 +52,7 @@ def test_a_map_that_thinks_everything_free():
     assert found["legal_share"] == pytest.approx(29 / 42)
     assert found["excess_length"] == 0  # all legal paths are as short as can be
     assert found["regret"] == pytest.approx((13 + 3 * 2) / 42)
+    assert found["arriving_share"] == 1
     assert found["auc"] == found["auc_relevant"] == 0.5
     assert found["average_precision"] == pytest.approx(2 / 9)
     assert found["recall"] == 0

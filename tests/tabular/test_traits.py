@@ -144,6 +144,19 @@ def test_tastes_are_found_with_the_walls_that_nobody_touched():
     assert blocked[hidden].min() > blocked[~hidden].max()
 
 
+def test_costs_start_at_the_mode_of_their_prior_and_are_paid_by_who_aims():
+    """A cost of ln(1 + exp −4) to begin with; k has a standard deviation of 2."""
+    aimed_at = np.asarray(OPEN.graph.successors[..., 0])
+    someone = people(Behavior(LogSumExp(), 5.0), aimed_at=aimed_at)
+    assert float(someone.log_density()) == 0
+    np.testing.assert_allclose(someone.costs, np.log1p(np.exp(-4)))
+    dearer = someone.with_parameters(someone.parameters._replace(costs=jnp.linspace(-4, 0, GRID.size)))
+    assert float(dearer.log_density()) == pytest.approx(-np.sum(np.linspace(0, 4, GRID.size) ** 2) / 8)
+    paid = dearer.tasks_of(reach(GRID, 0, discount=1.0, step_cost=1.0)).reward
+    assert float(paid[7, 3]) == pytest.approx(-1 - np.log1p(np.exp(-4 + 8 * 4 / 29)))  # to the right, at 8
+    assert float(paid[29, 3]) == pytest.approx(-1 - np.log(2))  # off the map one aims at where one is
+
+
 def test_what_cannot_be_learned_is_refused():
     behavior = Behavior(LogSumExp(), 5.0)
     with pytest.raises(InputError, match=r"'learned': expected some of .*'lapse'"):
