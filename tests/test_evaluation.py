@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sidestep import evaluation
-from sidestep.evaluation import Reward, evaluate, plan_paths, sample_for
+from sidestep.evaluation import Reward, evaluate, evaluate_planner, plan_paths, sample_for
+from sidestep.planners import ByPolicy
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, true_model
 
@@ -51,6 +52,7 @@ def test_a_map_that_thinks_everything_free():
     assert found["legal_share"] == pytest.approx(29 / 42)
     assert found["excess_length"] == 0  # all legal paths are as short as can be
     assert found["regret"] == pytest.approx((13 + 3 * 2) / 42)
+    assert found["arriving_share"] == 1
     assert found["auc"] == found["auc_relevant"] == 0.5
     assert found["average_precision"] == pytest.approx(2 / 9)
     assert found["recall"] == 0
@@ -156,3 +158,14 @@ def test_the_work_that_is_reported_is_done():
         done = [done for name, done, of in told if name == stage and of == total]
         assert done == sorted(done)
         assert (done[0], done[-1]) == (0, total)
+
+
+def test_a_policy_without_a_map_is_scored_by_its_paths():
+    """Always right, else up: in a row of four, half of the pairs; the others never arrive. No cell is ranked."""
+    policy = np.tile([0.2, 0.0, 0.0, 0.8], (4, 1))
+    truth = Grid(np.zeros((1, 4), dtype=int))
+    planner = ByPolicy(truth.forget(), lambda goal: policy)  # noqa: ARG005
+    found = evaluate_planner(planner, None, truth, np.ones((1, 4), bool), np.zeros((0, 2), int))
+    assert found["legal_share"] == found["arriving_share"] == 0.5
+    assert found["excess_length"] == 0
+    assert found["regret"] is found["auc"] is found["average_precision"] is found["mean_free"] is None

@@ -6,16 +6,18 @@ import numpy as np
 import pytest
 
 from sidestep.demonstrations import Trajectory, gather
+from sidestep.rivals.cloning import by_cloning
 from sidestep.rivals.constraints import by_constraints
-from sidestep.rivals.costs import by_costs
+from sidestep.rivals.costs import CostlyReward, by_costs
+from sidestep.rivals.joint import by_joint
 from sidestep.rivals.learned import by_behavior, by_transitions, by_visits
 from sidestep.settings import Settings
 from sidestep.simulation import simulate
-from sidestep.tabular.backups import Behavior, BoltzmannAverage
+from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid, true_model
 from sidestep.tabular.planning import plan
-from sidestep.tasks import reach
+from sidestep.tasks import reach, with_costs
 
 WALL = np.zeros((5, 5), int)
 WALL[:4, 2] = 1
@@ -32,7 +34,7 @@ def walks():
     return gather(simulate(jax.random.key(0), true_model(TRUTH), tasks, starts), tasks)
 
 
-@pytest.mark.parametrize("method", [by_behavior, by_constraints])
+@pytest.mark.parametrize("method", [by_behavior, by_constraints, by_joint])
 def test_a_wall_that_stood_in_the_way_is_found(method, walks):
     """All of it that anybody would have crossed, which is more than every cell that nobody visited."""
     learned = method(BLANK, walks, Settings())
@@ -93,3 +95,76 @@ def test_constraints_end_where_the_walls_end():
     world = ObstacleGrid(BLANK, jnp.full(25, -20.0))
     demos = gather(simulate(jax.random.key(1), world, tasks, starts, Behavior(BoltzmannAverage(), 7.0)), tasks)
     assert np.asarray(by_constraints(BLANK, demos, Settings()).model.blocked).max() < 0.5
+
+
+def test_joint_tells_a_costly_floor_from_a_wall():
+    """People who dislike a carpet, and cross it where that pays: the cost is found, and nothing blocked."""
+    carpet = WALL.astype(float).ravel()
+    goals = (*GOALS, 7, 12)
+    plain = [reach(BLANK, goal) for goal in goals]
+    room = true_model(BLANK.passable())
+    disliked = [with_costs(task, jnp.asarray(0.1 * carpet), room.graph.successors[..., 0]) for task in plain]
+    starts = [np.repeat(np.setdiff1d(np.arange(25), [goal]), 4) for goal in goals]
+    walks = simulate(jax.random.key(0), room, disliked, starts, Behavior(LogSumExp(), 40.0))
+    learned = by_joint(BLANK, gather(walks, plain), Settings(beta=40.0))
+    assert isinstance(learned.reward, CostlyReward)
+    assert learned.reward.costs is not None
+    np.testing.assert_allclose(learned.reward.costs[carpet == 1], 0.1, atol=0.03)
+    assert learned.reward.costs[carpet == 0].max() < 0.02
+    assert learned.ranking.max() < 0.1
+    # plans pay what was learned: 4 moves around the end of the carpet rather than 2 across it
+    path = plan(learned.model, learned.reward.reach(BLANK, 18)).path_from(16)
+    assert path.tolist() == [16, 21, 22, 23, 18]
+
+
+def walk(*states):
+    """Along a row of cells or, in grids of 5 columns, through neighbouring cells."""
+    action = {-5: 0, 5: 1, -1: 2, 1: 3}
+    return Trajectory(np.array(states), np.array([action[move] for move in np.diff(states).tolist()]), 0)
+
+
+def test_cloning_does_what_was_demonstrated_in_a_corridor():
+    """To one end; what was done nowhere is thought possible, and a known obstacle is not walked into."""
+    corridor = Grid(np.array([[-1, -1, -1, -1, 1]]))
+    learned = by_cloning(corridor, gather([walk(0, 1, 2, 3)], [reach(corridor, 3)]), Settings())
+    policy = learned.policy(3)
+    assert (policy[:3].argmax(axis=1) == 3).all()
+    assert policy[:3, 3].min() > 0.5
+    assert policy.min() > 0
+    np.testing.assert_allclose(policy.sum(axis=1), 1)
+    assert [path.tolist() for path in learned.pursue(3).follow(np.array([0, 2]))] == [[0, 1, 2, 3], [2, 3]]
+    assert learned.pursue(4).follow(np.array([3]))[0].tolist() == [3, 2]
+    assert learned.possible().tolist() == [[True, True, True, True, False]]
+
+
+def test_cloning_generalises_to_goals_that_nobody_had():
+    """In a free room people walk straight to five goals; by the direction, so does who cloned them to any other."""
+    room = Grid.unknown(7, 7)
+    tasks = [reach(room, goal) for goal in (0, 6, 42, 48, 24)]
+    starts = [np.random.default_rng(goal).choice(np.delete(np.arange(49), 24), 12) for goal in range(5)]
+    starts = [own[own != goal] for own, goal in zip(starts, (0, 6, 42, 48, 24), strict=True)]
+    shown = gather(simulate(jax.random.key(2), true_model(room.passable()), tasks, starts), tasks)
+    learned = by_cloning(room, shown, Settings())
+    for goal in (10, 20, 33, 45):
+        others = np.delete(np.arange(49), goal)
+        shortest = [abs(start // 7 - goal // 7) + abs(start % 7 - goal % 7) for start in others]
+        paths = learned.pursue(goal).follow(others)
+        assert [path[-1] for path in paths] == [goal] * 48
+        assert [len(path) - 1 for path in paths] == shortest
+
+
+def test_cloning_is_particular_to_places():
+    """The same direction, another action: around the wall as people went, not straight into it."""
+    ways = [walk(10, 15, 20, 21, 22, 23, 24, 19, 14), walk(11, 16, 21, 22, 23, 24, 19, 14)]
+    learned = by_cloning(BLANK, gather(ways * 5, [reach(BLANK, 14)]), Settings())
+    assert learned.pursue(14).follow(np.array([10]))[0].tolist() == [10, 15, 20, 21, 22, 23, 24, 19, 14]
+
+
+def test_cloning_takes_actions_to_be_as_probable_as_its_policy_says(walks):
+    learned = by_cloning(BLANK, walks, Settings())
+    assert learned.ranking is learned.shares is None
+    each = learned.log_policies(walks)
+    for move in (0, 17, len(walks) - 1):
+        policy = learned.policy(GOALS[int(walks.task[move])])
+        assert each[move] == pytest.approx(np.log(policy[int(walks.states[move]), int(walks.actions[move])]))
+    assert each.mean() > np.log(0.5)

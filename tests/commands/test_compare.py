@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from office import call, write_office
 
+from sidestep.cli import console
 from sidestep.commands.compare import METHODS
 from sidestep.demonstrations import Demonstrations
 from sidestep.io.demonstrations import demonstrations
@@ -26,17 +27,29 @@ def office(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def compared(office):
+def compared_table(office):
+    """What the command prints."""
     files = (office / "walks.csv", "--map", office / "half.yaml", "--truth", office / "true.yaml")
-    assert call("compare", *files, "--out", office / "compared", "--seed", 3) == 0
+    with console.capture() as captured:
+        assert call("compare", *files, "--out", office / "compared", "--seed", 3) == 0
+    return captured.get()
+
+
+@pytest.fixture(scope="module")
+def compared(office, compared_table):
+    assert compared_table
     return json.loads((office / "compared" / "summary.json").read_text())
 
 
 def test_every_method_has_every_score(office, compared):
     assert set(compared["methods"]) == set(METHODS)
-    for scores in compared["methods"].values():
-        for key in ("auc", "average_precision", "legal_share", "regret", "heldout_log_likelihood", "seconds"):
+    for name, scores in compared["methods"].items():
+        for key in ("legal_share", "arriving_share", "heldout_log_likelihood", "seconds"):
             assert np.isfinite(scores[key])
+        assert scores["arriving_share"] >= scores["legal_share"]
+        assert (scores["regret"] is None) == (scores["arriving_share"] < 1)
+        for key in ("auc", "average_precision"):
+            assert scores[key] is None if name == "cloning" else np.isfinite(scores[key])
     assert compared["data"]["walks"] == 64
     assert compared["data"]["heldout_walks"] == 16
     assert (office / "compared" / "compare.png").read_bytes().startswith(b"\x89PNG")
@@ -58,6 +71,18 @@ def test_held_out_walks_are_judged_by_what_the_others_taught(office, compared):
     people = Behavior(BoltzmannAverage(), Settings.beta)
     expected = log_likelihood(model, others, people, terms=("actions",)).actions / len(others)
     assert compared["methods"]["behavior"]["heldout_log_likelihood"] == pytest.approx(float(expected), rel=1e-6)
+
+
+def test_the_table_says_where_there_is_no_score(compared_table):
+    rows = {line.split()[1]: line for line in compared_table.splitlines() if len(line.split()) > 8}
+    assert set(METHODS) <= set(rows)
+    assert [cell.strip() for cell in rows["cloning"].split("│")[2:5]] == ["–", "–", "–"]
+    assert "–" not in rows["behavior"].split("│")[2:5]
+
+
+def test_joint_sees_the_wall_too(compared):
+    methods = compared["methods"]
+    assert methods["joint"]["mean_obstacle"] > methods["transitions"]["mean_obstacle"] + 0.1
 
 
 @pytest.mark.parametrize("share", [0, 1, 0.001])

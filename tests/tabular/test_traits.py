@@ -43,7 +43,7 @@ def test_lapses_are_a_share_of_actions_at_random():
 
 @pytest.mark.parametrize("backup", [BoltzmannAverage(), LogSumExp()], ids=lambda backup: type(backup).__name__)
 def test_the_slope_of_all_that_is_learned_is_that_of_the_objective(backup):
-    """Central differences of the objective, with two persons, two features, lapses and a discount to learn."""
+    """Central differences of the objective: by two persons, two features, lapses, a discount and costs of places."""
     shown = walks(Behavior(BoltzmannAverage(), 8.0, lapse=0.1), count=4)
     features = np.random.default_rng(1).normal(size=(GRID.size, 4, 2))
     someone = people(
@@ -53,16 +53,20 @@ def test_the_slope_of_all_that_is_learned_is_that_of_the_objective(backup):
         person=np.array([0, 1, 1]),
         features=features,
         tastes=np.array([0.02, -0.01]),
+        aimed_at=np.asarray(OPEN.graph.successors[..., 0]),
     )
     model = ObstacleGrid(GRID, 0.3 * np.sin(np.arange(GRID.size)))
     problem = Problem(model, someone, shown, Normal(), ALL_TERMS, None, "exact", Jacobi(tolerance=1e-13), tempering=0.7)
     objective = Objective(problem, MEMORY)
     point, back = ravel_pytree(problem.parameters)
-    found, starts = objective.evaluate(back(point), objective.cold_starts())
+    starts = objective.cold_starts()
+    costs = GRID.size + 2 + 1 + 1 + 2
+    assert len(point) == costs + GRID.size
+    # away from where the costs' prior is flat
+    point = point.at[costs:].add(np.cos(np.arange(GRID.size)))
+    found, starts = objective.evaluate(back(point), starts)
     slope = ravel_pytree(found.slope)[0]
-    of_people = range(GRID.size, len(point))
-    assert len(of_people) == 2 + 1 + 1 + 2
-    for index in (3, *of_people):
+    for index in (3, *range(GRID.size, costs), costs, costs + 8, costs + 29):
         ends = [objective.evaluate(back(point.at[index].add(width)), starts)[0].objective for width in (-1e-5, 1e-5)]
         assert slope[index] == pytest.approx(-(ends[1] - ends[0]) / 2e-5, rel=1e-5, abs=1e-6)
 
@@ -140,6 +144,19 @@ def test_tastes_are_found_with_the_walls_that_nobody_touched():
     assert blocked[hidden].min() > blocked[~hidden].max()
 
 
+def test_costs_start_at_the_mode_of_their_prior_and_are_paid_by_who_aims():
+    """A cost of ln(1 + exp −4) to begin with; k has a standard deviation of 2."""
+    aimed_at = np.asarray(OPEN.graph.successors[..., 0])
+    someone = people(Behavior(LogSumExp(), 5.0), aimed_at=aimed_at)
+    assert float(someone.log_density()) == 0
+    np.testing.assert_allclose(someone.costs, np.log1p(np.exp(-4)))
+    dearer = someone.with_parameters(someone.parameters._replace(costs=jnp.linspace(-4, 0, GRID.size)))
+    assert float(dearer.log_density()) == pytest.approx(-np.sum(np.linspace(0, 4, GRID.size) ** 2) / 8)
+    paid = dearer.tasks_of(reach(GRID, 0, discount=1.0, step_cost=1.0)).reward
+    assert float(paid[7, 3]) == pytest.approx(-1 - np.log1p(np.exp(-4 + 8 * 4 / 29)))  # to the right, at 8
+    assert float(paid[29, 3]) == pytest.approx(-1 - np.log(2))  # off the map one aims at where one is
+
+
 def test_what_cannot_be_learned_is_refused():
     behavior = Behavior(LogSumExp(), 5.0)
     with pytest.raises(InputError, match=r"'learned': expected some of .*'lapse'"):
@@ -152,6 +169,8 @@ def test_what_cannot_be_learned_is_refused():
         people(behavior, features=np.full((3, 1, 1), np.nan))
     with pytest.raises(InputError, match=r"'tastes': expected 1 finite numbers"):
         people(behavior, features=np.zeros((3, 1, 1)), tastes=np.full(1, np.inf))
+    with pytest.raises(InputError, match=r"'aimed_at': expected states 0…29"):
+        people(behavior, aimed_at=np.full((30, 4), 30))
     with pytest.raises(InputError, match=r"'lapse': expected a share"):
         Behavior(LogSumExp(), 5.0, lapse=1.0)
     with pytest.raises(InputError, match=r"'tempering': expected a share above 0"):
