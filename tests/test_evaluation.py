@@ -1,13 +1,14 @@
 """Scores of learned maps, on maps small enough to score by hand."""
 
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from sidestep import evaluation
-from sidestep.evaluation import Reward, evaluate, evaluate_planner, plan_paths, sample_for
-from sidestep.planners import ByPolicy
+from sidestep.evaluation import Reward, evaluate, plan_paths, sample_for
+from sidestep.planners import ByPolicy, InModel
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, true_model
 
@@ -26,7 +27,11 @@ def model_of(blocked) -> ObstacleGrid:
 
 
 def scores(model, reward=Reward(), scored=ALL, truth=TRUTH, visited=VISITED, **settings):  # noqa: B008
-    return evaluate(model, truth, scored, visited, reward, **settings)
+    return evaluate(who_pursues(reward, model), np.asarray(model.blocked), truth, scored, visited, **settings)
+
+
+def who_pursues(reward, model) -> InModel:
+    return InModel(model, partial(reward.reach, model.blank))
 
 
 @pytest.mark.parametrize("reward", [Reward(), Reward(discount=1.0, step_cost=1.0)])
@@ -88,7 +93,7 @@ def test_a_detour_that_nobody_needs():
     """Cell 4 seems blocked: 1 to 4 and 3 to 5 take longer ways, or go through it all the same."""
     blocked = np.full((3, 3), 1e-6)
     blocked[1, 1] = blocked[0, 2] = blocked[2, 1] = 1 - 1e-6
-    paths, goals = plan_paths(model_of(blocked), TRUTH, np.array([3, 6]), np.array([0, 3]), Reward())
+    paths, goals = plan_paths(who_pursues(Reward(), model_of(blocked)), np.array([3, 6]), np.array([0, 3]))
     assert [path.tolist() for path in paths] == [[3, 0], [6, 3, 0], [6, 3]]
     assert goals.tolist() == [0, 0, 3]
     blocked = np.full((3, 3), 1e-6)
@@ -119,7 +124,7 @@ def test_a_world_without_a_free_cell_has_no_paths():
 def test_paths_that_never_arrive_end_somewhere():
     """Between known walls the plan leads nowhere: its paths end, and count as not legal."""
     model = true_model(Grid(np.array([[0, 1, 0], [0, 1, 0], [0, 1, 0]])))
-    paths, goals = plan_paths(model, TRUTH, np.array([0, 5]), np.array([8]), Reward())
+    paths, goals = plan_paths(who_pursues(Reward(), model), np.array([0, 5]), np.array([8]))
     assert goals.tolist() == [8, 8]
     assert paths[1].tolist() == [5, 8]
     assert 8 not in paths[0]
@@ -165,7 +170,7 @@ def test_a_policy_without_a_map_is_scored_by_its_paths():
     policy = np.tile([0.2, 0.0, 0.0, 0.8], (4, 1))
     truth = Grid(np.zeros((1, 4), dtype=int))
     planner = ByPolicy(truth.forget(), lambda goal: policy)  # noqa: ARG005
-    found = evaluate_planner(planner, None, truth, np.ones((1, 4), bool), np.zeros((0, 2), int))
+    found = evaluate(planner, None, truth, np.ones((1, 4), bool), np.zeros((0, 2), int))
     assert found["legal_share"] == found["arriving_share"] == 0.5
     assert found["excess_length"] == 0
     assert found["regret"] is found["auc"] is found["average_precision"] is found["mean_free"] is None

@@ -132,9 +132,9 @@ def test_cloning_does_what_was_demonstrated_in_a_corridor():
     assert policy[:3, 3].min() > 0.5
     assert policy.min() > 0
     np.testing.assert_allclose(policy.sum(axis=1), 1)
-    assert [path.tolist() for path in learned.pursue(3).follow(np.array([0, 2]))] == [[0, 1, 2, 3], [2, 3]]
-    assert learned.pursue(4).follow(np.array([3]))[0].tolist() == [3, 2]
-    assert learned.possible().tolist() == [[True, True, True, True, False]]
+    assert [path.tolist() for path in learned.planner.pursue(3).follow(np.array([0, 2]))] == [[0, 1, 2, 3], [2, 3]]
+    assert learned.planner.pursue(4).follow(np.array([3]))[0].tolist() == [3, 2]
+    assert learned.planner.possible().tolist() == [[True, True, True, True, False]]
 
 
 def test_cloning_generalises_to_goals_that_nobody_had():
@@ -148,7 +148,7 @@ def test_cloning_generalises_to_goals_that_nobody_had():
     for goal in (10, 20, 33, 45):
         others = np.delete(np.arange(49), goal)
         shortest = [abs(start // 7 - goal // 7) + abs(start % 7 - goal % 7) for start in others]
-        paths = learned.pursue(goal).follow(others)
+        paths = learned.planner.pursue(goal).follow(others)
         assert [path[-1] for path in paths] == [goal] * 48
         assert [len(path) - 1 for path in paths] == shortest
 
@@ -157,7 +157,7 @@ def test_cloning_is_particular_to_places():
     """The same direction, another action: around the wall as people went, not straight into it."""
     ways = [walk(10, 15, 20, 21, 22, 23, 24, 19, 14), walk(11, 16, 21, 22, 23, 24, 19, 14)]
     learned = by_cloning(BLANK, gather(ways * 5, [reach(BLANK, 14)]), Settings())
-    assert learned.pursue(14).follow(np.array([10]))[0].tolist() == [10, 15, 20, 21, 22, 23, 24, 19, 14]
+    assert learned.planner.pursue(14).follow(np.array([10]))[0].tolist() == [10, 15, 20, 21, 22, 23, 24, 19, 14]
 
 
 def test_cloning_takes_actions_to_be_as_probable_as_its_policy_says(walks):

@@ -34,6 +34,7 @@ from sidestep.experiments import motivation, pendulum, representations, room
 from sidestep.experiments.demo import demo
 from sidestep.experiments.reproduce import reproduce
 from sidestep.inference.climb import Progress as FitProgress
+from sidestep.robots import BUMP_COST
 from sidestep.settings import Settings, Terms, most_iterations
 
 app = typer.Typer(
@@ -59,6 +60,9 @@ Connected = Annotated[Literal["4", "8"], typer.Option(help="Moves: 4 directions,
 Backup = Annotated[BackupName, typer.Option(help="How walkers value a state by its actions.")]
 Beta = Annotated[float, typer.Option(help="How sharply walkers choose, in units of one over reward.")]
 Discount = Annotated[float, typer.Option(help="γ, above 0 and at most 1.")]
+BumpCost = Annotated[
+    float, typer.Option(help="What bumping into something costs a robot beside the move, in cell sides.")
+]
 StepCost = Annotated[
     float | None,
     typer.Option(help="Cost of a cell side. Without it, the goal pays 1 and γ < 1 makes haste worthwhile."),
@@ -232,10 +236,11 @@ def plan_command(
     start: Annotated[str, typer.Option(help="Metres.", metavar="X,Y")],
     goal: Annotated[str, typer.Option(help="Metres.", metavar="X,Y")],
     out: Annotated[Path | None, typer.Option("--out", help="The folder to write to (DIR/plan).", metavar="DIR")] = None,
+    bump_cost: BumpCost = BUMP_COST,
 ) -> None:
     """A path in a learned map, as CSV and PNG."""
     out = out or folder / "plan"
-    summary = plan_path(folder, _position(start, "--start"), _position(goal, "--goal"), out)
+    summary = plan_path(folder, _position(start, "--start"), _position(goal, "--goal"), out, bump_cost)
     console.print(
         f"{summary['moves']} moves, {summary['length_metres']:g} m; the likeliest obstacle on the way has "
         f"P(blocked) = {summary['max_probability_blocked']:.3f}"
@@ -252,10 +257,11 @@ def evaluate_command(
         typer.Option("--out", help="Where to write summary.json (added to DIR's own by default).", metavar="DIR"),
     ] = None,
     seed: Seed = 0,
+    bump_cost: BumpCost = BUMP_COST,
 ) -> None:
     """AUC, average precision, recall, and how legal and how long the planned paths are."""
     with _stages() as report:
-        scores = evaluate_map(folder, truth, out, seed, report)
+        scores = evaluate_map(folder, truth, out, seed, report, bump_cost)
     _print_scores({str(folder): scores})
 
 

@@ -6,14 +6,13 @@ small and between sampled ones where it is large. What has no map, but says what
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 
-from sidestep.planners import InModel, Planner
+from sidestep.planners import Planner
 from sidestep.replanning import world_of
 from sidestep.scoring import (
     MapScores,
@@ -25,8 +24,6 @@ from sidestep.scoring import (
     walkable_graph,
 )
 from sidestep.tabular.grid import Cell, Grid
-from sidestep.tabular.models import ObstacleGrid, TransitionModel
-from sidestep.tabular.planning import plan
 from sidestep.tasks import Task, reach
 
 MOST_PLACES = 150
@@ -81,25 +78,6 @@ class _Pairs(NamedTuple):
 
 
 def evaluate(
-    model: ObstacleGrid,
-    truth: Grid,
-    scored: Bool[np.ndarray, "rows columns"],
-    visited: Int[np.ndarray, "visits 2"],
-    reward: Reward,
-    seed: int = 0,
-    report: Report = lambda *_: None,
-    ranking: Float[np.ndarray, "rows columns"] | None = None,
-) -> Mapping[str, float | None]:
-    """All scores of a learned map: those of `evaluate_planner` for who plans in it optimally.
-
-    - `reward`: what planned paths pursue. `ranking`: what cells are ranked by, where that is not P(blocked).
-    """
-    planner = InModel(model, partial(reward.reach, truth.forget()))
-    blocked = np.asarray(model.blocked, dtype=np.float64) if ranking is None else ranking
-    return evaluate_planner(planner, blocked, truth, scored, visited, seed, report)
-
-
-def evaluate_planner(
     planner: Planner,
     ranking: Float[np.ndarray, "rows columns"] | None,
     truth: Grid,
@@ -201,21 +179,16 @@ def _followed_lengths(
 
 
 def plan_paths(
-    model: TransitionModel,
-    grid: Grid,
-    starts: Int[np.ndarray, " starts"],
-    goals: Int[np.ndarray, " goals"],
-    reward: Reward,
+    planner: Planner, starts: Int[np.ndarray, " starts"], goals: Int[np.ndarray, " goals"]
 ) -> tuple[Sequence[Int[np.ndarray, " _"]], Int[np.ndarray, " paths"]]:
-    """The optimal paths under a model from every start to every other goal, and the goal of each.
+    """The paths that a robot means to take from every start to every other goal, and the goal of each.
 
     A path that never arrives ends before the first state that would repeat. Raises `NotConverged` if a plan's values
     did not converge.
     """
-    geometry = grid.forget()
     paths, path_goals = [], []
     for goal in goals:
         others = starts[starts != goal]
-        paths += plan(model, reward.reach(geometry, int(goal))).follow(others)
+        paths += planner.pursue(int(goal)).follow(others)
         path_goals += [int(goal)] * len(others)
     return paths, np.asarray(path_goals, dtype=np.int64)

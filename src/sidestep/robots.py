@@ -13,13 +13,14 @@ in the model in which cells that people walked through are known to be free.
 from collections.abc import Sequence
 from functools import partial
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
 from sidestep.errors import InputError
 from sidestep.planners import InModel
-from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.grid import Cell
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tasks import Task, reach
 
@@ -40,7 +41,7 @@ def believed(model: ObstacleGrid, walked: Int[np.ndarray, " visits"] | Sequence[
     known = np.array(model.known).reshape(-1)
     seen = np.asarray(walked, dtype=np.int64)
     known[seen[known[seen] == Cell.UNKNOWN]] = Cell.FREE
-    return ObstacleGrid(_grid(model, known.reshape(model.known.shape)), model.parameters)
+    return eqx.tree_at(lambda model: model.known, model, jnp.asarray(known.reshape(model.known.shape)))
 
 
 def careful(model: ObstacleGrid, goal: int, bump_cost: float = BUMP_COST) -> Task:
@@ -51,11 +52,7 @@ def careful(model: ObstacleGrid, goal: int, bump_cost: float = BUMP_COST) -> Tas
     if not (np.isfinite(bump_cost) and bump_cost >= 0):
         raise InputError(f"expected a number of at least 0, found {bump_cost}", field="bump_cost")
     # what the model takes for an obstacle may be a goal all the same
-    task = reach(_grid(model, np.full(model.known.shape, Cell.UNKNOWN)), goal, discount=1.0, step_cost=1.0)
+    task = reach(model.blank, goal, discount=1.0, step_cost=1.0)
     states = jnp.arange(model.graph.states)[:, None, None]
     nowhere = jnp.sum(jnp.where(model.graph.successors == states, model.probabilities(), 0), axis=-1)
     return Task(task.reward - bump_cost * nowhere, task.final_reward, task.terminal, task.discount)
-
-
-def _grid(model: ObstacleGrid, known: Int[np.ndarray, "rows columns"]) -> Grid:
-    return Grid(known, connectivity=4 if model.graph.actions == 4 else 8)

@@ -20,6 +20,8 @@ from sidestep.errors import InputError
 from sidestep.evaluation import Reward
 from sidestep.io.files import read_array, read_json, write_array, write_json
 from sidestep.io.maps import read_map, write_map
+from sidestep.planners import InModel
+from sidestep.robots import BUMP_COST, robot
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 from sidestep.tabular.models import ObstacleGrid
 
@@ -31,7 +33,7 @@ class LearnedMap:
     - `grid`: geometry and moves, and what was known beforehand.
     - `blocked`: P(blocked), exactly 0 or 1 where the map knew.
     - `visited`: the (state, goal) pairs of the moves that it was learned from.
-    - `reward`: what the walkers were taken to pursue, and what plans pursue.
+    - `reward`: what the walkers were taken to pursue.
     """
 
     grid: Grid
@@ -49,6 +51,10 @@ class LearnedMap:
         with np.errstate(divide="ignore"):
             logits = np.log(self.blocked) - np.log1p(-self.blocked)
         return ObstacleGrid(self.grid, np.where(self.unknown, logits, 0.0).reshape(-1))
+
+    def robot(self, bump_cost: float = BUMP_COST) -> InModel:
+        """Who knows the learned map, and where people walked (see `sidestep.robots`)."""
+        return robot(self.model(), self.visited.reshape(-1), bump_cost)
 
 
 def write_learned_map(folder: Path, learned: LearnedMap, summary: dict[str, Any]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError
-from sidestep.evaluation import evaluate_planner
+from sidestep.evaluation import evaluate
 from sidestep.io.demonstrations import demonstrations
 from sidestep.io.files import write_json
 from sidestep.io.maps import read_map
@@ -53,7 +53,7 @@ def compare(
     - `hold_out`: the share of walks, drawn by the settings' seed, that are not learned from. How probable their actions
       are under what was learned, in nats a move, is `heldout_log_likelihood`.
 
-    The summary has `methods.<name>` with the scores of `evaluate_planner`, that, and `seconds`. Raises `InputError` for
+    The summary has `methods.<name>` with the scores of `evaluate`, that, and `seconds`. Raises `InputError` for
     files that do not fit, and a share that leaves no walk to learn from or none to score.
     """
     given, truth = (read_map(file, connectivity=settings.connectivity) for file in (map_file, truth_file))
@@ -75,8 +75,8 @@ def compare(
         learned = learn(given, own, settings)
         seconds = time.monotonic() - started
         report(f"scoring {name}")
-        scores = evaluate_planner(
-            learned, learned.ranking, truth, given.known == Cell.UNKNOWN, own.visited(), settings.seed
+        scores = evaluate(
+            learned.planner, learned.ranking, truth, given.known == Cell.UNKNOWN, own.visited(), settings.seed
         )
         heldout = float(learned.log_policies(others).mean())
         methods[name] = {**scores, "heldout_log_likelihood": heldout, "seconds": round(seconds, 3)}
@@ -103,5 +103,9 @@ def _panel(name: str, learned: Lesson, given: Grid, truth: Grid, shown: Demonstr
     goals = np.asarray(shown.tasks.terminal).argmax(axis=-1)
     first = np.flatnonzero(np.diff(np.asarray(shown.trajectory), prepend=-1))
     ends = np.unique(np.stack([np.asarray(shown.states)[first], goals[np.asarray(shown.task)[first]]]), axis=1)
-    paths = [path for goal in np.unique(ends[1]) for path in learned.pursue(int(goal)).follow(ends[0, ends[1] == goal])]
+    paths = [
+        path
+        for goal in np.unique(ends[1])
+        for path in learned.planner.pursue(int(goal)).follow(ends[0, ends[1] == goal])
+    ]
     return Panel(f"{name}: its {len(paths)} ways", truth, paths=paths)

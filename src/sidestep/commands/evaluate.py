@@ -9,17 +9,24 @@ import numpy as np
 from sidestep.errors import InputError
 from sidestep.evaluation import Report, evaluate, sample_for
 from sidestep.io.maps import read_map
+from sidestep.robots import BUMP_COST
 from sidestep.runs import add_to_summary, read_learned_map
 
 
 def evaluate_map(
-    folder: Path, truth_file: Path, out: Path | None = None, seed: int = 0, report: Report = lambda *_: None
+    folder: Path,
+    truth_file: Path,
+    out: Path | None = None,
+    seed: int = 0,
+    report: Report = lambda *_: None,
+    bump_cost: float = BUMP_COST,
 ) -> Mapping[str, Any]:
     """Scores the learned map of `folder` against a true map and returns the scores (see `sidestep.scoring`).
 
     They are written to `summary.json` in `out`; without `out`, added to the learned map's own. Beside them stands
     `planned_at_most`: between how many starts and goals paths were planned, and how many of those with bumps were
-    followed. On maps too large for paths between all pairs of free cells `seed` draws them. Raises `InputError` for a
+    followed; and `bump_cost`, what a bump costs the robot that plans (`sidestep.robots`). On maps too large for paths
+    between all pairs of free cells `seed` draws them. Raises `InputError` for a
     true map of another size, resolution or origin.
     """
     learned = read_learned_map(folder)
@@ -40,7 +47,8 @@ def evaluate_map(
         raise InputError(
             f"expected the learned map's {learned.grid.origin}, found {truth.origin}", source=truth_file, field="origin"
         )
-    scores = evaluate(learned.model(), truth, learned.unknown, learned.visited, learned.reward, seed, report)
-    limits = {"planned_at_most": sample_for(truth.size)._asdict()}
+    robot = learned.robot(bump_cost)
+    scores = evaluate(robot, learned.blocked, truth, learned.unknown, learned.visited, seed, report)
+    limits = {"planned_at_most": sample_for(truth.size)._asdict(), "bump_cost": bump_cost}
     add_to_summary(folder, out or folder, None, {"truth": str(truth_file), **limits, **scores})
     return scores

@@ -9,22 +9,23 @@ import pyarrow as pa
 from sidestep.errors import InputError
 from sidestep.io.tables import write_table
 from sidestep.plotting.maps import figure_plan, save
+from sidestep.robots import BUMP_COST
 from sidestep.runs import add_to_summary, read_learned_map
 from sidestep.tabular.grid import Cell, Grid
-from sidestep.tabular.planning import plan
 
 Position = tuple[float, float]
 
 
-def plan_path(folder: Path, start: Position, goal: Position, out: Path) -> dict[str, Any]:
-    """Plans from `start` to `goal` (metres) in the learned map of `folder`; writes `path.csv` (`step, x, y, blocked`),
-    `path.png` and `summary.json` to `out`, and returns the summary.
+def plan_path(folder: Path, start: Position, goal: Position, out: Path, bump_cost: float = BUMP_COST) -> dict[str, Any]:
+    """Plans as a robot does (`sidestep.robots`) from `start` to `goal` (metres) in the learned map of `folder`.
+
+    Writes `path.csv` (`step, x, y, blocked`), `path.png` and `summary.json` to `out`, and returns the summary.
 
     Raises `InputError` for positions outside the map or in known obstacles, and where there is no way.
     """
     learned = read_learned_map(folder)
     first, last = (_state(learned.grid, position, name) for name, position in (("start", start), ("goal", goal)))
-    path = plan(learned.model(), learned.reward.reach(learned.grid, last)).path_from(first)
+    path = learned.robot(bump_cost).pursue(last).follow(np.array([first]))[0]
     if path[-1] != last:
         raise InputError(f"no way from {start} to {goal} in the learned map", source=folder)
     chances = learned.blocked.reshape(-1)[path]
@@ -34,6 +35,7 @@ def plan_path(folder: Path, start: Position, goal: Position, out: Path) -> dict[
         "command": "plan",
         "start": start,
         "goal": goal,
+        "bump_cost": bump_cost,
         "moves": len(path) - 1,
         "length_metres": float(lengths.sum()),
         "max_probability_blocked": float(chances.max()),

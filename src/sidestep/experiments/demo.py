@@ -49,10 +49,11 @@ def demo(folder: Path, seed: int = 0, report: Callable[[str], None] = lambda _: 
     blocked = np.asarray(found.model.blocked)
 
     report("planning between all pairs of places")
-    scores = evaluate(found.model, truth, np.ones(truth.shape, bool), shown.visited(), reward)
+    learned = LearnedMap(blank, blocked, shown.visited(), reward)
+    scores = evaluate(learned.robot(), blocked, truth, np.ones(truth.shape, bool), learned.visited)
     elsewhere = places(truth, NEW_PLACES + len(goals), seed + 1)
     new = elsewhere[~np.isin(elsewhere, goals)][:NEW_PLACES]
-    paths, _ = plan_paths(found.model, truth, new[:1], new[1:], reward)
+    paths, _ = plan_paths(learned.robot(), new[:1], new[1:])
     panels = [
         Panel(f"{len(walks)} walks in an office", truth, paths=shown.paths(), goals=goals),
         Panel(
@@ -75,6 +76,6 @@ def demo(folder: Path, seed: int = 0, report: Callable[[str], None] = lambda _: 
         "message": found.message,
         "scores": scores,
     }
-    write_learned_map(folder / "learned", LearnedMap(blank, blocked, shown.visited(), reward), summary)
+    write_learned_map(folder / "learned", learned, summary)
     write_json(folder / "summary.json", summary)
     return summary

@@ -32,6 +32,7 @@ from sidestep.plotting.maps import save
 from sidestep.plotting.policies import Curves, PolicyPanel, figure_policies
 from sidestep.rivals.costs import by_costs
 from sidestep.rivals.learned import Learned, by_behavior, reward_of
+from sidestep.robots import robot
 from sidestep.settings import Settings
 from sidestep.simulation import simulate
 from sidestep.tabular.grid import Cell, Grid
@@ -141,7 +142,7 @@ def walks(form: Form, seed: int) -> Demonstrations:
 def learned(form: Form, demonstrations: Demonstrations) -> dict[str, Learned]:
     """The truth, and what each method makes of the walks on a map of which nothing is known."""
     world, settings = true_world(), form.settings
-    truth = Learned(world, reward_of(settings), settings.behavior(), np.asarray(world.blocked))
+    truth = Learned(world, reward_of(settings), settings.behavior(), np.asarray(world.blocked), robot(world, []))
     return {"truth": truth} | {name: learn(_blank(), demonstrations, settings) for name, learn in METHODS.items()}
 
 

@@ -12,6 +12,7 @@ The paper's own two maps survive only as pictures that we do not have; see `side
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +26,7 @@ from sidestep.inference.fit import Fit, fit
 from sidestep.inference.optimisers import LBFGS, Ascent, Optimiser
 from sidestep.inference.priors import Normal
 from sidestep.io.files import write_json
+from sidestep.planners import InModel
 from sidestep.plotting.maps import Panel, figure_environments, figure_learned, save
 from sidestep.simulation import simulate
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, Gradient
@@ -106,13 +108,8 @@ def _learn(world: World, demonstrations: Demonstrations, variant: Variant) -> Fi
 
 
 def _scores(world: World, demonstrations: Demonstrations, found: Fit[ObstacleGrid]) -> dict[str, Any]:
-    scores = evaluate(
-        found.model,
-        world.truth,
-        np.ones(world.truth.shape, dtype=bool),
-        demonstrations.visited(),
-        REWARD,
-    )
+    scored = np.ones(world.truth.shape, dtype=bool)
+    scores = evaluate(_planner(found), np.asarray(found.model.blocked), world.truth, scored, demonstrations.visited())
     return {
         **scores,
         "objective": found.final.objective,
@@ -121,8 +118,13 @@ def _scores(world: World, demonstrations: Demonstrations, found: Fit[ObstacleGri
     }
 
 
+def _planner(found: Fit[ObstacleGrid]) -> InModel:
+    """The paper's: what people pursue, in the learned dynamics."""
+    return InModel(found.model, partial(REWARD.reach, found.model.blank))
+
+
 def _panel(world: World, variant: Variant, found: Fit[ObstacleGrid]) -> Panel:
-    paths, _ = plan_paths(found.model, world.truth, np.array(world.starts), np.array(world.goals), REWARD)
+    paths, _ = plan_paths(_planner(found), np.array(world.starts), np.array(world.goals))
     return Panel(
         f"{world.name}: {variant.title}",
         world.truth,

@@ -21,7 +21,7 @@ from scipy.sparse import csr_array, hstack, vstack
 from scipy.special import log_softmax
 
 from sidestep.demonstrations import Demonstrations
-from sidestep.planners import ByPolicy, Pursuit
+from sidestep.planners import ByPolicy
 from sidestep.settings import Settings
 from sidestep.tabular.grid import Grid
 
@@ -52,21 +52,15 @@ class Cloned:
         states = np.arange(self.grid.size)
         return np.exp(self._log_policy(states, np.full(self.grid.size, goal)))
 
-    def possible(self) -> Bool[np.ndarray, "rows columns"]:
-        """The cells that the map does not say are occupied."""
-        return self._planner().possible()
-
-    def pursue(self, goal: int) -> Pursuit:
+    @property
+    def planner(self) -> ByPolicy:
         """The most probable action everywhere."""
-        return self._planner().pursue(goal)
+        return ByPolicy(self.grid, self.policy)
 
     def log_policies(self, demonstrations: Demonstrations) -> Float[np.ndarray, " moves"]:
         """How probable every action is, in nats."""
         states, actions, goals = _moves(demonstrations)
         return self._log_policy(states, goals)[np.arange(len(states)), actions]
-
-    def _planner(self) -> ByPolicy:
-        return ByPolicy(self.grid, self.policy)
 
     def _log_policy(
         self, states: Int[np.ndarray, " visits"], goals: Int[np.ndarray, " visits"]

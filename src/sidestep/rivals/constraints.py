@@ -19,7 +19,7 @@ from scipy.sparse import coo_array, eye_array
 from scipy.sparse.linalg import spsolve
 
 from sidestep.demonstrations import Demonstrations
-from sidestep.rivals.learned import Learned, reward_of
+from sidestep.rivals.learned import Learned, known_map
 from sidestep.settings import Settings
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, true_model
@@ -53,7 +53,7 @@ def by_constraints(grid: Grid, demonstrations: Demonstrations, settings: Setting
         found = after
     logits = _logits(possible, forbidden, found.visits)
     model = ObstacleGrid(grid, logits)
-    return Learned(model, reward_of(settings), settings.behavior(), np.asarray(model.blocked, dtype=np.float64))
+    return known_map(model, demonstrations, settings)
 
 
 def _logits(

@@ -7,6 +7,7 @@ Maximum causal entropy is the log-sum-exp, whatever the settings say of how peop
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,12 +18,13 @@ from sidestep.errors import NotConverged
 from sidestep.evaluation import Reward
 from sidestep.inference.fit import fit
 from sidestep.inference.optimisers import LBFGS
+from sidestep.planners import InModel
 from sidestep.rivals.learned import Learned
 from sidestep.settings import Settings
 from sidestep.tabular.backups import Behavior, LogSumExp
 from sidestep.tabular.graph import grid_graph
 from sidestep.tabular.grid import Grid
-from sidestep.tabular.models import true_model
+from sidestep.tabular.models import ObstacleGrid, true_model
 from sidestep.tabular.people import People, people
 from sidestep.tasks import Task, with_costs
 
@@ -49,8 +51,7 @@ def by_costs(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> 
     found = fit(model, demonstrations, walkers, terms=("actions",), optimiser=LBFGS(iterations=_ITERATIONS))
     if not found.converged:
         raise NotConverged(f"the costs of cells were not found: {found.message}")
-    reward = costly_reward(found.people, settings)
-    return Learned(model, reward, walkers.behavior, np.asarray(found.people.costs).reshape(grid.shape))
+    return costly(model, found.people, settings, np.asarray(found.people.costs).reshape(grid.shape))
 
 
 def who_pay(grid: Grid, settings: Settings) -> People:
@@ -58,6 +59,10 @@ def who_pay(grid: Grid, settings: Settings) -> People:
     return people(Behavior(LogSumExp(), settings.beta), aimed_at=np.asarray(grid_graph(grid).successors[..., 0]))
 
 
-def costly_reward(walkers: People, settings: Settings) -> CostlyReward:
-    """What such people pursue."""
-    return CostlyReward(settings.discount, settings.step_cost, np.asarray(walkers.costs))
+def costly(
+    model: ObstacleGrid, walkers: People, settings: Settings, ranking: Float[np.ndarray, "rows columns"]
+) -> Learned:
+    """What was learned where cells cost something: robots pursue what people do, their costs with it."""
+    reward = CostlyReward(settings.discount, settings.step_cost, np.asarray(walkers.costs))
+    planner = InModel(model, partial(reward.reach, model.blank))
+    return Learned(model, reward, walkers.behavior_of(), ranking, planner)

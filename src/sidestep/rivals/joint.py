@@ -15,7 +15,7 @@ Herman et al. also have people whose beliefs differ from them.
 import numpy as np
 
 from sidestep.demonstrations import Demonstrations
-from sidestep.rivals.costs import costly_reward, who_pay
+from sidestep.rivals.costs import costly, who_pay
 from sidestep.rivals.learned import Learned
 from sidestep.settings import Settings, fit_map
 from sidestep.tabular.grid import Grid
@@ -26,5 +26,4 @@ def by_joint(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> 
     """A cost of every cell and P(blocked) of every unknown one; the ranking is by P(blocked)."""
     model, walkers = ObstacleGrid(grid, settings.prior_mean), who_pay(grid, settings)
     found = fit_map(model, demonstrations, settings, walkers=walkers)
-    reward = costly_reward(found.people, settings)
-    return Learned(found.model, reward, walkers.behavior, np.asarray(found.model.blocked, dtype=np.float64))
+    return costly(found.model, found.people, settings, np.asarray(found.model.blocked, dtype=np.float64))

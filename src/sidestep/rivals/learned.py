@@ -6,16 +6,16 @@ so are the simplest things that one could do instead: the likelihood of transiti
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from sidestep.demonstrations import Demonstrations
 from sidestep.evaluation import Reward
-from sidestep.planners import InModel, Planner, Pursuit
+from sidestep.planners import Planner
+from sidestep.robots import robot
 from sidestep.scoring import visit_ranking
 from sidestep.settings import Settings, fit_map
 from sidestep.tabular.backups import Behavior
@@ -29,8 +29,13 @@ _SELDOM = 0.98
 
 
 @runtime_checkable
-class Lesson(Planner, Protocol):
-    """What a method has learned from walks, as far as it is scored: what a robot does with it, and the rest here."""
+class Lesson(Protocol):
+    """What a method has learned from walks, as far as it is scored."""
+
+    @property
+    def planner(self) -> Planner:
+        """What a robot does with it."""
+        ...
 
     @property
     def ranking(self) -> Float[np.ndarray, "rows columns"] | None:
@@ -50,14 +55,16 @@ class Lesson(Planner, Protocol):
 class Learned(NamedTuple):
     """What is learned by a method that has a model.
 
-    - `model`: to plan in. `reward`: what plans pursue in it. `behavior`: how people are taken to act on it.
+    - `model`: what is known of the world. `reward`: what people pursue in it. `behavior`: how they act on it.
     - `ranking`: of cells, higher for those that are more surely obstacles; P(blocked) where there is such a thing.
+    - `planner`: what a robot does that knows all this.
     """
 
     model: ObstacleGrid
     reward: Reward
     behavior: Behavior
     ranking: Float[np.ndarray, "rows columns"]
+    planner: Planner
 
     @property
     def shares(self) -> Float[np.ndarray, "rows columns"]:
@@ -67,28 +74,12 @@ class Learned(NamedTuple):
             return (self.ranking - self.ranking.min()) / np.ptp(self.ranking)
         return blocked
 
-    def possible(self) -> Bool[np.ndarray, "rows columns"]:
-        """The cells that the model is not sure are blocked."""
-        return self._planner().possible()
-
-    def pursue(self, goal: int) -> Pursuit:
-        """The optimal plan in the model."""
-        return self._planner().pursue(goal)
-
     def log_policies(self, demonstrations: Demonstrations) -> Float[np.ndarray, " moves"]:
         """Of people who know the model and pursue the reward."""
         goals = np.asarray(demonstrations.tasks.terminal).argmax(axis=-1)
-        tasks = stack_tasks([self.reward.reach(self._blank(), int(goal)) for goal in goals])
+        tasks = stack_tasks([self.reward.reach(self.model.blank, int(goal)) for goal in goals])
         pursued = eqx.tree_at(lambda demos: demos.tasks, demonstrations, tasks)
         return np.asarray(log_policies(self.model, pursued, self.behavior))
-
-    def _planner(self) -> InModel:
-        return InModel(self.model, partial(self.reward.reach, self._blank()))
-
-    def _blank(self) -> Grid:
-        """The model's grid with nothing known; goals in what it takes for obstacles are goals all the same."""
-        rows, columns = self.model.known.shape
-        return Grid.unknown(rows, columns, 4 if self.model.graph.actions == 4 else 8)
 
 
 Method = Callable[[Grid, Demonstrations, Settings], Lesson]
@@ -99,10 +90,22 @@ def reward_of(settings: Settings) -> Reward:
     return Reward(settings.discount, settings.step_cost)
 
 
+def known_map(
+    model: ObstacleGrid,
+    demonstrations: Demonstrations,
+    settings: Settings,
+    ranking: Float[np.ndarray, "rows columns"] | None = None,
+) -> Learned:
+    """A map as what was learned: robots know it and where people walked. Without a ranking, cells have P(blocked)."""
+    ranking = np.asarray(model.blocked, dtype=np.float64) if ranking is None else ranking
+    planner = robot(model, np.concatenate(demonstrations.paths()))
+    return Learned(model, reward_of(settings), settings.behavior(), ranking, planner)
+
+
 def by_behavior(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> Learned:
     """Behavior-aware modeling, as `sidestep learn` has it."""
     model = fit_map(ObstacleGrid(grid, settings.prior_mean), demonstrations, settings).model
-    return Learned(model, reward_of(settings), settings.behavior(), np.asarray(model.blocked, dtype=np.float64))
+    return known_map(model, demonstrations, settings)
 
 
 def by_transitions(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> Learned:
@@ -115,4 +118,4 @@ def by_visits(grid: Grid, demonstrations: Demonstrations, settings: Settings) ->
     ranking = visit_ranking(np.concatenate(demonstrations.paths()), grid)
     blocked = np.clip(1 / (1 - ranking), None, _SELDOM).ravel()
     model = ObstacleGrid(grid, np.log(blocked) - np.log1p(-blocked))
-    return Learned(model, reward_of(settings), settings.behavior(), ranking)
+    return known_map(model, demonstrations, settings, ranking)

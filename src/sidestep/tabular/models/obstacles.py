@@ -54,6 +54,12 @@ class ObstacleGrid(TransitionModel):
         """(success, failure) of every move."""
         return chances_of_moves(self.parameters, self.known, self.graph.actions)
 
+    @property
+    def blank(self) -> Grid:
+        """The grid, with nothing known of its cells."""
+        rows, columns = self.known.shape
+        return Grid.unknown(rows, columns, 4 if self.graph.actions == 4 else 8)
+
 
 class FeaturedGrid(TransitionModel):
     """A grid whose cells are blocked as a function of what is known of each of them says.
