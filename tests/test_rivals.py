@@ -154,10 +154,12 @@ def test_cloning_generalises_to_goals_that_nobody_had():
 
 
 def test_cloning_is_particular_to_places():
-    """The same direction, another action: around the wall as people went, not straight into it."""
-    ways = [walk(10, 15, 20, 21, 22, 23, 24, 19, 14), walk(11, 16, 21, 22, 23, 24, 19, 14)]
-    learned = by_cloning(BLANK, gather(ways * 5, [reach(BLANK, 14)]), Settings())
-    assert learned.planner.pursue(14).follow(np.array([10]))[0].tolist() == [10, 15, 20, 21, 22, 23, 24, 19, 14]
+    """The goal is four cells to the right, and people go straight there in one row, and by another row in another."""
+    straight, around = walk(5, 6, 7, 8, 9), walk(15, 10, 11, 12, 13, 14, 19)._replace(task=1)
+    shown = gather([straight, around] * 5, [reach(BLANK, goal) for goal in (9, 19)])
+    learned = by_cloning(BLANK, shown, Settings())
+    assert learned.planner.pursue(9).follow(np.array([5]))[0].tolist() == straight.states.tolist()
+    assert learned.planner.pursue(19).follow(np.array([15]))[0].tolist() == around.states.tolist()
 
 
 def test_cloning_takes_actions_to_be_as_probable_as_its_policy_says(walks):

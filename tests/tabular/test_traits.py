@@ -149,6 +149,7 @@ def test_costs_start_at_the_mode_of_their_prior_and_are_paid_by_who_aims():
     aimed_at = np.asarray(OPEN.graph.successors[..., 0])
     someone = people(Behavior(LogSumExp(), 5.0), aimed_at=aimed_at)
     assert float(someone.log_density()) == 0
+    assert someone.costs is not None
     np.testing.assert_allclose(someone.costs, np.log1p(np.exp(-4)))
     dearer = someone.with_parameters(someone.parameters._replace(costs=jnp.linspace(-4, 0, GRID.size)))
     assert float(dearer.log_density()) == pytest.approx(-np.sum(np.linspace(0, 4, GRID.size) ** 2) / 8)
