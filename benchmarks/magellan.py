@@ -59,8 +59,8 @@ METHODS = ("learned", "visits", "transitions")
 
 def read_town(folder: Path, settings: Settings) -> Maze:
     """The town in a folder; raises `InputError` for missing files and those that are none."""
-    blank, truth = (read_map(folder / f"{name}.yaml", connectivity=settings.connectivity) for name in ("blank", "truth"))
-    return Maze(folder.name, blank, truth, read_walks(folder / "drives.csv"))
+    maps = [read_map(folder / f"{name}.yaml", connectivity=settings.connectivity) for name in ("blank", "truth")]
+    return Maze(folder.name, *maps, read_walks(folder / "drives.csv"))
 
 
 def score(town: Maze, drives: Walks, settings: Settings) -> dict[str, Any]:
@@ -110,7 +110,7 @@ def measure(towns: Sequence[Maze], counts: Sequence[int], seeds: int, settings: 
 
 
 def summarise(records: Sequence[dict[str, Any]], counts: Sequence[int]) -> list[dict[str, Any]]:
-    """For every number of drives, the mean scores over towns, each the mean over its seeds; NaN where there is none."""
+    """For every number of drives, mean scores over towns, each the mean over its seeds; None where there are none."""
     rows = []
     for count in counts:
         own = [record for record in records if record["drives"] == count]
@@ -123,33 +123,38 @@ def summarise(records: Sequence[dict[str, Any]], counts: Sequence[int]) -> list[
     return rows
 
 
-def _mean_over_towns(records: Sequence[dict[str, Any]], method: str, key: str) -> float:
+def _mean_over_towns(records: Sequence[dict[str, Any]], method: str, key: str) -> float | None:
     by_town: dict[str, list[float]] = {}
     for record in records:
         if (value := record[method][key]) is not None:
             by_town.setdefault(record["town"], []).append(value)
-    return float(np.mean([np.mean(values) for values in by_town.values()])) if by_town else float("nan")
+    return float(np.mean([np.mean(values) for values in by_town.values()])) if by_town else None
 
 
 def print_summary(rows: Sequence[dict[str, Any]], title: str) -> None:
     """The table: a line for each number of drives and method."""
     lines = [
-        [str(row["drives"]), format(row["moves"], ".0f"), str(row["into_buildings"]), method]
-        + [format(row[method][key], ".3f") for key in SCORES]
+        [str(row["drives"]), number(row["moves"], ".0f"), str(row["into_buildings"]), method]
+        + [number(row[method][key], ".3f") for key in SCORES[:2]]
         for row in rows
         for method in METHODS
     ]
-    names = ["AUC", "AP", "AUC, those that matter", "AP, those that matter"]
-    print_table(title, ["drives", "moves", "into buildings", "ranked by", *names], lines, left=("ranked by",))
+    columns = ["drives", "moves", "into buildings", "ranked by", "AUC", "average precision"]
+    print_table(title, columns, lines, left=("ranked by",))
 
 
 def figure(town: Maze, record: dict[str, Any]) -> Figure:
     """The drives of a record in the true town, and P(blocked) as learned from them with the buildings outlined."""
-    drives = next(drives for seed, drives in draws(town, record["drives"], record["seed"] + 1) if seed == record["seed"])
+    drives = dict(draws(town, record["drives"], record["seed"] + 1))[record["seed"]]
     goals = np.unique(drives.goals, axis=0)
     known = Panel(f"{town.name}: {len(drives)} drives", town.truth, paths=list(drives), goals=goals)
     learned = Panel("learned from them", town.blank, blocked=np.asarray(record["blocked"]), truth=town.truth)
-    return figure_learned([known, learned])
+    picture = figure_learned([known, learned])
+    for axes in picture.axes[:2]:
+        axes.set(xlabel="x (blocks)", ylabel="y (blocks)")
+    # no cell is surely blocked: the scale ends where the most probable one is
+    picture.axes[1].images[0].set_clim(0.0, max(map(max, record["blocked"])))
+    return picture
 
 
 def _arguments() -> argparse.Namespace:
