@@ -59,8 +59,12 @@ METHODS = ("learned", "visits", "transitions")
 
 def read_town(folder: Path, settings: Settings) -> Maze:
     """The town in a folder; raises `InputError` for missing files and those that are none."""
-    maps = [read_map(folder / f"{name}.yaml", connectivity=settings.connectivity) for name in ("blank", "truth")]
-    return Maze(folder.name, *maps, read_walks(folder / "drives.csv"))
+    return Maze(
+        folder.name,
+        read_map(folder / "blank.yaml", connectivity=settings.connectivity),
+        read_map(folder / "truth.yaml", connectivity=settings.connectivity),
+        read_walks(folder / "drives.csv"),
+    )
 
 
 def score(town: Maze, drives: Walks, settings: Settings) -> dict[str, Any]:

@@ -62,9 +62,8 @@ def test_a_building_that_all_drive_around_is_found(script, towns):
     assert record["converged"]
     assert set(record["learned"]) == set(record["visits"]) == set(record["transitions"]) == SCORES
     # neither of the others can tell the building from what else was not visited
-    unvisited = record["visits"]["average_precision"]
-    assert record["transitions"]["average_precision"] == pytest.approx(unvisited, abs=1e-3)
-    assert record["learned"]["average_precision"] > unvisited + 0.2
+    learned, *others = (record[method]["average_precision"] for method in ("learned", "visits", "transitions"))
+    assert learned > max(others) + 0.2
 
 
 def test_moves_into_buildings_are_counted_and_survived(script, towns):
