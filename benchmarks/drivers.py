@@ -35,7 +35,7 @@ Trip = Int[np.ndarray, " _"]
 
 @dataclass(frozen=True)
 class Settings:
-    """How closed links are learned; `docs/real-people.md` tells how these were chosen.
+    """How closed links are learned; `docs/towns.md` tells what other priors come to.
 
     - `backup`: a name in `BACKUPS`. `tastes`: whether drivers mind turns, or lengths and the number of links only.
     - `prior_mean`, `prior_variance`: of the logit of each link that was not driven.
