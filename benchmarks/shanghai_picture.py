@@ -79,7 +79,9 @@ def draw_town(
         Line2D([], [], color="0.3", linewidth=2.2, label="unused, and closed"),
         Line2D([], [], color="0.3", linewidth=2.2, marker="o", markeredgecolor="black", label="unused, but open"),
     ]
-    axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=3, frameon=False, fontsize="small")
+    axes.legend(
+        handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=3, frameon=False, fontsize="small"
+    )
     axes.autoscale()
     axes.set(aspect="equal", xlabel="metres", title=f"learned from {record['trips']} trips")
     return shades

@@ -207,10 +207,12 @@ def test_a_street_that_says_it_is_one_way_but_leads_back_is_refused(script, tmp_
         script("drivers").read_town(tmp_path)
 
 
-def test_streets_that_drivers_drive_around_are_found(script, city):
+@pytest.mark.parametrize(("times", "many"), [(1, 1_000_000), (100, 1)])
+def test_streets_that_drivers_drive_around_are_found(script, city, times, many):
+    """From few trips, and from above from many."""
     shanghai = script("shanghai")
-    town, trips = city
-    record = shanghai.score(town, trips, trips[:4], shanghai.Settings(iterations=30))
+    town, trips = city[0], city[1] * times
+    record = shanghai.score(town, trips, trips[:4], shanghai.Settings(many=many))
     chances, unused = np.asarray(record["rankings"]["P(closed)"]), town.uses(trips) == 0
     closed = town.network.added
     assert unused[closed].all()
