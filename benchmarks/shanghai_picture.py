@@ -48,7 +48,7 @@ def figure(roads: Roads, closed: Bool[np.ndarray, " links"], records: Sequence[M
         draw_precision(axes, closed, record)
         axes.set_xlabel("recall of closed links" if record is firsts[-1] else "")
         if record is firsts[0]:
-            axes.legend(fontsize="small", frameon=False, loc="lower left", bbox_to_anchor=(0.0, 0.1))
+            axes.legend(fontsize="small", frameon=False, loc="lower left", bbox_to_anchor=(0.0, 0.2))
     return picture
 
 
@@ -94,8 +94,9 @@ def draw_precision(axes: Axes, closed: Bool[np.ndarray, " links"], record: Mappi
         precision, recall, _ = precision_recall_curve(closed[unused], np.asarray(ranks)[unused])
         axes.plot(recall[:-1], precision[:-1], style, color="black", label=name)
     axes.axhline(record["share"], color="0.6", linewidth=3, zorder=0, label="share of closed links")
+    open_links = max(1 - record["share"], 0.01)
     axes.set(
-        ylim=(min(0.95 * record["share"], 0.98), 1.002),
+        ylim=(1 - 1.3 * open_links, 1 + 0.03 * open_links),
         ylabel="precision",
         title=f"unused links, {record['trips']} trips",
     )

@@ -221,6 +221,7 @@ def test_streets_that_drivers_drive_around_are_found(script, city, times, many):
     assert record["P(closed)"] == pytest.approx(1.0)
     assert record["share"] == pytest.approx(closed.sum() / unused.sum())
     assert record["gain"] == pytest.approx(1 - record["share"])
+    assert record["likely"] == (chances[unused] > 0.5).sum()
     assert record["converged"]
     # the four trips show nothing that the others do not
     assert record["later"] is None
