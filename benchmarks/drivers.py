@@ -12,13 +12,13 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.optimize import minimize
 
 from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError, NotConverged
 from sidestep.inference.fit import Fit, fit
-from sidestep.inference.optimisers import LBFGS
+from sidestep.inference.optimisers import LBFGS, Optimiser, Resilient
 from sidestep.inference.priors import Normal
 from sidestep.io.roads import Roads, demonstrations_of_trips, read_roads, read_trips
 from sidestep.tabular.backups import BACKUPS, Behavior
@@ -28,6 +28,10 @@ from two_way import FEATURES, TwoWay, turn_features, two_way
 
 OPEN, SURELY = -7.0, 0.01
 """The prior of a link that was driven: the mean of its logit, and the variance."""
+CLOSED = 3.0
+"""The logit of a link that is taken as closed: some twenty tries, longer than most ways round."""
+A_TURN = 1e-3
+"""Of many trips all is learned when the next step promises less than this for each turn (nats)."""
 LEAST = 1e-3
 """The least that a link costs: at no discount, every action must cost something."""
 Trip = Int[np.ndarray, " _"]
@@ -35,11 +39,12 @@ Trip = Int[np.ndarray, " _"]
 
 @dataclass(frozen=True)
 class Settings:
-    """How closed links are learned; `docs/real-people.md` tells how these were chosen.
+    """How closed links are learned; `docs/towns.md` tells what other priors come to.
 
     - `backup`: a name in `BACKUPS`. `tastes`: whether drivers mind turns, or lengths and the number of links only.
     - `prior_mean`, `prior_variance`: of the logit of each link that was not driven.
     - `iterations`, `tolerance`: those of `LBFGS`.
+    - `many`: from so many turns on, the climb is that of large maps: from above, by `Resilient` (see `_climb`).
     """
 
     backup: str = "boltzmann"
@@ -48,6 +53,7 @@ class Settings:
     prior_variance: float = 0.3
     iterations: int = 100
     tolerance: float = 0.05
+    many: int = 100_000
 
 
 class Town(NamedTuple):
@@ -135,7 +141,21 @@ def learn(town: Town, trips: Sequence[Trip], settings: Settings) -> Learned:
     driven = jnp.asarray(town.uses(trips) > 0)
     means = jnp.where(driven, OPEN, settings.prior_mean)
     prior = Normal(means, jnp.where(driven, SURELY, settings.prior_variance))
-    optimiser = LBFGS(iterations=settings.iterations, tolerance=settings.tolerance)
-    begin = town.model.with_parameters(means)
-    found = fit(begin, town.paying(demos, weights), people, prior=prior, optimiser=optimiser)
+    optimiser, begin = _climb(settings, means, driven, len(demos))
+    model = town.model.with_parameters(begin)
+    found = fit(model, town.paying(demos, weights), people, prior=prior, optimiser=optimiser)
     return Learned(found, weights, people)
+
+
+def _climb(
+    settings: Settings, means: Float[Array, " links"], driven: Bool[Array, " links"], turns: int
+) -> tuple[Optimiser, Float[Array, " links"]]:
+    """The optimiser, and the logits that it begins with.
+
+    Many trips make cliffs: links that thousands of drivers would take if they were a little more open. L-BFGS crawls
+    along them. So all links that were not driven begin as closed, and the prior opens them until drivers would come.
+    """
+    if turns < settings.many:
+        return LBFGS(iterations=settings.iterations, tolerance=settings.tolerance), means
+    optimiser = Resilient(iterations=settings.iterations, tolerance=A_TURN * turns)
+    return optimiser, jnp.where(driven, means, CLOSED)

@@ -1,6 +1,7 @@
 """One-way streets that are found from where taxis drove, on a network of which nobody says what is one-way.
 
     python benchmarks/shanghai.py --out shanghai.png
+    python benchmarks/shanghai.py --trips 2000 --seeds 3 --json shanghai.json
     python benchmarks/shanghai.py --trips 200 --set prior_mean=-2 prior_variance=4
     python benchmarks/shanghai.py --quick
 
@@ -41,7 +42,10 @@ DATA = Path(__file__).parents[2] / "shared" / "data" / "shanghai"
 
 
 def score(town: Town, trips: Sequence[Trip], others: Sequence[Trip], settings: Settings) -> dict[str, Any]:
-    """The record of one draw of trips; `others` are trips that were not drawn."""
+    """The record of one draw of trips; `others` are trips that were not drawn.
+
+    Beside what the table has, `likely` counts the unused links that are more probably closed than open.
+    """
     started = time.perf_counter()
     learned = learn(town, trips, settings)
     seconds = time.perf_counter() - started
@@ -59,12 +63,15 @@ def score(town: Town, trips: Sequence[Trip], others: Sequence[Trip], settings: S
         "share": share,
         **precision,
         "gain": precision["P(closed)"] - share,
+        "likely": int((chances[unused] > 0.5).sum()),
         "all: P(closed)": average_precision_score(truth, chances),
         "all: by use": average_precision_score(truth, -uses),
         "weights": dict(zip(FEATURES, np.asarray(learned.weights).tolist(), strict=True)),
         "destinations": len(learned.found.sweeps),
         "iterations": learned.found.final.iteration,
         "converged": learned.found.converged,
+        "objective": learned.found.final.objective,
+        "largest_gradient": learned.found.final.gradient,
         "seconds": round(seconds, 3),
         "later": later(chances[unused], town.uses(others)[unused]),
         "log-likelihood": learned.log_likelihood(town, others) if others else None,

@@ -38,8 +38,8 @@ def figure(roads: Roads, closed: Bool[np.ndarray, " links"], records: Sequence[M
     - `records`: those of `shanghai.score`; of each number of trips, the first one counts.
     """
     firsts = list({record["trips"]: record for record in reversed(records)}.values())[::-1]
-    picture = Figure(figsize=(12.5, 7.6), layout="constrained")
-    grid = picture.add_gridspec(len(firsts), 2, width_ratios=[7.6, 4.9])
+    picture = Figure(figsize=(10.4, 7.4), layout="constrained")
+    grid = picture.add_gridspec(len(firsts), 2, width_ratios=[5.6, 4.6])
     town = picture.add_subplot(grid[:, 0])
     label = "rank by P(closed) among unused links (1: most surely closed)"
     picture.colorbar(draw_town(town, roads, closed, firsts[0]), ax=town, shrink=0.5, pad=0.01, label=label)
@@ -47,6 +47,8 @@ def figure(roads: Roads, closed: Bool[np.ndarray, " links"], records: Sequence[M
         axes = picture.add_subplot(grid[row, 1])
         draw_precision(axes, closed, record)
         axes.set_xlabel("recall of closed links" if record is firsts[-1] else "")
+        if record is firsts[0]:
+            axes.legend(fontsize="small", frameon=False, loc="lower left", bbox_to_anchor=(0.0, 0.2))
     return picture
 
 
@@ -77,7 +79,9 @@ def draw_town(
         Line2D([], [], color="0.3", linewidth=2.2, label="unused, and closed"),
         Line2D([], [], color="0.3", linewidth=2.2, marker="o", markeredgecolor="black", label="unused, but open"),
     ]
-    axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=3, frameon=False)
+    axes.legend(
+        handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=3, frameon=False, fontsize="small"
+    )
     axes.autoscale()
     axes.set(aspect="equal", xlabel="metres", title=f"learned from {record['trips']} trips")
     return shades
@@ -90,13 +94,13 @@ def draw_precision(axes: Axes, closed: Bool[np.ndarray, " links"], record: Mappi
         precision, recall, _ = precision_recall_curve(closed[unused], np.asarray(ranks)[unused])
         axes.plot(recall[:-1], precision[:-1], style, color="black", label=name)
     axes.axhline(record["share"], color="0.6", linewidth=3, zorder=0, label="share of closed links")
+    open_links = max(1 - record["share"], 0.01)
     axes.set(
-        ylim=(min(0.95 * record["share"], 0.98), 1.002),
+        ylim=(1 - 1.3 * open_links, 1 + 0.03 * open_links),
         ylabel="precision",
         title=f"unused links, {record['trips']} trips",
     )
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(fontsize="small", frameon=False)
 
 
 def layout(roads: Roads) -> Float[np.ndarray, "nodes 2"]:
