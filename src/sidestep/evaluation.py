@@ -85,6 +85,7 @@ def evaluate(
     visited: Int[np.ndarray, "visits 2"],
     seed: int = 0,
     report: Report = lambda *_: None,
+    goals: Int[np.ndarray, " goals"] | None = None,
 ) -> Mapping[str, float | None]:
     """All scores, by name: those of `scoring.MapScores` and `scoring.PathScores`, `regret` and `arriving_share`.
 
@@ -93,6 +94,7 @@ def evaluate(
     - `scored`: the cells that had to be learned.
     - `visited`: (state, goal) of the moves that were learned from; they tell which obstacles matter.
     - `seed` draws starts and goals of paths on maps too large for all pairs (see `sample_for`).
+    - `goals`: the states that paths lead to, where these are not all free cells.
 
     The regret is by how much a robot goes farther than the shortest way, on average and in cell sides: where it bumps
     into something it stays, having gone the length of the move, notes the obstacle and goes on as its planner has it.
@@ -107,7 +109,8 @@ def evaluate(
     free = np.flatnonzero((truth.known == Cell.FREE) & planner.possible())
     random, sample = np.random.default_rng(seed), sample_for(truth.size)
     graph = walkable_graph(truth)
-    pairs = _pairs_with_a_way(_some(free, sample.starts, random), _some(free, sample.goals, random), graph)
+    starts, ends = _some(free, sample.starts, random), free if goals is None else np.intersect1d(free, goals)
+    pairs = _pairs_with_a_way(starts, _some(ends, sample.goals, random), graph)
     lengths = _planned_lengths(planner, pairs, graph, report)
     cells = MapScores() if ranking is None else score_map(ranking, truth, scored, relevant)
     bumps = _followed_with_bumps(planner, pairs, lengths, truth, sample.followed, random, report)

@@ -104,8 +104,8 @@ def known_map(
 
 def by_behavior(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> Learned:
     """Behavior-aware modeling, as `sidestep learn` has it."""
-    model = fit_map(ObstacleGrid(grid, settings.prior_mean), demonstrations, settings).model
-    return known_map(model, demonstrations, settings)
+    found = fit_map(ObstacleGrid(grid, settings.prior_mean), demonstrations, settings)
+    return known_map(found.model, demonstrations, settings)._replace(behavior=found.people.behavior_of())
 
 
 def by_transitions(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> Learned:
