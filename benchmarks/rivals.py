@@ -4,15 +4,15 @@
     python benchmarks/rivals.py tartarus --behavior auto
     python benchmarks/rivals.py tartarus --walks 10 --methods behavior visits --json rivals.json
 
-`offices` are drawn by seed, with simulated walkers who go the best ways, ties at random, between eight places; robots are
-to reach eight others. `tartarus` are the mazes of `real_people.py`, whose people all have one goal; robots are to reach
-twelve other cells. Of the walks N are learned from. Others, at most a hundred of those left, tell how probable the
-actions are that each method expects (nats a move); there is at least a fifth of all walks of them.
+`offices` are drawn by seed, with simulated walkers who go the best ways, ties at random, between eight places; robots
+are to reach eight others. `tartarus` are the mazes of `real_people.py`, whose people all have one goal; robots are to
+reach twelve other cells. Of the walks N are learned from, but at most four fifths. Others, at most a hundred, tell how
+probable the actions are that each method expects (nats a move).
 
-Robots set out from every free cell and plan by what each method has learned (`sidestep.robots`; those who know costs pursue
-these). `legal` is the share of planned paths that bump into nothing, `regret` by how many cells robots go farther than
-they had to, bumps and ways around included, and `arriving` the share of those who ever arrive; the regret is that of
-worlds in which all do.
+Robots set out from every free cell and plan by what each method has learned (`sidestep.robots`; those who know costs
+pursue these). `legal` is the share of planned paths that bump into nothing, `regret` by how many cells robots go
+farther than they had to, bumps and ways around included, and `arriving` the share of those who ever arrive; the regret
+is a mean over the worlds in which all do.
 """
 
 import argparse
