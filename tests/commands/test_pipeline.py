@@ -196,7 +196,7 @@ def test_simulation_repeats_by_seed(office, tmp_path):
     assert one == same != other
 
 
-def test_an_interrupted_run_goes_on(office, tmp_path, monkeypatch, capsys):
+def test_an_interrupted_run_goes_on(office, learned, tmp_path, monkeypatch, capsys):
     learn = ("learn", office / "walks.csv", "--map", office / "half.yaml", "--out", tmp_path)
     whole = cli.learn
 
@@ -227,7 +227,7 @@ def test_an_interrupted_run_goes_on(office, tmp_path, monkeypatch, capsys):
     assert call(*learn, "--resume") == 0
     assert iterations[0] == 4
     assert written(tmp_path) == LEARNED
-    np.testing.assert_array_equal(np.load(tmp_path / "blocked.npy"), np.load(office / "learned" / "blocked.npy"))
+    np.testing.assert_array_equal(np.load(tmp_path / "blocked.npy"), np.load(learned / "blocked.npy"))
 
 
 def test_known_cells_of_the_learned_map_are_known_again(learned):
