@@ -24,8 +24,8 @@ from sidestep.tabular.grid import Cell
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tasks import Task, reach
 
-BUMP_COST = 10.0
-"""What a bump costs beside the move itself, in cell sides: about a way around."""
+BUMP_COST = 40.0
+"""What a bump costs beside the move itself, in cell sides: a long way around; `docs/rivals.md` says what less does."""
 
 
 def robot(
