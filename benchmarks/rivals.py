@@ -35,7 +35,7 @@ from sidestep.commands.behavior import choose_behavior
 from sidestep.commands.compare import METHODS
 from sidestep.commands.simulate import Walkers, walk
 from sidestep.domains.offices import office, places
-from sidestep.errors import InputError, NotConverged
+from sidestep.errors import ImproperTask, InputError, NotConverged
 from sidestep.evaluation import evaluate
 from sidestep.io.demonstrations import demonstrations
 from sidestep.io.files import write_json
@@ -116,12 +116,12 @@ def score(problem: Problem, settings: Settings, auto: bool, methods: Sequence[st
     for name in methods:
         try:
             learned = METHODS[name](blank, own, settings)
-        except NotConverged as error:
+            found = evaluate(
+                learned.planner, learned.ranking, problem.truth, everywhere, own.visited(), goals=problem.goals
+            )
+        except (ImproperTask, NotConverged) as error:
             Console(stderr=True).print(f"{problem.name}, {name}: {error}")
             continue
-        found = evaluate(
-            learned.planner, learned.ranking, problem.truth, everywhere, own.visited(), goals=problem.goals
-        )
         heldout = float(np.mean(learned.log_policies(others)))
         scores[name] = {key: {**found, "heldout_log_likelihood": heldout}[key] for key in SCORES}
     return scores

@@ -303,6 +303,9 @@ def compare_command(
         "seconds": "seconds",
     }
     _print_table(summary["methods"], columns)
+    for name, scores in summary["methods"].items():
+        if "failed" in scores:
+            errors.print(f"note: nothing by {name}: {scores['failed']}", markup=False, soft_wrap=True)
     console.print(f"picture and numbers in {out}")
 
 
@@ -447,6 +450,6 @@ def _print_scores(rows: Mapping[str, Mapping[str, Any]]) -> None:
 def _print_table(rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> None:
     table = Table("", *columns.values())
     for name, scores in rows.items():
-        cells = (scores[key] for key in columns)
+        cells = (scores.get(key) for key in columns)
         table.add_row(name, *("–" if number is None else f"{number:.3f}" for number in cells))
     console.print(table)

@@ -67,9 +67,13 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         return [np.concatenate([piece, end[-1:]]) for piece, end in pieces]
 
     def visited(self: "Demonstrations[Task]") -> Int[np.ndarray, "visits 2"]:
-        """The different (state, goal) pairs of all moves; the goal is the first terminal state of the task."""
+        """The different (state, goal) pairs of all that people passed, where they arrived or stopped included.
+
+        The goal is the first terminal state of the task.
+        """
         goals = np.asarray(self.tasks.terminal).argmax(axis=-1)[np.asarray(self.task)]
-        return np.unique(np.stack([np.asarray(self.states), goals], axis=1), axis=0)
+        passed = np.concatenate([np.asarray(self.states), np.asarray(self.next_states)])
+        return np.unique(np.stack([passed, np.tile(goals, 2)], axis=1), axis=0)
 
 
 def apart(

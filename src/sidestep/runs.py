@@ -4,7 +4,7 @@
 |----------------|------------------------------------------------------------------------------------------|
 | `map.yaml`, `map.pgm` | the learned map for ROS (`map_server`, mode scale)                                 |
 | `blocked.npy`  | P(blocked) of each cell, row 0 at the top; exactly 0 or 1 where the map knew             |
-| `visited.npy`  | the (state, goal) pairs of the moves that it was learned from                            |
+| `visited.npy`  | the (state, goal) pairs of all that people passed whose walks it was learned from        |
 | `summary.json` | settings, the final objective and its parts, the convergence of every task, time, memory |
 | `learned.png`  | the picture                                                                              |
 """
@@ -32,7 +32,7 @@ class LearnedMap:
 
     - `grid`: geometry and moves, and what was known beforehand.
     - `blocked`: P(blocked), exactly 0 or 1 where the map knew.
-    - `visited`: the (state, goal) pairs of the moves that it was learned from.
+    - `visited`: the (state, goal) pairs of all that people passed whose walks it was learned from.
     - `reward`: what the walkers were taken to pursue.
     """
 
@@ -54,7 +54,7 @@ class LearnedMap:
 
     def robot(self, bump_cost: float = BUMP_COST) -> InModel:
         """Who knows the learned map, and where people walked (see `sidestep.robots`)."""
-        return robot(self.model(), self.visited.reshape(-1), bump_cost)
+        return robot(self.model(), self.visited[:, 0], bump_cost)
 
 
 def write_learned_map(folder: Path, learned: LearnedMap, summary: dict[str, Any]) -> None:

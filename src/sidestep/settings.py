@@ -7,7 +7,7 @@ from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError
@@ -88,21 +88,24 @@ def fit_map(
     resume: bool = False,
     each: Normal | None = None,
     walkers: People | None = None,
+    afresh: bool = True,
 ) -> Fit[ObstacleGrid]:
     """The fit that `settings` describe.
 
-    `each` is the prior of cells' logits and `walkers` are the people, where they are not the settings' own.
+    - `each` is the prior of cells' logits and `walkers` are the people, where they are not the settings' own.
+    - `afresh`: begin where the transitions alone lead, rather than at `model`.
     """
     if not (np.isfinite(settings.memory) and settings.memory > 0):
         raise InputError(f"expected GiB above 0, found {settings.memory}", field="memory")
     walkers = walkers or settings.people()
     prior = _prior_of(settings, model, each)
-    optimiser = optimiser_of(settings, model.graph.states, len(demonstrations))
-    if settings.terms == "both":
+    counted = np.ones(len(demonstrations)) if demonstrations.weight is None else np.asarray(demonstrations.weight)
+    optimiser = optimiser_of(settings, model.graph.states, counted.sum())
+    if afresh and settings.terms == "both":
         # where people walked is known without a solve: begin there
         model = fit(model, demonstrations, walkers, prior=prior, terms=("transitions",)).model
-    if isinstance(optimiser, Resilient):
-        model = _taken_as_blocked(model, demonstrations)
+    if afresh and isinstance(optimiser, Resilient):
+        model = _taken_as_blocked(model, demonstrations, counted > 0)
     return fit(
         model,
         demonstrations,
@@ -131,7 +134,7 @@ _A_MOVE = 1e-3
 """A large map is learned when the next step promises less than this for each of people's moves (nats)."""
 
 
-def optimiser_of(settings: Settings, cells: int, moves: int) -> Optimiser:
+def optimiser_of(settings: Settings, cells: int, moves: float) -> Optimiser:
     """L-BFGS for the exact gradient, `Resilient` for what people do on large maps; ascent for the fixed-policy one.
 
     `docs/design.md` says why. A map is large where solves are loose at first and tasks come in small batches.
@@ -151,13 +154,16 @@ def most_iterations(settings: Settings) -> int:
     return max(optimiser_of(settings, cells, moves=1).iterations for cells in (0, LARGE))
 
 
-def _taken_as_blocked(model: ObstacleGrid, demonstrations: Demonstrations) -> ObstacleGrid:
-    """The model, with all unknown cells that nobody visited as good as blocked.
+def _taken_as_blocked(
+    model: ObstacleGrid, demonstrations: Demonstrations, counted: Bool[np.ndarray, " moves"]
+) -> ObstacleGrid:
+    """The model, with all unknown cells that nobody visited, in moves that count, as good as blocked.
 
     Then nobody could have taken another way, and the prior pulls cells down until people would have. From below it is a
     long climb: of all the gaps in a wall, the likelihood only sees the one that people would take next.
     """
     visited = np.zeros(model.graph.states, dtype=bool)
-    visited[np.asarray(demonstrations.states)] = visited[np.asarray(demonstrations.next_states)] = True
+    for states in (demonstrations.states, demonstrations.next_states):
+        visited[np.asarray(states)[counted]] = True
     unseen = jnp.asarray(~visited & (np.asarray(model.known).ravel() == Cell.UNKNOWN))
     return model.with_parameters(jnp.where(unseen, _CLOSED, model.parameters))

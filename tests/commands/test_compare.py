@@ -1,16 +1,18 @@
 """`sidestep compare`: one table for all methods, from files."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from office import call, write_office
 
 from sidestep.cli import console
+from sidestep.commands import compare
 from sidestep.commands.compare import METHODS
 from sidestep.demonstrations import Demonstrations
 from sidestep.io.demonstrations import demonstrations
-from sidestep.io.maps import read_map
+from sidestep.io.maps import read_map, write_map
 from sidestep.io.walks import read_walks
 from sidestep.settings import Settings, fit_map
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
@@ -53,6 +55,25 @@ def test_every_method_has_every_score(office, compared):
     assert compared["data"]["walks"] == 64
     assert compared["data"]["heldout_walks"] == 16
     assert (office / "compared" / "compare.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_one_method_cannot_do_is_no_reason_to_say_nothing_of_the_others(office, tmp_path, monkeypatch, capsys):
+    """Whose entropy is worth more to them than a step costs never arrive, so there are no costs of cells to find."""
+    monkeypatch.setattr(compare, "METHODS", {name: METHODS[name] for name in ("costs", "behavior")})
+    files = (office / "walks.csv", "--map", office / "half.yaml", "--truth", office / "true.yaml", "--out", tmp_path)
+    assert call("compare", *files, "--discount", 1, "--step-cost", 1, "--beta", 0.5) == 0
+    methods = json.loads((tmp_path / "summary.json").read_text())["methods"]
+    assert methods["costs"]["auc"] is methods["costs"]["seconds"] is None
+    assert methods["costs"]["failed"] in " ".join(capsys.readouterr().err.split())
+    assert np.isfinite(methods["behavior"]["auc"])
+
+
+def test_a_truth_of_another_place_is_refused(office, tmp_path, capsys):
+    shifted = replace(read_map(office / "true.yaml"), origin=(0.0, 2.0, 0.0))
+    write_map(tmp_path / "far.yaml", np.zeros(shifted.shape), shifted)
+    files = (office / "walks.csv", "--map", office / "half.yaml", "--truth", tmp_path / "far.yaml")
+    assert call("compare", *files, "--out", tmp_path / "out") == 1
+    assert "far.yaml, field 'origin'" in capsys.readouterr().err
 
 
 def test_behavior_sees_walls_and_transitions_alone_do_not(compared):

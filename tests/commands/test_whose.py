@@ -6,7 +6,7 @@ import pyarrow.csv
 import pytest
 from office import call, summary, write_office, written
 
-from sidestep.io.maps import read_map
+from sidestep.io.maps import read_map, write_map
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def test_goals_that_walks_do_not_name_are_found_among_candidates(office, tmp_pat
     assert told["candidates"] == 4
     assert told["shares"][3] < 0.1  # nobody had it
     assert all(later >= before - 1e-6 for before, later in zip(told["evidence"], told["evidence"][1:], strict=False))
-    found = pyarrow.csv.read_csv(tmp_path / "out" / "goals.csv")
+    found = pyarrow.csv.read_csv(tmp_path / "out" / "posterior.csv")
     chances = found["probability"].to_numpy().reshape(-1, 4)
     np.testing.assert_allclose(chances.sum(axis=1), 1, atol=1e-9)
     true = dict(zip(table["walk"].to_pylist(), goals.tolist(), strict=True))
@@ -81,6 +81,8 @@ def test_what_cannot_be_is_refused(office, tmp_path, capsys):
     for options, expected in (
         (("--person", "who"), "walks.csv, field 'who': the column is missing"),
         (("--candidates", tmp_path / "none.csv"), "none.csv"),
+        (("--person", "step"), "walks.csv, field 'step': expected a column that says something else"),
+        (("--behavior", "auto", "--tempering", 0.5), "field 'tempering'"),
         (("--candidates", walks, "--person", "who"), "field 'person'"),
         (("--candidates", walks, "--behavior", "auto"), "field 'behavior'"),
         (("--candidates", tmp_path / "two.csv", "--unknown", "lapses"), "field 'unknown'"),
@@ -93,6 +95,16 @@ def test_what_cannot_be_is_refused(office, tmp_path, capsys):
         assert len(lines) == 1
         assert expected in lines[0]
         assert written(tmp_path / "out") == []
+    (tmp_path / "behind.csv").write_text("goal_x,goal_y\n-0.75,2.25\n-0.75,4.25\n")
+    known = np.full((5, 5), 0.5)
+    known[1, :2] = known[0, 2] = 1.0  # the upper left corner is walled off
+    known[0, :2] = 0.0
+    write_map(tmp_path / "corner.yaml", known, read_map(office / "blank.yaml"))
+    walk = tmp_path / "walk.csv"
+    walk.write_text("walk,step,x,y\n0,0,-0.75,2.25\n0,1,-0.25,2.25\n")
+    arguments = ("learn", walk, "--map", tmp_path / "corner.yaml", "--out", tmp_path / "out")
+    assert call(*arguments, "--candidates", tmp_path / "behind.csv") == 1
+    assert "behind.csv, row 2, field 'goal_x, goal_y': expected a place that all can reach" in capsys.readouterr().err
     half = ("learn", walks, "--map", office / "half.yaml", "--out", tmp_path / "out")
     assert call(*half, "--candidates", tmp_path / "wall.csv") == 1
     assert "wall.csv, row 2" in capsys.readouterr().err

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sidestep.demonstrations import Demonstrations
-from sidestep.errors import InputError
+from sidestep.errors import InputError, NotConverged
 from sidestep.inference.calibration import doubtful, effective_share, scores
 from sidestep.inference.priors import Normal
 from sidestep.io.demonstrations import demonstrations_of_moves
@@ -94,8 +94,11 @@ def choose_behavior(
     """The settings with the reward, the β and the tempering that held-out walks speak for; lapses are to be learned.
 
     `prior` is that of cells' logits where it is not the settings' own. Raises `InputError` for fewer than two walks,
-    and as a fit does.
+    for what is chosen here and given too, and as a fit does.
     """
+    for field, given in (("unknown", settings.unknown), ("tempering", settings.tempering != 1)):
+        if given:
+            raise InputError("cannot be given where behavior is chosen by held-out walks", field=field)
     settings = replace(settings, unknown=("lapses",))
     trials: list[Trial] = []
 
@@ -113,7 +116,10 @@ def choose_behavior(
     for _ in range(_DOUBLINGS):
         if not doubtful(found.share, len(gains), _SURELY)[1]:
             break
-        after = tried(replace(found.settings, beta=2 * found.settings.beta))
+        try:
+            after = tried(replace(found.settings, beta=2 * found.settings.beta))
+        except NotConverged:
+            break  # so sharp that values are not found
         if after.nats.sum() <= found.nats.sum():
             break
         found = after
@@ -155,7 +161,7 @@ def _tried(
         report(f"choosing: {kind}, β = {settings.beta:g}, part {fold + 1} of {part.max() + 1}")
         found = fit_map(model, shown.counting(part != fold), settings, each=prior)
         others, people = shown.counting(part == fold), found.people.behavior_of()
-        of_fold = scores(found.model, others, people)
+        of_fold = scores(found.model, others, people, settings.horizon)
         held_out.append(of_fold)
         lapses.append(0.0 if people.lapse is None else float(people.lapse))
         arrived = np.log(np.asarray(transition_probabilities(found.model, others)))[np.asarray(others.weight) > 0]

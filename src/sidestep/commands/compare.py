@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from sidestep.commands.truth import read_truth
 from sidestep.demonstrations import Demonstrations
-from sidestep.errors import InputError
+from sidestep.errors import ImproperTask, InputError, NotConverged
 from sidestep.evaluation import evaluate
 from sidestep.io.demonstrations import demonstrations
 from sidestep.io.files import write_json
@@ -37,6 +38,8 @@ METHODS: Mapping[str, Method] = MappingProxyType(
     }
 )
 """The methods by name: behavior-aware modeling first, then its rivals."""
+_SCORES = ("auc", "average_precision", "legal_share", "regret", "heldout_log_likelihood", "seconds")
+"""What is told of every method, null where it failed."""
 
 
 def compare(
@@ -53,12 +56,12 @@ def compare(
     - `hold_out`: the share of walks, drawn by the settings' seed, that are not learned from. How probable their actions
       are under what was learned, in nats a move, is `heldout_log_likelihood`.
 
-    The summary has `methods.<name>` with the scores of `evaluate`, that, and `seconds`. Raises `InputError` for
+    The summary has `methods.<name>` with the scores of `evaluate`, that, and `seconds`; with nothing but the reason,
+    `failed`, for a method that finds no values. Raises `InputError` for
     files that do not fit, and a share that leaves no walk to learn from or none to score.
     """
-    given, truth = (read_map(file, connectivity=settings.connectivity) for file in (map_file, truth_file))
-    if given.shape != truth.shape or not np.isclose(given.resolution, truth.resolution):
-        raise InputError(f"expected the map's {given.shape} cells of {given.resolution} metres", source=truth_file)
+    given = read_map(map_file, connectivity=settings.connectivity)
+    truth = read_truth(truth_file, given)
     walks = read_walks(walks_file)
     held = round(hold_out * len(walks))
     if not 0 < held < len(walks):
@@ -72,12 +75,16 @@ def compare(
     for name, learn in METHODS.items():
         report(f"learning by {name}")
         started = time.monotonic()
-        learned = learn(given, own, settings)
-        seconds = time.monotonic() - started
-        report(f"scoring {name}")
-        scores = evaluate(
-            learned.planner, learned.ranking, truth, given.known == Cell.UNKNOWN, own.visited(), settings.seed
-        )
+        try:
+            learned = learn(given, own, settings)
+            seconds = time.monotonic() - started
+            report(f"scoring {name}")
+            scored = given.known == Cell.UNKNOWN
+            scores = evaluate(learned.planner, learned.ranking, truth, scored, own.visited(), settings.seed)
+        except (ImproperTask, NotConverged) as error:
+            # what one method cannot do is no reason to say nothing of the others
+            methods[name] = {**dict.fromkeys(_SCORES), "failed": str(error)}
+            continue
         heldout = float(learned.log_policies(others).mean())
         methods[name] = {**scores, "heldout_log_likelihood": heldout, "seconds": round(seconds, 3)}
         pictures.append(_panel(name, learned, given, truth, own))

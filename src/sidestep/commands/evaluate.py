@@ -4,11 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from sidestep.errors import InputError
+from sidestep.commands.truth import read_truth
 from sidestep.evaluation import Report, evaluate, sample_for
-from sidestep.io.maps import read_map
 from sidestep.robots import BUMP_COST
 from sidestep.runs import add_to_summary, read_learned_map
 
@@ -30,23 +27,7 @@ def evaluate_map(
     true map of another size, resolution or origin.
     """
     learned = read_learned_map(folder)
-    truth = read_map(truth_file, connectivity=learned.grid.connectivity)
-    if truth.shape != learned.grid.shape:
-        raise InputError(
-            f"expected the learned map's {learned.grid.shape[0]} × {learned.grid.shape[1]} cells, found "
-            f"{truth.shape[0]} × {truth.shape[1]}",
-            source=truth_file,
-        )
-    if not np.isclose(truth.resolution, learned.grid.resolution):
-        raise InputError(
-            f"expected the learned map's {learned.grid.resolution} metres a cell, found {truth.resolution}",
-            source=truth_file,
-            field="resolution",
-        )
-    if not np.allclose(truth.origin, learned.grid.origin):
-        raise InputError(
-            f"expected the learned map's {learned.grid.origin}, found {truth.origin}", source=truth_file, field="origin"
-        )
+    truth = read_truth(truth_file, learned.grid)
     robot = learned.robot(bump_cost)
     scores = evaluate(robot, learned.blocked, truth, learned.unknown, learned.visited, seed, report)
     limits = {"planned_at_most": sample_for(truth.size)._asdict(), "bump_cost": bump_cost}

@@ -7,14 +7,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 from jaxtyping import Int
+from scipy.sparse.csgraph import connected_components
 
-from sidestep.demonstrations import Trajectory
+from sidestep.demonstrations import Demonstrations, Trajectory
 from sidestep.errors import InputError
 from sidestep.inference.fit import Fit
 from sidestep.inference.goals import GoalFit, fit_goals
 from sidestep.inference.priors import Normal
 from sidestep.io.gridding import Moves
 from sidestep.io.tables import check_columns, finite_column, read_table, write_table
+from sidestep.scoring import walkable_graph
 from sidestep.settings import Settings, fit_map
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid
@@ -54,10 +56,11 @@ _SURELY = 0.9
 """A goal is surely known where its posterior is above this."""
 
 
-def read_candidates(path: Path, grid: Grid) -> Int[np.ndarray, " candidates"]:
+def read_candidates(path: Path, grid: Grid, moves: Moves) -> Int[np.ndarray, " candidates"]:
     """The states of the goals that a table names, in metres: `goal_x`, `goal_y`.
 
-    Raises `InputError`, with the row, for places outside the map or in known obstacles, and for a cell named twice.
+    Raises `InputError`, with the row, for places outside the map, in known obstacles or walled off by these from where
+    some move was made, and for a cell named twice.
     """
     table = read_table(path)
     check_columns(table, ("goal_x", "goal_y"), str(path))
@@ -67,6 +70,8 @@ def read_candidates(path: Path, grid: Grid) -> Int[np.ndarray, " candidates"]:
     _refuse(~grid.contains(places), path, "expected a place on the map")
     states = grid.states(places)
     _refuse(grid.known.reshape(-1)[states] == Cell.OCCUPIED, path, "expected a place outside known obstacles")
+    part = connected_components(walkable_graph(grid.passable()), directed=False)[1]
+    _refuse(~(part[states][:, None] == part[moves.states]).all(axis=1), path, "expected a place that all can reach")
     first = np.unique(states, return_index=True)[1]
     _refuse(~np.isin(np.arange(len(states)), first), path, "expected a cell of its own for every candidate")
     return states
@@ -87,15 +92,13 @@ def fit_candidates(
 ) -> Guessed:
     """The map and the goals that make walks most probable, by expectation maximisation (`sidestep.inference.goals`).
 
-    Raises `InputError` for traits of people that are to be learned too, and as `fit_goals` does.
+    Raises `InputError` as `fit_goals` does.
     """
-    if settings.unknown:
-        raise InputError("expected none, where goals are unknown", field="unknown")
     walks = np.unique(moves.walk)
     tasks = [reach(grid, int(state), discount=settings.discount, step_cost=settings.step_cost) for state in candidates]
 
-    def learn(model: ObstacleGrid, shown: Any) -> Fit[ObstacleGrid]:
-        return fit_map(model, shown, settings, each=prior)
+    def learn(present: ObstacleGrid, shown: Demonstrations) -> Fit[ObstacleGrid]:
+        return fit_map(present, shown, settings, each=prior, afresh=present is model)
 
     found = fit_goals(model, trajectories_of_moves(moves), tasks, settings.behavior(), learn)
     goals = moves.goals.copy()

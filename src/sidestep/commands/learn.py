@@ -52,10 +52,10 @@ def learn(
     """
     started = time.monotonic()
     grid = read_map(map_file, connectivity=settings.connectivity)
-    shown = _sampled(read_walks(walks), settings)
+    whose.check(settings, choosing is not None, resume)
+    shown = whose.nameless(_sampled(read_walks(walks), settings))
     moves = grid_walks(shown, grid)
     known = known_by(sensor, grid, Normal(settings.prior_mean, settings.prior_variance))
-    whose.check(choosing is not None, resume)
     choice = choose_behavior(grid, moves, settings, known.prior, choosing) if choosing else None
     settings = choice.settings if choice else settings
     checkpoint = folder / "fit.checkpoint"

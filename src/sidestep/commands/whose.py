@@ -30,16 +30,29 @@ class Whose:
     person: str | None = None
     candidates: Path | None = None
 
-    def check(self, choosing: bool, resume: bool) -> None:
+    def check(self, settings: Settings, choosing: bool, resume: bool) -> None:
         """Raises `InputError` for what does not go together.
 
-        Where goals are unknown, people are taken to be known and alike, and nothing is kept to resume from.
+        Where goals are unknown, people are taken to be known and alike and to look all the way ahead, and nothing is
+        kept to resume from.
         """
         if self.candidates is None:
             return
-        for given, field in ((self.person is not None, "person"), (choosing, "behavior"), (resume, "resume")):
+        refused = {
+            "person": self.person is not None,
+            "behavior": choosing,
+            "resume": resume,
+            "unknown": bool(settings.unknown),
+            "tempering": settings.tempering != 1,
+            "horizon": settings.horizon is not None,
+        }
+        for field, given in refused.items():
             if given:
                 raise InputError("cannot be had together with candidates for goals", field=field)
+
+    def nameless(self, walks: Walks) -> Walks:
+        """The walks, without goals of their own where these are to be found among candidates: each ends at its last."""
+        return walks if self.candidates is None else replace(walks, goals=walks.positions[walks.offsets[1:] - 1])
 
 
 ALIKE = Whose()
@@ -67,11 +80,11 @@ def fit_walks(
 ) -> Found:
     """The fit of a map to walks, by whoever they are and whatever they were after.
 
-    `moves` are those of `walks`; `how` is for `fit_map`. Where goals are unknown, writes `goals.csv` to the folder.
+    `moves` are those of `walks`; `how` is for `fit_map`. Where goals are unknown, writes `posterior.csv` to the folder.
     """
     if whose.candidates is not None:
-        guessed = fit_candidates(model, grid, moves, read_candidates(whose.candidates, grid), settings, prior)
-        write_posterior(folder / "goals.csv", guessed, walks.labels, grid)
+        guessed = fit_candidates(model, grid, moves, read_candidates(whose.candidates, grid, moves), settings, prior)
+        write_posterior(folder / "posterior.csv", guessed, walks.labels, grid)
         return Found(guessed.fit, _demonstrations(guessed.moves, grid, settings), {"goals": guessed.told()})
     demonstrations = _demonstrations(moves, grid, settings)
     if whose.person is None:
@@ -80,7 +93,7 @@ def fit_walks(
     names = [said[walk] for walk in np.unique(moves.walk[pursuing_moves(moves)]).tolist()]
     persons = list(dict.fromkeys(names))
     demonstrations, person = apart(demonstrations, np.array([persons.index(name) for name in names]))
-    settings = replace(settings, unknown=tuple({*settings.unknown, "sharpness"}))
+    settings = replace(settings, unknown=tuple(dict.fromkeys((*settings.unknown, "sharpness"))))
     found = fit_map(model, demonstrations, settings, each=prior, walkers=settings.people(person), **how)
     betas = {str(name): float(found.people.behavior_of(index).beta) for index, name in enumerate(persons)}
     return Found(found, demonstrations, {"persons": betas})

@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sidestep.demonstrations import Demonstrations
+from sidestep.errors import NotConverged
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.likelihood import visited_action_values
 from sidestep.tabular.models import TransitionModel
@@ -40,10 +41,17 @@ class Scores(NamedTuple):
     trajectory: Int[np.ndarray, " moves"]
 
 
-def scores(model: TransitionModel, demonstrations: Demonstrations, behavior: Behavior) -> Scores:
-    """The scores of the moves whose weight is not 0, under a model that should not have been learned from them."""
-    values = solve(model, demonstrations.tasks, behavior).values
-    q = visited_action_values(model, demonstrations.tasks, values, demonstrations.task, demonstrations.states)
+def scores(
+    model: TransitionModel, demonstrations: Demonstrations, behavior: Behavior, horizon: int | None = None
+) -> Scores:
+    """The scores of the moves whose weight is not 0, under a model that should not have been learned from them.
+
+    `horizon`: how many actions people look ahead, as in `solve`. Raises `NotConverged` if values are not found.
+    """
+    solution = solve(model, demonstrations.tasks, behavior, horizon=horizon)
+    if not bool(solution.converged.all()):
+        raise NotConverged("the values of a task were not found: a smaller β may help")
+    q = visited_action_values(model, demonstrations.tasks, solution.values, demonstrations.task, demonstrations.states)
     log_policy, by_log_beta = jax.jvp(
         lambda log_beta: Behavior(behavior.backup, jnp.exp(log_beta), behavior.lapse).log_policy(q),
         (jnp.log(behavior.beta),),

@@ -9,8 +9,9 @@ and the posterior over what it was after is its share of the sum,
     P(g | walk i) ∝ p_g Π_t π_θ,g(a_t | s_t).
 
 Expectation maximisation takes turns: the posterior under the present model; then shares p_g, the mean posterior, and a
-fit in which every walk is a demonstration of every candidate, weighted by its posterior. L and the prior never fall. A
-walk that goes on after it has reached a candidate was not after that one; where it stops elsewhere, it was cut short.
+fit in which every walk is a demonstration of every candidate, weighted by its posterior. Where each fit begins at the
+model before, L and the prior never fall. A walk that goes on after it has reached a candidate was not after that one;
+where it stops elsewhere, it was cut short.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,7 +24,7 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Float
 
 from sidestep.demonstrations import Demonstrations, Trajectory, flat_moves, gather
-from sidestep.errors import InputError, check_count
+from sidestep.errors import InputError, NotConverged, check_count
 from sidestep.inference.fit import Fit, Model
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.likelihood import log_policies
@@ -57,7 +58,8 @@ def goal_posterior(
 
     - `walks`: their tasks do not matter. `shares`: p_g, by default all alike.
 
-    Raises `InputError` for a walk that could not have been after any of the candidates, and as `gather` does.
+    Raises `InputError` for a walk that could not have been after any of the candidates, and as `gather` does;
+    `NotConverged` where a candidate's values are not found.
     """
     if shares is None:
         shares = np.full(len(candidates), 1 / len(candidates))
@@ -135,5 +137,7 @@ def _if_after(
         stack_tasks([task]),
     )
     each = np.asarray(log_policies(model, moves, behavior))
+    if np.isnan(each).any():
+        raise NotConverged("the values of a candidate's task were not found: a smaller β may help")
     ended = np.asarray(task.terminal)[np.asarray(moves.states)]
     return np.bincount(np.asarray(moves.trajectory), np.where(ended, -np.inf, each), minlength=len(walks))

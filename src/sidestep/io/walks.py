@@ -73,6 +73,8 @@ class Walks:
 
         Raises `InputError` where there is no such column, nothing in it, or not the same in all rows of a walk.
         """
+        if column in _REQUIRED + _OPTIONAL:
+            raise InputError("expected a column that says something else of walks", source=self.source, field=column)
         check_columns(self.metadata, (column,), self.source)
         said = self.metadata[column].to_pylist()
         for row, first in enumerate(np.repeat(self.offsets[:-1], np.diff(self.offsets)).tolist()):
