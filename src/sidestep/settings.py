@@ -100,7 +100,7 @@ def fit_map(
     walkers = walkers or settings.people()
     prior = _prior_of(settings, model, each)
     counted = np.ones(len(demonstrations)) if demonstrations.weight is None else np.asarray(demonstrations.weight)
-    optimiser = optimiser_of(settings, model.graph.states, counted.sum())
+    optimiser = optimiser_of(settings, model.graph.states, round(float(counted.sum())))
     if afresh and settings.terms == "both":
         # where people walked is known without a solve: begin there
         model = fit(model, demonstrations, walkers, prior=prior, terms=("transitions",)).model
@@ -134,7 +134,7 @@ _A_MOVE = 1e-3
 """A large map is learned when the next step promises less than this for each of people's moves (nats)."""
 
 
-def optimiser_of(settings: Settings, cells: int, moves: float) -> Optimiser:
+def optimiser_of(settings: Settings, cells: int, moves: int) -> Optimiser:
     """L-BFGS for the exact gradient, `Resilient` for what people do on large maps; ascent for the fixed-policy one.
 
     `docs/design.md` says why. A map is large where solves are loose at first and tasks come in small batches.
