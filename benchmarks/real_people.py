@@ -3,13 +3,13 @@
     python benchmarks/real_people.py
     python benchmarks/real_people.py --set beta=5 prior_mean=-2
     python benchmarks/real_people.py --behavior auto
-    python benchmarks/real_people.py --animal rats --json rats.json
+    python benchmarks/real_people.py --animal rats --trials 1 4 --json rats.json
 
 Tartarus (de Cothi et al. 2022): twelve mazes of 10×10 cells of which the learner is told nothing. The layout is learned
-over trials 1–10, so trials 5–10 are the purposeful ones. Of these, N walks are drawn by seed without replacement (all
-of them where there are no more), a map is learned with the defaults of `sidestep learn`, and all cells are scored
-against the truth, beside the ranking of cells by how rarely the same walks visit them. Scores are averaged over the
-seeds of a maze, then over mazes.
+over trials 1–10, so trials 5–10 are the purposeful ones (`--trials 1 4`: the others). Of these, N walks are drawn by
+seed without replacement (all of them where there are no more), a map is learned with the defaults of `sidestep learn`,
+and all cells are scored against the truth, beside the ranking of cells by how rarely the same walks visit them. Scores
+are averaged over the seeds of a maze, then over mazes.
 """
 
 import argparse
@@ -48,7 +48,7 @@ SCORES = ("auc", "average_precision", "auc_relevant", "average_precision_relevan
 
 @dataclass(frozen=True)
 class Maze:
-    """A maze, what the learner is told of it, and the purposeful walks in it."""
+    """A maze, what the learner is told of it, and walks in it."""
 
     name: str
     blank: Grid
@@ -56,12 +56,15 @@ class Maze:
     walks: Walks
 
 
-def read_maze(folder: Path, animal: str, settings: Settings) -> Maze:
-    """The maze in a folder; raises `InputError` for missing files and walks without numbers of trials."""
+def read_maze(folder: Path, animal: str, settings: Settings, trials: Sequence[int] = TRIALS) -> Maze:
+    """The maze in a folder, with the walks from the first to the last of some trials.
+
+    Raises `InputError` for missing files and walks without numbers of trials.
+    """
     source = folder / f"{animal}.csv"
     walks = read_walks(source)
     trial = np.asarray(walks.of_each("trial"))
-    first, last = TRIALS
+    first, last = trials
     return Maze(
         folder.name,
         read_map(folder / "blank.yaml", connectivity=settings.connectivity),
@@ -160,6 +163,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--walks", type=int, nargs="+", default=[10, 40, 150], metavar="N", help="how many to draw")
     parser.add_argument("--seeds", type=int, default=3, help="how many draws")
     parser.add_argument("--animal", choices=("humans", "rats"), default="humans")
+    parser.add_argument("--trials", type=int, nargs=2, default=list(TRIALS), metavar=("FIRST", "LAST"))
     parser.add_argument("--behavior", choices=("given", "auto"), default="given", help="as for `sidestep learn`")
     add_set_option(parser, Settings, OWN)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the means and every record")
@@ -180,11 +184,12 @@ def run(arguments: argparse.Namespace) -> None:
         raise InputError(
             "expected folders maze_01, maze_02, …; give the right folder with --data", source=arguments.data
         )
-    mazes = [read_maze(folder, arguments.animal, chosen) for folder in folders]
+    mazes = [read_maze(folder, arguments.animal, chosen, arguments.trials) for folder in folders]
     auto = arguments.behavior == "auto"
     records = measure(mazes, arguments.walks, arguments.seeds, chosen, auto)
     rows = summarise(records, arguments.walks)
-    people = f"{arguments.animal}, behavior {arguments.behavior}"
+    first, last = arguments.trials
+    people = f"{arguments.animal}, trials {first}–{last}, behavior {arguments.behavior}"
     print_summary(rows, f"{people}, {len(mazes)} mazes, {described(chosen)}")
     if not all(row["converged"] for row in rows):
         Console(stderr=True).print("warning: some fits have not converged; see the records")
