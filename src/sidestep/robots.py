@@ -25,7 +25,7 @@ from sidestep.tabular.models import ObstacleGrid
 from sidestep.tasks import Task, reach
 
 BUMP_COST = 40.0
-"""What a bump costs beside the move itself, in cell sides: a long way around; `docs/rivals.md` says what less does."""
+"""What a bump costs beside the move itself, in cell sides: a long way around."""
 
 
 def robot(
