@@ -84,7 +84,10 @@ def test_the_history_tells_the_objective_and_its_parts(name):
 
 @pytest.mark.parametrize("name", CLIMBING)
 def test_lbfgs_rises_at_every_iteration(name):
-    assert (np.diff([progress.objective for progress in fitted(name).history]) > 0).all()
+    objective = np.array([progress.objective for progress in fitted(name).history])
+    # the values of hundreds of moves are each known to the solver's tolerance, and no better is their sum
+    assert (np.diff(objective) > -1e-7).all()
+    assert objective[-1] > objective[0]
 
 
 @pytest.mark.parametrize("name", SMOOTH)
