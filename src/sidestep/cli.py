@@ -1,26 +1,12 @@
-"""The command line: it parses, calls `sidestep.commands` and `sidestep.experiments`, and prints."""
+"""The command line: it parses, calls `sidestep.commands` and `sidestep.experiments`, and has `terminal` print."""
 
 import os
-import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import jax
 import typer
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-from rich.table import Table
 
 from sidestep.commands.compare import compare
 from sidestep.commands.evaluate import evaluate_map
@@ -33,9 +19,9 @@ from sidestep.errors import SidestepError
 from sidestep.experiments import motivation, pendulum, representations, room
 from sidestep.experiments.demo import demo
 from sidestep.experiments.reproduce import reproduce
-from sidestep.inference.climb import Progress as FitProgress
 from sidestep.robots import BUMP_COST
 from sidestep.settings import Settings, Terms, most_iterations
+from sidestep.terminal import console, errors, fitting, print_scores, print_table, stages, working
 
 app = typer.Typer(
     help="Learn the obstacles that nobody touched from the walks of people who knew them.",
@@ -44,8 +30,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-console = Console(highlight=False, width=None if sys.stdout.isatty() else 140)
-errors = Console(stderr=True, highlight=False)
 
 BackupName = Literal["boltzmann", "max", "logsumexp", "mellowmax"]
 EXPERIMENTS = {
@@ -72,23 +56,23 @@ StepCost = Annotated[
 @app.command(name="demo", epilog="Example: sidestep demo --out demo")
 def demo_command(out: Folder = Path("sidestep-demo"), seed: Seed = 0) -> None:
     """An office nobody mapped: simulate walkers, forget the map, learn it, plan to new goals, draw it all."""
-    with _working("simulating, learning, planning") as say:
+    with working("simulating, learning, planning") as say:
         summary = demo(out, seed, report=say)
-    _print_scores({"learned map": summary["scores"]})
+    print_scores({"learned map": summary["scores"]})
     console.print(f"pictures and numbers in {out}")
 
 
 @app.command(name="reproduce", epilog="Example: sidestep reproduce --out figures")
 def reproduce_command(out: Folder = Path("sidestep-reproduce"), seed: Seed = 0) -> None:
     """The paper's figures 1-4 as PNG, and the numbers behind them."""
-    with _working("starting") as say:
+    with working("starting") as say:
         summary = reproduce(out, seed, report=say)
     rows = {
         f"{name} {variant}": scores
         for name, variants in summary["maps"].items()
         for variant, scores in variants.items()
     }
-    _print_scores(rows)
+    print_scores(rows)
     console.print(f"figures and numbers in {out}")
 
 
@@ -106,7 +90,7 @@ def experiment_command(
 ) -> None:
     """Experiments beyond the paper's figures: a picture and summary.json."""
     out = out or Path(f"sidestep-{name}")
-    with _working("starting") as say:
+    with working("starting") as say:
         summary = EXPERIMENTS[name](out, seed, say)
     for key, value in summary.items():
         if isinstance(value, int | float | str) and key != "command":
@@ -206,7 +190,7 @@ def learn_command(
         seed=seed,
     )
     sensor = None if sensor_map is None else Sensor(sensor_map, _number_or_file(sensor_variance))
-    with _fitting(most_iterations(settings)) as (report, say):
+    with fitting(most_iterations(settings)) as (report, say):
         choosing = say if behavior == "auto" else None
         summary = learn(walks, map_file, out, settings, report, resume, sensor, choosing, Whose(person, candidates))
     data = summary["data"]
@@ -260,9 +244,9 @@ def evaluate_command(
     bump_cost: BumpCost = BUMP_COST,
 ) -> None:
     """AUC, average precision, recall, and how legal and how long the planned paths are."""
-    with _stages() as report:
+    with stages() as report:
         scores = evaluate_map(folder, truth, out, seed, report, bump_cost)
-    _print_scores({str(folder): scores})
+    print_scores({str(folder): scores})
 
 
 @app.command(
@@ -290,7 +274,7 @@ def compare_command(
         connectivity=4 if connectivity == "4" else 8,
         seed=seed,
     )
-    with _working("starting") as say:
+    with working("starting") as say:
         summary = compare(walks, map_file, truth, out, settings, hold_out, say)
     columns = {
         "auc": "AUC",
@@ -302,7 +286,7 @@ def compare_command(
         "heldout_log_likelihood": "held-out\nnats a move",
         "seconds": "seconds",
     }
-    _print_table(summary["methods"], columns)
+    print_table(summary["methods"], columns)
     for name, scores in summary["methods"].items():
         if "failed" in scores:
             errors.print(f"note: nothing by {name}: {scores['failed']}", markup=False, soft_wrap=True)
@@ -327,7 +311,7 @@ def simulate_command(
     """Walkers on a known map."""
     four_or_eight = 4 if connectivity == "4" else 8
     walkers = Walkers(walks, goals, beta, backup, discount, step_cost, four_or_eight, seed)
-    with _working("walking"):
+    with working("walking"):
         summary = simulate_walks(map_file, out, walkers)
     console.print(f"{walks} walks, {summary['moves']} moves, in {out}")
 
@@ -372,84 +356,3 @@ def _number_or_file(text: str) -> float | Path:
         return float(text)
     except ValueError:
         return Path(text)
-
-
-@contextmanager
-def _working(text: str) -> Iterator[Callable[[str], None]]:
-    """A spinner on a terminal, with a text that can be changed."""
-    with errors.status(text) as status:
-        yield status.update
-
-
-@contextmanager
-def _fitting(iterations: int) -> Iterator[tuple[Callable[[FitProgress], None], Callable[[str], None]]]:
-    """A progress bar on a terminal for a fit of at most `iterations`, how long these would take, and what comes before.
-
-    When a fit converges cannot be known; so the time is the longest that is left, at the pace of the last ten minutes.
-    """
-    columns = (
-        TextColumn("learning"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("at most"),
-        TimeRemainingColumn(),
-        TextColumn("left; {task.fields[state]}"),
-    )
-    with Progress(*columns, console=errors, transient=True, speed_estimate_period=600) as bar:
-        task = bar.add_task("learning", total=iterations, state="compiling")
-
-        def report(progress: FitProgress) -> None:
-            state = f"objective {progress.objective:.3f}, largest gradient {progress.gradient:.2g}"
-            bar.update(task, completed=progress.iteration, state=state)
-
-        yield report, lambda text: bar.update(task, state=text)
-
-
-@contextmanager
-def _stages() -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar on a terminal for each stage of a work, with the time that is left of it.
-
-    How much a later stage has to do is known when it begins; so no time is told for the whole.
-    """
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("left"),
-    )
-    with Progress(*columns, console=errors, transient=True, speed_estimate_period=600) as bar:
-        begun: dict[str, TaskID] = {}
-
-        def report(stage: str, done: int, of: int) -> None:
-            if stage not in begun:
-                begun[stage] = bar.add_task(stage, total=of)
-            bar.update(begun[stage], completed=done)
-
-        yield report
-
-
-def _print_scores(rows: Mapping[str, Mapping[str, Any]]) -> None:
-    columns = {
-        "auc": "AUC",
-        "average_precision": "average\nprecision",
-        "auc_relevant": "AUC of those\nthat matter",
-        "recall": "recall",
-        "mean_obstacle": "mean on\nobstacles",
-        "mean_free": "mean on\nfree cells",
-        "max_probability": "highest",
-        "legal_share": "legal\npaths",
-        "excess_length": "excess\nlength",
-        "regret": "regret",
-    }
-    _print_table(rows, columns)
-
-
-def _print_table(rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> None:
-    table = Table("", *columns.values())
-    for name, scores in rows.items():
-        cells = (scores.get(key) for key in columns)
-        table.add_row(name, *("–" if number is None else f"{number:.3f}" for number in cells))
-    console.print(table)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from office import call, write_office
 
-from sidestep.cli import console
 from sidestep.commands import compare
 from sidestep.commands.compare import METHODS
 from sidestep.demonstrations import Demonstrations
@@ -18,6 +17,7 @@ from sidestep.settings import Settings, fit_map
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import ObstacleGrid
+from sidestep.terminal import console
 
 
 @pytest.fixture(scope="module")
