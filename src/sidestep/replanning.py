@@ -94,6 +94,13 @@ def lengths_by_policy(
 
 
 @compiled()
+def _hit(world, here, action):  # pragma: no cover
+    """The cells that a robot bumps into where it takes an action; none where it gets through."""
+    needed = world.needed[here, action]
+    return needed[world.walls[needed]]
+
+
+@compiled()
 def _walked_by(policy, ranked, world, goal, start):  # pragma: no cover
     """How far the robot goes from the start to the goal by the actions' rank in each state."""
     here, length, since_a_bump = start, 0.0, 0
@@ -108,12 +115,9 @@ def _walked_by(policy, ranked, world, goal, start):  # pragma: no cover
             return np.inf
         length += world.lengths[action]
         since_a_bump += 1
-        bumped = False
-        for cell in world.needed[here, action]:
-            if world.walls[cell]:
-                found[cell] = True
-                bumped = True
-        if bumped:
+        hit = _hit(world, here, action)
+        found[hit] = True
+        if len(hit):
             since_a_bump = 0
         else:
             here = world.needed[here, action, 0]
@@ -134,12 +138,10 @@ def _walked(world, mind, start):  # pragma: no cover
             return np.inf
         length += world.lengths[action]
         since_a_bump += 1
-        bumped = False
-        for cell in world.needed[here, action]:
-            if world.walls[cell]:
-                _close(mind, world.needed, cell, stale)
-                bumped = True
-        if bumped:
+        hit = _hit(world, here, action)
+        for cell in hit:
+            _close(mind, world.needed, cell, stale)
+        if len(hit):
             since_a_bump = 0
         else:
             here = world.needed[here, action, 0]
