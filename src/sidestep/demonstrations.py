@@ -59,11 +59,15 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         weight = np.asarray(trajectories, dtype=np.float64)[np.asarray(self.trajectory)]
         return eqx.tree_at(lambda demos: demos.weight, self, jnp.asarray(weight), is_leaf=lambda leaf: leaf is None)
 
+    def firsts(self) -> Int[np.ndarray, " trajectories"]:
+        """The index of the first move of each trajectory."""
+        return np.flatnonzero(np.diff(np.asarray(self.trajectory), prepend=-1))
+
     def paths(self) -> list[Shaped[np.ndarray, "_ *state"]]:
         """The states along each trajectory, the last one included."""
-        starts = np.flatnonzero(np.diff(np.asarray(self.trajectory))) + 1
+        cuts = self.firsts()[1:]
         states, ends = np.asarray(self.states), np.asarray(self.next_states)
-        pieces = zip(np.split(states, starts), np.split(ends, starts), strict=True)
+        pieces = zip(np.split(states, cuts), np.split(ends, cuts), strict=True)
         return [np.concatenate([piece, end[-1:]]) for piece, end in pieces]
 
     def visited(self: "Demonstrations[Task]") -> Int[np.ndarray, "visits 2"]:

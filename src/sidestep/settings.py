@@ -16,7 +16,7 @@ from sidestep.inference.climb import Progress
 from sidestep.inference.fit import Fit, fit
 from sidestep.inference.objective import MEMORY
 from sidestep.inference.optimisers import LBFGS, Ascent, Optimiser, Resilient
-from sidestep.inference.priors import Lines, Normal, Prior
+from sidestep.inference.priors import Lines, Normal, Prior, Stood
 from sidestep.tabular.backups import BACKUPS, Behavior, Gradient
 from sidestep.tabular.grid import Cell, Connectivity
 from sidestep.tabular.likelihood import Term
@@ -90,7 +90,7 @@ def fit_map(
     walkers: People | None = None,
     afresh: bool = True,
 ) -> Fit[ObstacleGrid]:
-    """The fit that `settings` describe.
+    """The fit that `settings` describe. Where transitions count, so do the cells in which walks begin (`Stood`).
 
     - `each` is the prior of cells' logits and `walkers` are the people, where they are not the settings' own.
     - `afresh`: begin where the transitions alone lead, rather than at `model`.
@@ -98,8 +98,11 @@ def fit_map(
     if not (np.isfinite(settings.memory) and settings.memory > 0):
         raise InputError(f"expected GiB above 0, found {settings.memory}", field="memory")
     walkers = walkers or settings.people()
-    prior = _prior_of(settings, model, each)
     counted = np.ones(len(demonstrations)) if demonstrations.weight is None else np.asarray(demonstrations.weight)
+    prior = _prior_of(settings, model, each)
+    if settings.terms != "actions":
+        first = demonstrations.firsts()
+        prior = Stood(prior, demonstrations.states[first], jnp.asarray(counted[first]))
     optimiser = optimiser_of(settings, model.graph.states, round(float(counted.sum())))
     if afresh and settings.terms == "both":
         # where people walked is known without a solve: begin there

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -12,7 +13,7 @@ from sidestep.domains.offices import office
 from sidestep.inference import batches, climb, objective
 from sidestep.inference.fit import fit
 from sidestep.inference.optimisers import LBFGS, Ascent, Resilient
-from sidestep.inference.priors import Normal
+from sidestep.inference.priors import Normal, Stood
 from sidestep.scoring import relevant_obstacles, score_map, visit_ranking
 from sidestep.settings import Settings, fit_map
 from sidestep.tabular.backups import Behavior, LogSumExp
@@ -103,11 +104,18 @@ def test_it_ends_where_a_search_along_the_gradient_does(demonstrations, monkeypa
     assert from_above.final.objective > by_search.final.objective - 5e-3 * len(demonstrations)
 
 
+def by_transitions(grid, demonstrations):
+    """Where the transitions alone lead, and where walks begin."""
+    begins = demonstrations.states[demonstrations.firsts()]
+    prior = Stood(Normal(0.5, 8.0), begins, jnp.ones(len(begins)))
+    people = Behavior(LogSumExp(), 5.0)
+    return fit(ObstacleGrid(grid, 0.5), demonstrations, people, prior=prior, terms=("transitions",)).final
+
+
 @pytest.mark.usefixtures("everything_is_large")
 def test_the_climb_begins_with_cells_that_nobody_visited_taken_as_blocked(demonstrations):
     start = fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, SETTINGS).history[0]
-    prior, people = Normal(0.5, 8.0), Behavior(LogSumExp(), 5.0)
-    by_walks = fit(ObstacleGrid(UNKNOWN, 0.5), demonstrations, people, prior=prior, terms=("transitions",)).final
+    by_walks = by_transitions(UNKNOWN, demonstrations)
     unseen = TRUTH.size - len(np.unique([*demonstrations.states, *demonstrations.next_states]))
     # P(blocked) = σ(8), 7.5 from the prior's mean
     assert start.prior == pytest.approx(by_walks.prior - 7.5**2 / 8 * unseen)
@@ -120,8 +128,7 @@ def test_what_the_map_knows_is_left_alone(demonstrations):
     start = fit_map(ObstacleGrid(half, 0.5), demonstrations, replace(SETTINGS, iterations=1)).history[0]
     visited = np.unique([*demonstrations.states, *demonstrations.next_states])
     unseen = np.setdiff1d(np.flatnonzero(half.known == -1), visited)
-    prior, people = Normal(0.5, 8.0), Behavior(LogSumExp(), 5.0)
-    by_walks = fit(ObstacleGrid(half, 0.5), demonstrations, people, prior=prior, terms=("transitions",)).final
+    by_walks = by_transitions(half, demonstrations)
     assert start.prior == pytest.approx(by_walks.prior - 7.5**2 / 8 * len(unseen))
 
 

@@ -41,23 +41,23 @@ def learn(office, out, *options):
     return call("learn", office / "walks.csv", "--map", office / "blank.yaml", "--out", out, *NORMAL, *options)
 
 
-def entered(office):
-    """How often each cell was moved into."""
+def passed(office):
+    """How often somebody came into each cell or set out from it."""
     table = pyarrow.csv.read_csv(office / "walks.csv")
     grid = read_map(office / "blank.yaml")
     states = grid.states(np.stack([table["x"].to_numpy(), table["y"].to_numpy()], axis=1))
-    return np.bincount(states[table["step"].to_numpy() > 0], minlength=25).reshape(5, 5)
+    return np.bincount(states, minlength=25).reshape(5, 5)
 
 
 def posterior(times, mean, variance):
-    """P(blocked) of a cell that was entered so often: where −n σ(θ) − 2 (θ − b)/a is 0."""
+    """P(blocked) of a cell that was passed so often: where −n σ(θ) − 2 (θ − b)/a is 0."""
     return expit(brentq(lambda logit: times * expit(logit) + 2 * (logit - mean) / variance, -50, 50))
 
 
 def test_where_nobody_went_the_posterior_is_the_map(office, tmp_path):
-    """By transitions alone, which say nothing of cells that nobody entered, and elsewhere only how often."""
+    """By transitions alone, which say nothing of cells that nobody passed, and elsewhere only how often."""
     assert learn(office, tmp_path, "--terms", "transitions", "--sensor-map", office / "seen.yaml") == 0
-    blocked, times = np.load(tmp_path / "blocked.npy"), entered(office)
+    blocked, times = np.load(tmp_path / "blocked.npy"), passed(office)
     np.testing.assert_allclose(blocked[WALL], SEEN[WALL], atol=1e-6)
     expected = [posterior(n, logit(p), 1.0) for n, p in zip(times[~WALL], SEEN[~WALL], strict=True)]
     np.testing.assert_allclose(blocked[~WALL], expected, atol=1e-4)
@@ -76,7 +76,7 @@ def test_how_surely_each_cell_is_known(office, tmp_path):
     assert learn(office, tmp_path / "out", "--terms", "transitions", *options) == 0
     seen = np.isfinite(variance)
     means, variances = np.where(seen, logit(SEEN), 0.5), np.where(seen, variance, 8.0)
-    expected = [posterior(*each) for each in zip(entered(office).flat, means.flat, variances.flat, strict=True)]
+    expected = [posterior(*each) for each in zip(passed(office).flat, means.flat, variances.flat, strict=True)]
     np.testing.assert_allclose(np.load(tmp_path / "out" / "blocked.npy").ravel(), expected, atol=1e-4)
     told = summary(tmp_path / "out")
     assert told["data"]["sensed_cells"] == seen.sum() == 17

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sidestep.errors import InputError
-from sidestep.inference.priors import NEAREST, Lines, Normal, Smooth, sensed
+from sidestep.inference.priors import NEAREST, Lines, Normal, Smooth, Stood, sensed
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import borders
 
@@ -77,6 +77,14 @@ def test_a_gap_in_a_wall_is_more_probably_wall():
     chance = 1 / (1 + np.exp(-0.5))
     np.testing.assert_allclose(slope[1, 1], 3 * chance * (1 - chance), rtol=1e-9)
     assert (np.delete(np.asarray(slope).ravel(), 4) == 0).all()
+
+
+def test_who_stands_somewhere_counts_as_much_as_a_move_into_the_cell():
+    theta = jnp.asarray([3.0, 0.5, 7.0, -1.0])
+    prior = Stood(EACH, jnp.asarray([1, 3, 1, 2]), jnp.asarray([1.0, 0.5, 1.0, 0.0]))
+    free = 1 / (1 + np.exp(np.asarray(theta)))
+    expected = 2 * np.log(free[1]) + 0.5 * np.log(free[3])
+    assert float(prior.log_density(theta) - EACH.log_density(theta)) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("strength", [-1.0, np.nan, np.inf])

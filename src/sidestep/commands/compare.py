@@ -108,7 +108,7 @@ def _panel(name: str, learned: Lesson, given: Grid, truth: Grid, shown: Demonstr
     if learned.shares is not None:
         return Panel(name, given, learned.shares, truth)
     goals = np.asarray(shown.tasks.terminal).argmax(axis=-1)
-    first = np.flatnonzero(np.diff(np.asarray(shown.trajectory), prepend=-1))
+    first = shown.firsts()
     ends = np.unique(np.stack([np.asarray(shown.states)[first], goals[np.asarray(shown.task)[first]]]), axis=1)
     paths = [
         path

@@ -164,7 +164,7 @@ def run(folder: Path, seed: int = 0, report: Report = lambda _: None) -> dict[st
 
 def tasks_of(demonstrations: Demonstrations) -> Int[np.ndarray, " trajectories"]:
     """The task of each trajectory."""
-    first = np.flatnonzero(np.diff(np.asarray(demonstrations.trajectory), prepend=-1))
+    first = demonstrations.firsts()
     return np.asarray(demonstrations.task)[first]
 
 

@@ -4,10 +4,12 @@
 
     Smooth:  − s Σ_{i~j} (θ_i − θ_j)²                                  over pairs of neighbours
     Lines:   + s Σ_c p_c [1 − (1 − p_left p_right)(1 − p_up p_down)]   over cells, p = P(blocked)
+    Stood:   + Σ_i ln(1 − p_{c_i})                                     over cells that somebody was seen to stand in
 
 The first is a Gaussian Markov random field. The second says that walls are lines: a blocked cell is more probable
 between two others, in a row or in a column. So a gap one cell wide in a long wall, of which behavior says nothing, is
-taken for wall.
+taken for wall. The third is evidence rather than prior knowledge, but of cells and not of moves: the likelihood of
+demonstrations is that of moves, given where they begin. That somebody stood there counts as much as a move into it.
 """
 
 import abc
@@ -138,6 +140,24 @@ class Lines(Prior):
         along = around[:-2, 1:-1] * around[2:, 1:-1]
         lines = jnp.sum(blocked * (1 - (1 - across) * (1 - along)))
         return self.each.log_density(parameters) + self.strength.astype(parameters.dtype) * lines
+
+
+class Stood(Prior):
+    """Who stands in a cell shows that it is free, and so do those whose walks begin there.
+
+    - `other`: what else is known of the cells' logits.
+    - `cells`: the cell of each observation; the same one may come several times.
+    - `weight`: how much each observation counts, 0 or more.
+    """
+
+    other: Prior
+    cells: Int[Array, " observations"]
+    weight: Float[Array, " observations"]
+
+    def log_density(self, parameters: Float[Array, " cells"]) -> Float[Array, ""]:
+        """That of the other, and Σ w ln(1 − p)."""
+        free = jax.nn.log_sigmoid(-parameters[self.cells])
+        return self.other.log_density(parameters) + self.weight.astype(free.dtype) @ free
 
 
 def _strength(strength: float) -> Float[Array, ""]:

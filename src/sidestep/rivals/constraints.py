@@ -73,7 +73,7 @@ def _people(grid: Grid, forbidden: list[int], demonstrations: Demonstrations, se
     model = true_model(replace(grid, known=known))
     visits, total = np.zeros(grid.size), 0.0
     states, actions, task = (np.asarray(getattr(demonstrations, name)) for name in ("states", "actions", "task"))
-    first = np.flatnonzero(np.diff(np.asarray(demonstrations.trajectory), prepend=-1))
+    first = demonstrations.firsts()
     for index in range(len(demonstrations.tasks.terminal)):
         made = plan(
             model, jax.tree.map(lambda leaf, index=index: leaf[index], demonstrations.tasks), settings.behavior()
