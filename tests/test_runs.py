@@ -36,7 +36,7 @@ def test_round_trip(folder):
 
 
 def test_the_model_has_the_probabilities_of_the_map(folder):
-    np.testing.assert_allclose(read_learned_map(folder).model().blocked, BLOCKED, rtol=1e-9)
+    np.testing.assert_allclose(read_learned_map(str(folder)).model().blocked, BLOCKED, rtol=1e-9)
 
 
 FILES = ("summary.json", "map.yaml", "map.pgm", "blocked.npy", "visited.npy")

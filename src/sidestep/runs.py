@@ -81,8 +81,9 @@ def add_to_summary(folder: Path, out: Path, key: str | None, summary: dict[str, 
     write_json(path, summary)
 
 
-def read_learned_map(folder: Path) -> LearnedMap:
+def read_learned_map(folder: Path | str) -> LearnedMap:
     """A learned map back from its folder; raises `InputError` for a file that is missing or does not fit."""
+    folder = Path(folder)
     connectivity, reward = _settings(folder / "summary.json")
     geometry = read_map(folder / "map.yaml", connectivity=connectivity)
     blocked = read_array(folder / "blocked.npy", kinds="f")

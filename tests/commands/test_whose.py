@@ -6,7 +6,10 @@ import pyarrow.csv
 import pytest
 from office import call, summary, write_office, written
 
+from sidestep.commands.learn import learn as learn_map
+from sidestep.commands.whose import Whose
 from sidestep.io.maps import read_map, write_map
+from sidestep.settings import Settings
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +59,18 @@ def test_goals_that_walks_do_not_name_are_found_among_candidates(office, tmp_pat
     assert abs(share - chances.max(axis=1).mean()) < 0.2  # and the posterior says how sure one can be
 
 
+def test_a_fit_is_reported_in_every_round(office, tmp_path):
+    places = tmp_path / "goals.csv"
+    own = walked(office, "reported", "--walks", 6).select(["goal_x", "goal_y"]).group_by(["goal_x", "goal_y"])
+    pyarrow.csv.write_csv(own.aggregate([]), places)
+    told = []
+    whose = Whose(candidates=places)
+    walks, blank = office / "reported.csv", office / "blank.yaml"
+    found = learn_map(walks, blank, tmp_path / "out", Settings(), told.append, whose=whose)
+    rounds = len(found["behavior"]["goals"]["evidence"]) - 1
+    assert [progress.iteration for progress in told].count(0) == rounds >= 1
+
+
 def test_who_is_sharper_is_told_by_name(office, tmp_path):
     sharp = walked(office, "sharp", "--walks", 40, "--beta", 30, "--seed", 1)
     vague = walked(office, "vague", "--walks", 40, "--beta", 3, "--seed", 2)
@@ -68,6 +83,7 @@ def test_who_is_sharper_is_told_by_name(office, tmp_path):
     persons = summary(tmp_path / "out")["behavior"]["persons"]
     assert list(persons) == ["Ada", "Bo"]
     assert persons["Ada"] > 2 * persons["Bo"]
+    assert summary(tmp_path / "out")["settings"]["unknown"] == ["sharpness"]
 
 
 def test_what_cannot_be_is_refused(office, tmp_path, capsys):

@@ -96,9 +96,8 @@ def compare(
         "methods": methods,
     }
     paths = own.paths()
-    save(
-        figure_learned([Panel(f"{len(paths)} walks", truth, paths=paths), *pictures], columns=3), folder / "compare.png"
-    )
+    panels = [Panel(f"{len(paths)} walks", truth, paths=paths), *pictures]
+    save(figure_learned(panels, columns=3, label="P(blocked), or share of the highest cost"), folder / "compare.png")
     write_json(folder / "summary.json", summary)
     return summary
 

@@ -1,5 +1,6 @@
 """`sidestep learn --candidates`: walks that do not name their goals, each with a posterior over candidates."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sidestep.demonstrations import Demonstrations, Trajectory
 from sidestep.errors import InputError
+from sidestep.inference.climb import Progress
 from sidestep.inference.fit import Fit
 from sidestep.inference.goals import GoalFit, fit_goals
 from sidestep.inference.priors import Normal
@@ -89,16 +91,17 @@ def fit_candidates(
     candidates: Int[np.ndarray, " candidates"],
     settings: Settings,
     prior: Normal | None = None,
+    report: Callable[[Progress], None] | None = None,
 ) -> Guessed:
     """The map and the goals that make walks most probable, by expectation maximisation (`sidestep.inference.goals`).
 
-    Raises `InputError` as `fit_goals` does.
+    `report` is told of every round's fit. Raises `InputError` as `fit_goals` does.
     """
     walks = np.unique(moves.walk)
     tasks = [reach(grid, int(state), discount=settings.discount, step_cost=settings.step_cost) for state in candidates]
 
     def learn(present: ObstacleGrid, shown: Demonstrations) -> Fit[ObstacleGrid]:
-        return fit_map(present, shown, settings, each=prior, afresh=present is model)
+        return fit_map(present, shown, settings, report, each=prior, afresh=present is model)
 
     found = fit_goals(model, trajectories_of_moves(moves), tasks, settings.behavior(), learn)
     goals = moves.goals.copy()

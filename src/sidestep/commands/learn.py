@@ -62,7 +62,7 @@ def learn(
     resumed = resume and checkpoint.exists()
     model = ObstacleGrid(grid, np.broadcast_to(known.prior.mean, grid.size))
     how = {"report": report, "checkpoint": checkpoint, "resume": resume}
-    found, demonstrations, told_of_people = fit_walks(
+    found, settings, demonstrations, told_of_people = fit_walks(
         model, grid, shown, moves, whose, settings, known.prior, folder, **how
     )
     blocked = np.asarray(found.model.blocked, dtype=np.float64)

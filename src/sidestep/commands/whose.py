@@ -1,5 +1,6 @@
 """Who walked, and after what: fits for walks that say more of it in a column, or less."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,6 +10,7 @@ import numpy as np
 from sidestep.commands.goals import fit_candidates, read_candidates, write_posterior
 from sidestep.demonstrations import Demonstrations, apart
 from sidestep.errors import InputError
+from sidestep.inference.climb import Progress
 from sidestep.inference.fit import Fit
 from sidestep.inference.priors import Normal
 from sidestep.io.demonstrations import demonstrations_of_moves, pursuing_moves
@@ -60,9 +62,10 @@ ALIKE = Whose()
 
 
 class Found(NamedTuple):
-    """A fit, what it was made from, and what else it tells of people."""
+    """A fit, by which settings and from what it was made, and what else it tells of people."""
 
     fit: Fit[ObstacleGrid]
+    settings: Settings
     demonstrations: Demonstrations
     told: dict[str, Any]
 
@@ -76,27 +79,31 @@ def fit_walks(
     settings: Settings,
     prior: Normal,
     folder: Path,
+    report: Callable[[Progress], None] | None = None,
     **how: Any,
 ) -> Found:
     """The fit of a map to walks, by whoever they are and whatever they were after.
 
-    `moves` are those of `walks`; `how` is for `fit_map`. Where goals are unknown, writes `posterior.csv` to the folder.
+    `moves` are those of `walks`; `report` and `how` are for `fit_map`. Where goals are unknown, writes
+    `posterior.csv` to the folder.
     """
     if whose.candidates is not None:
-        guessed = fit_candidates(model, grid, moves, read_candidates(whose.candidates, grid, moves), settings, prior)
+        candidates = read_candidates(whose.candidates, grid, moves)
+        guessed = fit_candidates(model, grid, moves, candidates, settings, prior, report)
         write_posterior(folder / "posterior.csv", guessed, walks.labels, grid)
-        return Found(guessed.fit, _demonstrations(guessed.moves, grid, settings), {"goals": guessed.told()})
+        return Found(guessed.fit, settings, _demonstrations(guessed.moves, grid, settings), {"goals": guessed.told()})
     demonstrations = _demonstrations(moves, grid, settings)
     if whose.person is None:
-        return Found(fit_map(model, demonstrations, settings, each=prior, **how), demonstrations, {})
+        found = fit_map(model, demonstrations, settings, report, each=prior, **how)
+        return Found(found, settings, demonstrations, {})
     said = walks.of_each(whose.person)
     names = [said[walk] for walk in np.unique(moves.walk[pursuing_moves(moves)]).tolist()]
     persons = list(dict.fromkeys(names))
     demonstrations, person = apart(demonstrations, np.array([persons.index(name) for name in names]))
     settings = replace(settings, unknown=tuple(dict.fromkeys((*settings.unknown, "sharpness"))))
-    found = fit_map(model, demonstrations, settings, each=prior, walkers=settings.people(person), **how)
+    found = fit_map(model, demonstrations, settings, report, each=prior, walkers=settings.people(person), **how)
     betas = {str(name): float(found.people.behavior_of(index).beta) for index, name in enumerate(persons)}
-    return Found(found, demonstrations, {"persons": betas})
+    return Found(found, settings, demonstrations, {"persons": betas})
 
 
 def _demonstrations(moves: Moves, grid: Grid, settings: Settings) -> Demonstrations:

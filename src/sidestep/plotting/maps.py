@@ -136,8 +136,8 @@ def figure_environments(worlds: Sequence[World]) -> Figure:
     return figure_learned([Panel(world.name, world.truth, starts=world.starts, goals=world.goals) for world in worlds])
 
 
-def figure_learned(panels: Sequence[Panel], columns: int | None = None) -> Figure:
-    """A figure of several maps in rows of `columns` (default: all in one row), with one colour bar."""
+def figure_learned(panels: Sequence[Panel], columns: int | None = None, label: str = "P(blocked)") -> Figure:
+    """A figure of several maps in rows of `columns` (default: all in one row), with one colour bar and its `label`."""
     columns = min(columns or len(panels), len(panels))
     rows = -(-len(panels) // columns)
     width, height = _size(panels[0].grid, _PANEL)
@@ -149,7 +149,7 @@ def figure_learned(panels: Sequence[Panel], columns: int | None = None) -> Figur
         axes.remove()
     learned = [image for image in images if image is not None]
     if learned:
-        _colour_bar(figure, learned[0], list(all_axes[: len(panels)]))
+        _colour_bar(figure, learned[0], list(all_axes[: len(panels)]), label)
     _legend(figure, list(all_axes[: len(panels)]))
     return figure
 
@@ -274,8 +274,8 @@ def _width(grid: Grid, least: float, most: float) -> float:
     return float(np.clip(60 / max(grid.shape), least, most))
 
 
-def _colour_bar(figure: Figure, image: AxesImage, axes: list[Axes]) -> None:
-    figure.colorbar(image, ax=axes, label="P(blocked)", shrink=0.85, aspect=25, ticks=[0, 0.25, 0.5, 0.75, 1])
+def _colour_bar(figure: Figure, image: AxesImage, axes: list[Axes], label: str = "P(blocked)") -> None:
+    figure.colorbar(image, ax=axes, label=label, shrink=0.85, aspect=25, ticks=[0, 0.25, 0.5, 0.75, 1])
 
 
 def _legend(figure: Figure, axes: list[Axes]) -> None:
