@@ -6,6 +6,9 @@ import pyarrow.csv as tables
 import pytest
 from office import WALL, call, summary, write_office
 
+from sidestep.commands import behavior
+from sidestep.errors import NotConverged
+from sidestep.inference import calibration
 from sidestep.io.maps import write_map
 from sidestep.tabular.grid import Cell, Grid
 
@@ -64,6 +67,32 @@ def test_where_walks_are_long_people_pay_for_steps(tmp_path):
     told = chosen(tmp_path, walks, tmp_path / "learned")
     assert (told["settings"]["discount"], told["settings"]["step_cost"]) == (1, 1)
     assert "people pursue a cost of every cell" in told["behavior"]["reasons"][0]
+
+
+def test_people_of_whom_no_values_are_found_are_passed_over(office, tmp_path, monkeypatch):
+    """As it happens now and then to Boltzmann averages of people who pay for steps."""
+
+    def not_of_those_who_pay(model, shown, people, horizon):
+        if float(shown.tasks.discount[0]) == 1:
+            raise NotConverged("the values of a task were not found")
+        return calibration.scores(model, shown, people, horizon)
+
+    monkeypatch.setattr(behavior, "scores", not_of_those_who_pay)
+    told = chosen(office, walked(office, "some", "--walks", 12), tmp_path)
+    assert told["settings"]["step_cost"] is None
+    assert {trial["step_cost"] for trial in told["behavior"]["trials"]} == {None}
+    assert "with a cost of every cell no values were found" in told["behavior"]["reasons"][0]
+
+
+def test_where_no_values_are_found_at_all_there_is_nothing_to_choose(office, tmp_path, monkeypatch, capsys):
+    def of_nobody(*_):
+        raise NotConverged("the values of a task were not found")
+
+    monkeypatch.setattr(behavior, "scores", of_nobody)
+    walks = walked(office, "few", "--walks", 6)
+    command = ("learn", walks, "--map", office / "blank.yaml", "--out", tmp_path / "out", "--behavior", "auto")
+    assert call(*command) == 1
+    assert "no values were found with β = 7 of the settings" in capsys.readouterr().err
 
 
 def test_one_walk_is_too_few_to_choose_by(office, tmp_path, capsys):

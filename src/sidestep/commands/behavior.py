@@ -3,9 +3,9 @@
 Maps are learned from two thirds of the walks at a time and judged by the others.
 
 1. **Reward.** A goal that pays 1 with the discount of the settings, or a cost of 1 a cell without one, each with the β
-   to begin with or four times that, whichever suits it better. The reward of the settings stays unless the other makes
-   held-out actions and transitions more probable by a fifth of a nat a move: what predicts actions a little better may
-   find walls worse.
+   to begin with or four times that, whichever suits it better; a β of which no values are found is passed over. The
+   reward of the settings stays unless the other makes held-out actions and transitions more probable by a fifth of a
+   nat a move: what predicts actions a little better may find walls worse.
 2. **Sharpness.** β is doubled as long as people are more regular than they are taken to be (κ above 1, see
    `sidestep.inference.calibration`) and held-out walks become more probable by it.
 3. **Tempering.** Where their steps say less than as many independent ones (κ below 1), the actions' likelihood counts
@@ -16,6 +16,7 @@ are learned with every map.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -49,7 +50,10 @@ _SHARPNESS_BY_STEPS = 0.5
 
 @dataclass(frozen=True)
 class Trial:
-    """What held-out walks say of settings: the nats of every walk's actions and transitions, κ, the share of lapses."""
+    """What held-out walks say of settings: the nats of every walk's actions and transitions, κ, the share of lapses.
+
+    κ is infinite where the walks do not vary.
+    """
 
     settings: Settings
     actions: Float[np.ndarray, " walks"]
@@ -70,7 +74,7 @@ class Trial:
             **{name: getattr(self.settings, name) for name in names},
             "heldout_actions": float(self.actions.sum() / self.moves),
             "heldout_transitions": float(self.transitions.sum() / self.moves),
-            "effective_share": self.share,
+            "effective_share": self.share if np.isfinite(self.share) else None,
             "lapses": self.lapse,
         }
 
@@ -107,14 +111,20 @@ def choose_behavior(
         trials.append(_tried(ObstacleGrid(grid, some.prior_mean), shown, some, prior, report))
         return trials[-1]
 
-    own, other = (
-        [tried(replace(kind, beta=rung * kind.beta)) for rung in _RUNGS]
-        for kind in (settings, _of_the_other_kind(settings))
-    )
-    gains = _best(other).nats - _best(own).nats
-    found = (other if gains.sum() > max(_SURELY * _error(gains), _WORTH * own[0].moves) else own)[0]
+    def sharpnesses(kind: Settings) -> list[Trial]:
+        found = []
+        for rung in _RUNGS:
+            with suppress(NotConverged):  # what people of whom no values are found would do, cannot be told
+                found.append(tried(replace(kind, beta=rung * kind.beta)))
+        return found
+
+    own, other = sharpnesses(settings), sharpnesses(_of_the_other_kind(settings))
+    if not own:
+        raise NotConverged(f"no values were found with β = {settings.beta:g} of the settings: a smaller β may help")
+    gains = _best(other).nats - _best(own).nats if other else None
+    found = (other if gains is not None and _is_worth_it(gains, own[0].moves) else own)[0]
     for _ in range(_DOUBLINGS):
-        if not doubtful(found.share, len(gains), _SURELY)[1]:
+        if not doubtful(found.share, len(found.nats), _SURELY)[1]:
             break
         try:
             after = tried(replace(found.settings, beta=2 * found.settings.beta))
@@ -123,9 +133,13 @@ def choose_behavior(
         if after.nats.sum() <= found.nats.sum():
             break
         found = after
-    below, _ = doubtful(found.share, len(gains), _SURELY)
+    below, _ = doubtful(found.share, len(found.nats), _SURELY)
     chosen = replace(found.settings, tempering=found.share if below else 1.0)
     return Choice(chosen, _reasons(chosen, found, gains, settings), trials)
+
+
+def _is_worth_it(gains: Float[np.ndarray, " walks"], moves: int) -> bool:
+    return bool(gains.sum() > max(_SURELY * _error(gains), _WORTH * moves))
 
 
 def _error(differences: Float[np.ndarray, " walks"]) -> float:
@@ -170,13 +184,18 @@ def _tried(
     return Trial(settings, actions, transitions, len(shown), effective_share(held_out), float(np.mean(lapses)))
 
 
-def _reasons(chosen: Settings, found: Trial, gains: Float[np.ndarray, " walks"], given: Settings) -> list[str]:
-    """What was chosen and why, for people; `gains` are those of the other kind of reward."""
+def _reasons(chosen: Settings, found: Trial, gains: Float[np.ndarray, " walks"] | None, given: Settings) -> list[str]:
+    """What was chosen and why, for people; `gains` are those of the other kind of reward, if it has values."""
     kinds = ["a goal that pays 1", "a cost of every cell"]
     kind, other = kinds[chosen.step_cost is not None], kinds[given.step_cost is None]
+    against = (
+        f"with {other} no values were found"
+        if gains is None
+        else f"{other} makes held-out moves more probable by {gains.sum() / found.moves:.2g} ± "
+        f"{_error(gains) / found.moves:.1g} nats each, and {_WORTH:g} would be worth it"
+    )
     reasons = [
-        f"people pursue {kind}: {other} makes held-out moves more probable by {gains.sum() / found.moves:.2g} ± "
-        f"{_error(gains) / found.moves:.1g} nats each, and {_WORTH:g} would be worth it",
+        f"people pursue {kind}: {against}",
         f"β = {chosen.beta:g}: held-out steps are worth {found.share:.2g} times as many independent ones",
     ]
     if chosen.tempering < 1:
