@@ -10,7 +10,7 @@ from sidestep.rivals.cloning import by_cloning
 from sidestep.rivals.constraints import by_constraints
 from sidestep.rivals.costs import CostlyReward, by_costs
 from sidestep.rivals.joint import by_joint
-from sidestep.rivals.learned import by_behavior, by_transitions, by_visits
+from sidestep.rivals.learned import by_behavior, by_transitions, by_visits, known_map, nats_a_move
 from sidestep.settings import Settings
 from sidestep.simulation import simulate
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
@@ -151,6 +151,17 @@ def test_cloning_generalises_to_goals_that_nobody_had():
         paths = learned.planner.pursue(goal).follow(others)
         assert [path[-1] for path in paths] == [goal] * 48
         assert [len(path) - 1 for path in paths] == shortest
+
+
+@pytest.mark.parametrize(("logit", "found"), [(8.0, True), (20.0, False)])
+def test_what_people_do_cannot_be_told_where_they_have_no_values(logit, found, walks):
+    """Once in a hundred million tries somebody gets through a wall, and each try costs: values are out of reach."""
+    paying = Settings(discount=1.0, step_cost=1.0, beta=0.5)
+    walled = ObstacleGrid(BLANK, jnp.where(jnp.arange(25) % 5 == 1, logit, -3.0))
+    nats = nats_a_move(known_map(walled, walks, paying), walks)
+    assert (nats is not None) == found
+    if nats is not None:
+        assert nats == pytest.approx(float(known_map(walled, walks, paying).log_policies(walks).mean()))
 
 
 def test_cloning_is_particular_to_places():

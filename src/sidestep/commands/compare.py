@@ -22,7 +22,7 @@ from sidestep.rivals.cloning import by_cloning
 from sidestep.rivals.constraints import by_constraints
 from sidestep.rivals.costs import by_costs
 from sidestep.rivals.joint import by_joint
-from sidestep.rivals.learned import Lesson, Method, by_behavior, by_transitions, by_visits
+from sidestep.rivals.learned import Lesson, Method, by_behavior, by_transitions, by_visits, nats_a_move
 from sidestep.settings import Settings
 from sidestep.tabular.grid import Cell, Grid
 
@@ -56,9 +56,9 @@ def compare(
     - `hold_out`: the share of walks, drawn by the settings' seed, that are not learned from. How probable their actions
       are under what was learned, in nats a move, is `heldout_log_likelihood`.
 
-    The summary has `methods.<name>` with the scores of `evaluate`, that, and `seconds`; with nothing but the reason,
-    `failed`, for a method that finds no values. Raises `InputError` for
-    files that do not fit, and a share that leaves no walk to learn from or none to score.
+    The summary has `methods.<name>` with the scores of `evaluate`, that (null where no values are found for those who
+    were held out), and `seconds`; with nothing but the reason, `failed`, for a method that finds no values at all.
+    Raises `InputError` for files that do not fit, and a share that leaves no walk to learn from or none to score.
     """
     given = read_map(map_file, connectivity=settings.connectivity)
     truth = read_truth(truth_file, given)
@@ -85,7 +85,7 @@ def compare(
             # what one method cannot do is no reason to say nothing of the others
             methods[name] = {**dict.fromkeys(_SCORES), "failed": str(error)}
             continue
-        heldout = float(learned.log_policies(others).mean())
+        heldout = nats_a_move(learned, others)
         methods[name] = {**scores, "heldout_log_likelihood": heldout, "seconds": round(seconds, 3)}
         pictures.append(_panel(name, learned, given, truth, own))
     summary = {

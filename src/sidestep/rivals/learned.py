@@ -48,7 +48,7 @@ class Lesson(Protocol):
         ...
 
     def log_policies(self, demonstrations: Demonstrations) -> Float[np.ndarray, " moves"]:
-        """How probable every action of some demonstrations is taken to be, in nats."""
+        """How probable every action of some demonstrations is taken to be, in nats; NaN where no values are found."""
         ...
 
 
@@ -80,6 +80,12 @@ class Learned(NamedTuple):
         tasks = stack_tasks([self.reward.reach(self.model.blank, int(goal)) for goal in goals])
         pursued = eqx.tree_at(lambda demos: demos.tasks, demonstrations, tasks)
         return np.asarray(log_policies(self.model, pursued, self.behavior))
+
+
+def nats_a_move(lesson: Lesson, others: Demonstrations) -> float | None:
+    """How probable the actions of people are taken to be from whom was not learned; None where no values are found."""
+    nats = float(np.mean(lesson.log_policies(others)))
+    return None if np.isnan(nats) else nats
 
 
 Method = Callable[[Grid, Demonstrations, Settings], Lesson]
