@@ -12,7 +12,7 @@ from sidestep.inference.fit import Fit, fit
 from sidestep.inference.goals import GoalFit, fit_goals, goal_posterior
 from sidestep.inference.objective import tasks_mesh
 from sidestep.inference.optimisers import LBFGS, Ascent, Resilient
-from sidestep.inference.priors import Lines, Normal, Prior, Smooth, sensed
+from sidestep.inference.priors import Lines, Normal, Prior, Smooth, Stood, sensed
 from sidestep.io.demonstrations import demonstrations
 from sidestep.io.gymnasium import collect, from_gymnasium, slip_of, slippery
 from sidestep.io.maps import read_map, write_map
@@ -79,6 +79,7 @@ __all__ = [
     "SlipperyGrid",
     "Smooth",
     "Solution",
+    "Stood",
     "TabularModel",
     "Task",
     "TiedModel",

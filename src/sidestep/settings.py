@@ -7,7 +7,7 @@ from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError
@@ -101,8 +101,7 @@ def fit_map(
     counted = np.ones(len(demonstrations)) if demonstrations.weight is None else np.asarray(demonstrations.weight)
     prior = _prior_of(settings, model, each)
     if settings.terms != "actions":
-        first = demonstrations.firsts()
-        prior = Stood(prior, demonstrations.states[first], jnp.asarray(counted[first]))
+        prior = Stood(prior, jnp.asarray(_begun(model, demonstrations, counted)))
     optimiser = optimiser_of(settings, model.graph.states, round(float(counted.sum())))
     if afresh and settings.terms == "both":
         # where people walked is known without a solve: begin there
@@ -124,6 +123,15 @@ def fit_map(
         checkpoint=checkpoint,
         resume=resume,
     )
+
+
+def _begun(
+    model: ObstacleGrid, demonstrations: Demonstrations, counted: Float[np.ndarray, " moves"]
+) -> Float[np.ndarray, " cells"]:
+    """How many walks begin in each unknown cell, each by how much it counts."""
+    first = demonstrations.firsts()
+    begun = np.bincount(np.asarray(demonstrations.states)[first], counted[first], minlength=model.graph.states)
+    return np.where(np.asarray(model.known).ravel() == Cell.UNKNOWN, begun, 0.0)
 
 
 def _prior_of(settings: Settings, model: ObstacleGrid, each: Normal | None) -> Prior:

@@ -1,5 +1,7 @@
 """`learn --behavior auto`: what is chosen for walks whose walkers are known."""
 
+import json
+
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv as tables
@@ -10,6 +12,7 @@ from sidestep.commands import behavior
 from sidestep.errors import NotConverged
 from sidestep.inference import calibration
 from sidestep.io.maps import write_map
+from sidestep.settings import Settings
 from sidestep.tabular.grid import Cell, Grid
 
 
@@ -81,18 +84,28 @@ def test_people_of_whom_no_values_are_found_are_passed_over(office, tmp_path, mo
     told = chosen(office, walked(office, "some", "--walks", 12), tmp_path)
     assert told["settings"]["step_cost"] is None
     assert {trial["step_cost"] for trial in told["behavior"]["trials"]} == {None}
-    assert "with a cost of every cell no values were found" in told["behavior"]["reasons"][0]
+    reasons = told["behavior"]["reasons"]
+    assert "with a cost of every cell no values were found" in reasons[0]
+    assert sum("was passed over: the values of a task were not found" in reason for reason in reasons) == 2
 
 
-def test_where_no_values_are_found_at_all_there_is_nothing_to_choose(office, tmp_path, monkeypatch, capsys):
-    def of_nobody(*_):
-        raise NotConverged("the values of a task were not found")
-
-    monkeypatch.setattr(behavior, "scores", of_nobody)
+def test_where_the_settings_own_people_have_no_values_there_is_nothing_to_compare(office, tmp_path, capsys):
     walks = walked(office, "few", "--walks", 6)
     command = ("learn", walks, "--map", office / "blank.yaml", "--out", tmp_path / "out", "--behavior", "auto")
-    assert call(*command) == 1
-    assert "no values were found with β = 7 of the settings" in capsys.readouterr().err
+    assert call(*command, "--backup", "logsumexp", "--step-cost", 1, "--discount", 1, "--beta", 0.5) == 1
+    assert "never wants to arrive" in capsys.readouterr().err
+
+
+def test_people_who_never_want_to_arrive_are_passed_over(office, tmp_path):
+    """By log-sum-exp, those to whom ways differ as little as by half a cost a cell."""
+    told = chosen(office, walked(office, "soft", "--walks", 12), tmp_path, "--backup", "logsumexp", "--beta", 10)
+    assert any("a cost of every cell with β = 0.5 was passed over" in reason for reason in told["behavior"]["reasons"])
+
+
+def test_walks_that_do_not_vary_are_told():
+    none = np.zeros(3)
+    trial = behavior.Trial(Settings(), none, none, moves=5, share=np.inf, lapse=0.0)
+    assert json.loads(json.dumps(trial.told(), allow_nan=False))["effective_share"] is None
 
 
 def test_one_walk_is_too_few_to_choose_by(office, tmp_path, capsys):

@@ -106,8 +106,8 @@ def test_it_ends_where_a_search_along_the_gradient_does(demonstrations, monkeypa
 
 def by_transitions(grid, demonstrations):
     """Where the transitions alone lead, and where walks begin."""
-    begins = demonstrations.states[demonstrations.firsts()]
-    prior = Stood(Normal(0.5, 8.0), begins, jnp.ones(len(begins)))
+    begun = np.bincount(demonstrations.states[demonstrations.firsts()], minlength=grid.size)
+    prior = Stood(Normal(0.5, 8.0), jnp.asarray(np.where(grid.known.ravel() == -1, begun, 0.0)))
     people = Behavior(LogSumExp(), 5.0)
     return fit(ObstacleGrid(grid, 0.5), demonstrations, people, prior=prior, terms=("transitions",)).final
 

@@ -81,7 +81,7 @@ def test_a_gap_in_a_wall_is_more_probably_wall():
 
 def test_who_stands_somewhere_counts_as_much_as_a_move_into_the_cell():
     theta = jnp.asarray([3.0, 0.5, 7.0, -1.0])
-    prior = Stood(EACH, jnp.asarray([1, 3, 1, 2]), jnp.asarray([1.0, 0.5, 1.0, 0.0]))
+    prior = Stood(EACH, jnp.asarray([0.0, 2.0, 0.0, 0.5]))
     free = 1 / (1 + np.exp(np.asarray(theta)))
     expected = 2 * np.log(free[1]) + 0.5 * np.log(free[3])
     assert float(prior.log_density(theta) - EACH.log_density(theta)) == pytest.approx(expected, rel=1e-12)

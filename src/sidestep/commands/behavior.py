@@ -3,9 +3,9 @@
 Maps are learned from two thirds of the walks at a time and judged by the others.
 
 1. **Reward.** A goal that pays 1 with the discount of the settings, or a cost of 1 a cell without one, each with the β
-   to begin with or four times that, whichever suits it better; a β of which no values are found is passed over. The
-   reward of the settings stays unless the other makes held-out actions and transitions more probable by a fifth of a
-   nat a move: what predicts actions a little better may find walls worse.
+   to begin with or four times that, whichever suits it better. Where no values are found for one of them, other than
+   the settings' own, it is passed over. The reward of the settings stays unless the other makes held-out actions and
+   transitions more probable by a fifth of a nat a move: what predicts actions a little better may find walls worse.
 2. **Sharpness.** β is doubled as long as people are more regular than they are taken to be (κ above 1, see
    `sidestep.inference.calibration`) and held-out walks become more probable by it.
 3. **Tempering.** Where their steps say less than as many independent ones (κ below 1), the actions' likelihood counts
@@ -16,7 +16,6 @@ are learned with every map.
 """
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,7 +23,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sidestep.demonstrations import Demonstrations
-from sidestep.errors import InputError, NotConverged
+from sidestep.errors import ImproperTask, InputError, NotConverged
 from sidestep.inference.calibration import doubtful, effective_share, scores
 from sidestep.inference.priors import Normal
 from sidestep.io.demonstrations import demonstrations_of_moves
@@ -36,8 +35,8 @@ from sidestep.tabular.models import ObstacleGrid
 
 FOLDS = 3
 """Into how many parts the walks are cut."""
-_RUNGS = (1.0, 4.0)
-"""The β, times the one to begin with, by which kinds of reward are compared."""
+_SHARPER = 4.0
+"""Kinds of reward are compared by the β to begin with and by so many times that."""
 _SURELY = 3.0
 """How many standard errors a difference must have to count."""
 _WORTH = 0.2
@@ -105,37 +104,36 @@ def choose_behavior(
             raise InputError("cannot be given where behavior is chosen by held-out walks", field=field)
     settings = replace(settings, unknown=("lapses",))
     trials: list[Trial] = []
+    passed_over: list[str] = []
 
     def tried(some: Settings) -> Trial:
         shown = demonstrations_of_moves(moves, grid, discount=some.discount, step_cost=some.step_cost)
         trials.append(_tried(ObstacleGrid(grid, some.prior_mean), shown, some, prior, report))
         return trials[-1]
 
-    def sharpnesses(kind: Settings) -> list[Trial]:
-        found = []
-        for rung in _RUNGS:
-            with suppress(NotConverged):  # what people of whom no values are found would do, cannot be told
-                found.append(tried(replace(kind, beta=rung * kind.beta)))
-        return found
+    def attempted(some: Settings) -> list[Trial]:
+        """The trial, where there is one: what people would do of whom no values are found, cannot be told."""
+        try:
+            return [tried(some)]
+        except (ImproperTask, NotConverged) as error:
+            passed_over.append(f"{_named(some)} with β = {some.beta:g} was passed over: {error}")
+            return []
 
-    own, other = sharpnesses(settings), sharpnesses(_of_the_other_kind(settings))
-    if not own:
-        raise NotConverged(f"no values were found with β = {settings.beta:g} of the settings: a smaller β may help")
+    own = [tried(settings), *attempted(replace(settings, beta=_SHARPER * settings.beta))]
+    kind = _of_the_other_kind(settings)
+    other = [*attempted(kind), *attempted(replace(kind, beta=_SHARPER * kind.beta))]
     gains = _best(other).nats - _best(own).nats if other else None
     found = (other if gains is not None and _is_worth_it(gains, own[0].moves) else own)[0]
     for _ in range(_DOUBLINGS):
         if not doubtful(found.share, len(found.nats), _SURELY)[1]:
             break
-        try:
-            after = tried(replace(found.settings, beta=2 * found.settings.beta))
-        except NotConverged:
-            break  # so sharp that values are not found
-        if after.nats.sum() <= found.nats.sum():
+        after = attempted(replace(found.settings, beta=2 * found.settings.beta))
+        if not after or after[0].nats.sum() <= found.nats.sum():
             break
-        found = after
+        found = after[0]
     below, _ = doubtful(found.share, len(found.nats), _SURELY)
     chosen = replace(found.settings, tempering=found.share if below else 1.0)
-    return Choice(chosen, _reasons(chosen, found, gains, settings), trials)
+    return Choice(chosen, [*_reasons(chosen, found, gains, settings), *passed_over], trials)
 
 
 def _is_worth_it(gains: Float[np.ndarray, " walks"], moves: int) -> bool:
@@ -184,10 +182,13 @@ def _tried(
     return Trial(settings, actions, transitions, len(shown), effective_share(held_out), float(np.mean(lapses)))
 
 
+def _named(settings: Settings) -> str:
+    return "a goal that pays 1" if settings.step_cost is None else "a cost of every cell"
+
+
 def _reasons(chosen: Settings, found: Trial, gains: Float[np.ndarray, " walks"] | None, given: Settings) -> list[str]:
     """What was chosen and why, for people; `gains` are those of the other kind of reward, if it has values."""
-    kinds = ["a goal that pays 1", "a cost of every cell"]
-    kind, other = kinds[chosen.step_cost is not None], kinds[given.step_cost is None]
+    kind, other = _named(chosen), _named(_of_the_other_kind(given))
     against = (
         f"with {other} no values were found"
         if gains is None
@@ -196,7 +197,9 @@ def _reasons(chosen: Settings, found: Trial, gains: Float[np.ndarray, " walks"] 
     )
     reasons = [
         f"people pursue {kind}: {against}",
-        f"β = {chosen.beta:g}: held-out steps are worth {found.share:.2g} times as many independent ones",
+        f"β = {chosen.beta:g}: held-out steps are worth {found.share:.3g} times as many independent ones"
+        if np.isfinite(found.share)
+        else f"β = {chosen.beta:g}: held-out walks do not vary",
     ]
     if chosen.tempering < 1:
         reasons.append(

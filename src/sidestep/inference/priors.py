@@ -4,7 +4,7 @@
 
     Smooth:  − s Σ_{i~j} (θ_i − θ_j)²                                  over pairs of neighbours
     Lines:   + s Σ_c p_c [1 − (1 − p_left p_right)(1 − p_up p_down)]   over cells, p = P(blocked)
-    Stood:   + Σ_i ln(1 − p_{c_i})                                     over cells that somebody was seen to stand in
+    Stood:   + Σ_c n_c ln(1 − p_c)                                     over cells, n times seen to be stood in
 
 The first is a Gaussian Markov random field. The second says that walls are lines: a blocked cell is more probable
 between two others, in a row or in a column. So a gap one cell wide in a long wall, of which behavior says nothing, is
@@ -143,21 +143,19 @@ class Lines(Prior):
 
 
 class Stood(Prior):
-    """Who stands in a cell shows that it is free, and so do those whose walks begin there.
+    """Evidence that cells are free: somebody stood there, as those did whose walks begin in them.
 
     - `other`: what else is known of the cells' logits.
-    - `cells`: the cell of each observation; the same one may come several times.
-    - `weight`: how much each observation counts, 0 or more.
+    - `times`: how often somebody was seen to stand in each cell, 0 or more; where a map knows the cell, 0.
     """
 
     other: Prior
-    cells: Int[Array, " observations"]
-    weight: Float[Array, " observations"]
+    times: Float[Array, " cells"]
 
     def log_density(self, parameters: Float[Array, " cells"]) -> Float[Array, ""]:
-        """That of the other, and Σ w ln(1 − p)."""
-        free = jax.nn.log_sigmoid(-parameters[self.cells])
-        return self.other.log_density(parameters) + self.weight.astype(free.dtype) @ free
+        """That of the other, and Σ n ln(1 − p)."""
+        free = jax.nn.log_sigmoid(-parameters)
+        return self.other.log_density(parameters) + self.times.astype(free.dtype) @ free
 
 
 def _strength(strength: float) -> Float[Array, ""]:

@@ -48,7 +48,10 @@ class Lesson(Protocol):
         ...
 
     def log_policies(self, demonstrations: Demonstrations) -> Float[np.ndarray, " moves"]:
-        """How probable every action of some demonstrations is taken to be, in nats; NaN where no values are found."""
+        """How probable every action of some demonstrations is taken to be, in nats.
+
+        All are NaN if the values of a task are not found.
+        """
         ...
 
 
@@ -83,9 +86,9 @@ class Learned(NamedTuple):
 
 
 def nats_a_move(lesson: Lesson, others: Demonstrations) -> float | None:
-    """How probable the actions of people are taken to be from whom was not learned; None where no values are found."""
+    """How probable other people's actions are taken to be; None if that is not found for all of them."""
     nats = float(np.mean(lesson.log_policies(others)))
-    return None if np.isnan(nats) else nats
+    return nats if np.isfinite(nats) else None
 
 
 Method = Callable[[Grid, Demonstrations, Settings], Lesson]
@@ -115,7 +118,7 @@ def by_behavior(grid: Grid, demonstrations: Demonstrations, settings: Settings) 
 
 
 def by_transitions(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> Learned:
-    """Maximum likelihood of the observed transitions alone, whatever people wanted."""
+    """What transitions and first cells alone make most probable, whatever people wanted."""
     return by_behavior(grid, demonstrations, replace(settings, terms="transitions"))
 
 
