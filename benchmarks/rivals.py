@@ -48,10 +48,10 @@ from sidestep.tabular.grid import Cell, Grid
 
 ROWS, COLUMNS = 14, 24
 PLACES, NEW_PLACES, NEW_CELLS = 8, 24, 12
-FIRST_OFFICE = 200  # those before served to choose settings
 HELD_OUT = 100
 OFFICE = Settings(beta=400.0, discount=0.97, prior_mean=0.0)
-"""Walkers are sharp, and of the cells that nobody visits most are walls; chosen on offices of earlier seeds."""
+"""Walkers are sharp, and of the cells that nobody visits most are walls; chosen on offices of seeds below `FIRST`."""
+FIRST = 200
 OWN = ("sample", "seed", "unknown")
 SCORES = {
     "average_precision": "average\nprecision",
@@ -74,9 +74,9 @@ class Problem:
     goals: Int[np.ndarray, " goals"]
 
 
-def offices(counts: Sequence[int], seeds: int) -> Iterator[tuple[int, Problem]]:
+def offices(counts: Sequence[int], seeds: Sequence[int]) -> Iterator[tuple[int, Problem]]:
     """One office for each seed; with each number of walks."""
-    for seed in range(FIRST_OFFICE, FIRST_OFFICE + seeds):
+    for seed in seeds:
         truth = office(ROWS, COLUMNS, seed)
         for count in counts:
             trajectories, goals = walk(truth, Walkers(walks=count + HELD_OUT, goals=PLACES, seed=seed))
@@ -166,6 +166,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, help="how many offices, or draws of each maze")
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS), metavar="NAME")
     parser.add_argument("--behavior", choices=("given", "auto"), default="given", help="as for `sidestep learn`")
+    parser.add_argument(
+        "--first", type=int, default=FIRST, metavar="SEED", help="the first office's (default %(default)s)"
+    )
     add_set_option(parser, Settings, OWN)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the means and every record")
     parser.add_argument("--quick", action="store_true", help="one office of 40 walks, or every fourth maze of 10")
@@ -184,7 +187,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Measures, prints and writes what the arguments ask for."""
     if arguments.worlds == "offices":
         chosen = changed(OFFICE, arguments.set, OWN)
-        problems = list(offices(arguments.walks, arguments.seeds))
+        problems = list(offices(arguments.walks, range(arguments.first, arguments.first + arguments.seeds)))
     else:
         chosen = changed(Settings(), arguments.set, OWN)
         folders = sorted(arguments.data.glob("maze_*"))[:: 4 if arguments.quick else 1]

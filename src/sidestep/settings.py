@@ -93,7 +93,7 @@ def fit_map(
     """The fit that `settings` describe. Where transitions count, so do the cells in which walks begin (`Stood`).
 
     - `each` is the prior of cells' logits and `walkers` are the people, where they are not the settings' own.
-    - `afresh`: begin where the transitions alone lead, rather than at `model`.
+    - `afresh`: begin where transitions and first cells lead, rather than at `model`.
     """
     if not (np.isfinite(settings.memory) and settings.memory > 0):
         raise InputError(f"expected GiB above 0, found {settings.memory}", field="memory")

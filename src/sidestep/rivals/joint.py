@@ -6,10 +6,10 @@ what came of it,
 
     Σ log π_{k,θ}(a | s)  +  Σ ln T_θ(s, a, s′),        R(s, a) = R₀(s, a) − ln(1 + exp k_c(s, a)),
 
-is climbed in the costs' k and the cells' logits θ together, with the prior of the costs (`tabular.people`) and the
-settings' own of the logits. As there, people act by maximum causal entropy, whatever backup the settings name: the one
-thing in which this differs from `costs` is then that moves may fail. And as there people know the true dynamics;
-Herman et al. also have people whose beliefs differ from them.
+is climbed in the costs' k and the cells' logits θ together, with the prior of the costs (`tabular.people`) and, of the
+logits, the settings' own and what the walks' first cells say (`fit_map`). As there, people act by maximum causal
+entropy, whatever backup the settings name: the one thing in which this differs from `costs` is then that moves may
+fail. And as there people know the true dynamics; Herman et al. also have people whose beliefs differ from them.
 """
 
 import numpy as np

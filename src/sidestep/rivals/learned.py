@@ -1,7 +1,7 @@
 """What every method makes of walks: what a robot does, how people are taken to act, and a ranking of cells.
 
 A method is a function of a map, demonstrations on it and settings (`Method`). Behavior-aware modeling is one of them;
-so are the simplest things that one could do instead: the likelihood of transitions alone, and counting visits.
+so are the simplest things that one could do instead: the transitions alone, and counting visits.
 """
 
 from collections.abc import Callable
