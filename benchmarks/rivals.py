@@ -178,6 +178,8 @@ def _arguments() -> argparse.Namespace:
     arguments.seeds = arguments.seeds or (6 if in_offices else 1)
     if min(*arguments.walks, arguments.seeds) < 1:
         parser.error("--walks and --seeds: expected numbers above 0")
+    if arguments.first < 0:
+        parser.error("--first: expected a number of at least 0")
     if arguments.quick:
         arguments.walks, arguments.seeds = arguments.walks[:1], 1
     return arguments

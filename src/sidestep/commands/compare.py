@@ -56,8 +56,8 @@ def compare(
     - `hold_out`: the share of walks, drawn by the settings' seed, that are not learned from. How probable their actions
       are under what was learned, in nats a move, is `heldout_log_likelihood`.
 
-    The summary has `methods.<name>` with the scores of `evaluate`, that (null if a held-out goal's values are
-    not found), and `seconds`; with nothing but the reason, `failed`, for a method that finds no values at all.
+    The summary has `methods.<name>` with the scores of `evaluate`, that (null if a held-out goal's values are not
+    found), and `seconds`; with nothing but the reason, `failed`, for a method that finds no values at all.
     Raises `InputError` for files that do not fit, and a share that leaves no walk to learn from or none to score.
     """
     given = read_map(map_file, connectivity=settings.connectivity)

@@ -86,7 +86,7 @@ class Learned(NamedTuple):
 
 
 def nats_a_move(lesson: Lesson, others: Demonstrations) -> float | None:
-    """How probable other people's actions are taken to be; None if that is not found for all of them."""
+    """How probable other people's actions are taken to be, in nats a move; None if that is not found for all."""
     nats = float(np.mean(lesson.log_policies(others)))
     return nats if np.isfinite(nats) else None
 
