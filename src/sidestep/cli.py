@@ -3,7 +3,7 @@
 import os
 import traceback
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import typer
@@ -44,8 +44,12 @@ Connected = Annotated[Literal["4", "8"], typer.Option(help="Moves: 4 directions,
 Backup = Annotated[BackupName, typer.Option(help="How walkers value a state by its actions.")]
 Beta = Annotated[float, typer.Option(help="How sharply walkers choose, in units of one over reward.")]
 Discount = Annotated[float, typer.Option(help="γ, above 0 and at most 1.")]
+Chosen = Annotated[
+    Literal["given", "auto"],
+    typer.Option(help="auto: the reward, β, lapses and how much actions count are chosen by held-out walks."),
+]
 BumpCost = Annotated[
-    float, typer.Option(help="What bumping into something costs a robot beside the move, in cell sides.")
+    float, typer.Option(help="What the first bump costs a robot beside the move, in cell sides; further ones, a fifth.")
 ]
 StepCost = Annotated[
     float | None,
@@ -106,10 +110,7 @@ def learn_command(
     ],
     map_file: Annotated[Path, typer.Option("--map", help="ROS map: what is already known.", metavar="MAP.yaml")],
     out: Folder,
-    behavior: Annotated[
-        Literal["given", "auto"],
-        typer.Option(help="auto: the reward, β, lapses and how much actions count are chosen by held-out walks."),
-    ] = "given",
+    behavior: Chosen = "given",
     backup: Backup = Settings.backup,  # pyright: ignore[reportArgumentType]
     beta: Beta = Settings.beta,
     lapse: Annotated[float | None, typer.Option(help="The share of actions at random; none by default.")] = None,
@@ -202,8 +203,7 @@ def learn_command(
             f"left out: {data['walks_left_out']} walks that start at their goal, and {data['moves_left_out']} moves of "
             "walks that had arrived"
         )
-    for reason in summary["behavior"].get("reasons", ()):
-        console.print(reason, soft_wrap=True)
+    _print_reasons(summary)
     for note in summary["notes"]:
         errors.print(f"note: {note}", soft_wrap=True)
     console.print(
@@ -257,6 +257,7 @@ def compare_command(
     map_file: Annotated[Path, typer.Option("--map", help="ROS map: what is already known.", metavar="MAP.yaml")],
     truth: Annotated[Path, typer.Option(help="The true map.", metavar="TRUE.yaml")],
     out: Folder,
+    behavior: Chosen = "given",
     backup: Backup = Settings.backup,  # pyright: ignore[reportArgumentType]
     beta: Beta = Settings.beta,
     discount: Discount = Settings.discount,
@@ -275,7 +276,7 @@ def compare_command(
         seed=seed,
     )
     with working("starting") as say:
-        summary = compare(walks, map_file, truth, out, settings, hold_out, say)
+        summary = compare(walks, map_file, truth, out, settings, hold_out, say, say if behavior == "auto" else None)
     columns = {
         "auc": "AUC",
         "average_precision": "average\nprecision",
@@ -286,6 +287,7 @@ def compare_command(
         "heldout_log_likelihood": "held-out\nnats a move",
         "seconds": "seconds",
     }
+    _print_reasons(summary)
     print_table(summary["methods"], columns)
     for name, scores in summary["methods"].items():
         if "failed" in scores:
@@ -314,6 +316,12 @@ def simulate_command(
     with working("walking"):
         summary = simulate_walks(map_file, out, walkers)
     console.print(f"{walks} walks, {summary['moves']} moves, in {out}")
+
+
+def _print_reasons(summary: dict[str, Any]) -> None:
+    """Why people are taken to behave as they are, if that was chosen."""
+    for reason in summary["behavior"].get("reasons", ()):
+        console.print(reason, soft_wrap=True)
 
 
 _INTERRUPTED = 130

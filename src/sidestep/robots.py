@@ -3,11 +3,13 @@
 A learned map says how probable a move is to fail, each time anew. A robot may assume more: obstacles stay where they
 are. Then a cell through which somebody walked is free, and what failed once fails again, so that a bump costs the way
 back and around. Who tried until it works would expect two tries at a wall with P(blocked) = ½, and think little of it.
-So a robot that wants to arrive soon, and bumps into nothing if it can, pursues
+But who has bumped into a wall tries the next piece of it, and that is near. So a robot that wants to arrive soon, and
+bumps into nothing if it can, pursues
 
-    R(s, a) = −length(a) − bump_cost · P(a leads nowhere from s),        γ = 1,
+    R(s, a) = −length(a) − bump_cost · P · (1 − P + P/5),        P = P(a leads nowhere from s),        γ = 1,
 
-in the model in which cells that people walked through are known to be free.
+in the model in which cells that people walked through are known to be free: who tries until it works bumps P/(1 − P)
+times, at least once with probability P, and the first bump costs `bump_cost`, each further one a fifth of that.
 """
 
 from collections.abc import Sequence
@@ -25,7 +27,9 @@ from sidestep.tabular.models import ObstacleGrid
 from sidestep.tasks import Task, reach
 
 BUMP_COST = 40.0
-"""What a bump costs beside the move itself, in cell sides: a long way around."""
+"""What the first bump costs beside the move itself, in cell sides: a long way around."""
+_FURTHER = 0.2
+"""The share of it that every further bump costs: the way to the next piece of a wall."""
 
 
 def robot(
@@ -55,4 +59,5 @@ def careful(model: ObstacleGrid, goal: int, bump_cost: float = BUMP_COST) -> Tas
     task = reach(model.blank, goal, discount=1.0, step_cost=1.0)
     states = jnp.arange(model.graph.states)[:, None, None]
     nowhere = jnp.sum(jnp.where(model.graph.successors == states, model.probabilities(), 0), axis=-1)
-    return Task(task.reward - bump_cost * nowhere, task.final_reward, task.terminal, task.discount)
+    bumps = bump_cost * nowhere * (1 - nowhere + _FURTHER * nowhere)
+    return Task(task.reward - bumps, task.final_reward, task.terminal, task.discount)

@@ -8,9 +8,11 @@ import pytest
 from office import call, write_office
 
 from sidestep.commands import compare
+from sidestep.commands.behavior import choose_behavior
 from sidestep.commands.compare import METHODS
 from sidestep.demonstrations import Demonstrations
 from sidestep.io.demonstrations import demonstrations
+from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map, write_map
 from sidestep.io.walks import read_walks
 from sidestep.settings import Settings, fit_map
@@ -66,6 +68,21 @@ def test_what_one_method_cannot_do_is_no_reason_to_say_nothing_of_the_others(off
     assert methods["costs"]["auc"] is methods["costs"]["seconds"] is None
     assert methods["costs"]["failed"] in " ".join(capsys.readouterr().err.split())
     assert np.isfinite(methods["behavior"]["auc"])
+
+
+def test_behavior_is_chosen_by_the_walks_that_are_learned_from_and_for_all(office, tmp_path, monkeypatch):
+    monkeypatch.setattr(compare, "METHODS", {name: METHODS[name] for name in ("behavior", "transitions")})
+    files = (office / "walks.csv", "--map", office / "half.yaml", "--truth", office / "true.yaml", "--out", tmp_path)
+    with console.capture() as captured:
+        assert call("compare", *files, "--behavior", "auto", "--seed", 3) == 0
+    grid, walks = read_map(office / "half.yaml"), read_walks(office / "walks.csv")
+    own = walks.select(np.sort(np.random.default_rng(3).permutation(80)[16:]))
+    choice = choose_behavior(grid, grid_walks(own, grid), Settings(seed=3))
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["behavior"]["reasons"] == choice.reasons
+    assert summary["settings"]["beta"] == choice.settings.beta
+    assert summary["settings"]["unknown"] == ["lapses"]
+    assert all(reason in captured.get() for reason in choice.reasons)
 
 
 def test_a_truth_of_another_place_is_refused(office, tmp_path, capsys):

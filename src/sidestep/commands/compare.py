@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from sidestep.commands.behavior import choose_behavior, told
 from sidestep.commands.truth import read_truth
 from sidestep.demonstrations import Demonstrations
 from sidestep.errors import ImproperTask, InputError, NotConverged
 from sidestep.evaluation import evaluate
-from sidestep.io.demonstrations import demonstrations
+from sidestep.io.demonstrations import demonstrations_of_moves
 from sidestep.io.files import write_json
+from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map
 from sidestep.io.walks import read_walks
 from sidestep.plotting.maps import Panel, figure_learned, save
@@ -50,11 +52,14 @@ def compare(
     settings: Settings,
     hold_out: float = 0.2,
     report: Callable[[str], None] = lambda _: None,
+    choosing: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
     """Learns by every method from some of the walks, scores all, and writes `compare.png` and `summary.json`.
 
     - `hold_out`: the share of walks, drawn by the settings' seed, that are not learned from. How probable their actions
       are under what was learned, in nats a move, is `heldout_log_likelihood`.
+    - `choosing`: called with what is tried while it is chosen how people behave (`commands.behavior`), for all methods
+      and by the walks that are learned from; without it, they behave as the settings say.
 
     The summary has `methods.<name>` with the scores of `evaluate`, that (null if a held-out goal's values are not
     found), and `seconds`; with nothing but the reason, `failed`, for a method that finds no values at all.
@@ -67,9 +72,12 @@ def compare(
     if not 0 < held < len(walks):
         raise InputError(f"expected a share of the {len(walks)} walks, found {hold_out}", field="hold_out")
     drawn = np.random.default_rng(settings.seed).permutation(len(walks))
+    parts = [grid_walks(walks.select(np.sort(some)), given) for some in (drawn[held:], drawn[:held])]
+    choice = choose_behavior(given, parts[0], settings, report=choosing) if choosing else None
+    settings = choice.settings if choice else settings
     own, others = (
-        demonstrations(walks.select(np.sort(some)), given, discount=settings.discount, step_cost=settings.step_cost)
-        for some in (drawn[held:], drawn[:held])
+        demonstrations_of_moves(moves, given, discount=settings.discount, step_cost=settings.step_cost)
+        for moves in parts
     )
     methods, pictures = {}, []
     for name, learn in METHODS.items():
@@ -92,6 +100,7 @@ def compare(
         "command": "compare",
         "files": {"walks": str(walks_file), "map": str(map_file), "truth": str(truth_file)},
         "settings": asdict(settings),
+        "behavior": told(choice) if choice else {},
         "data": {"walks": len(walks) - held, "heldout_walks": held, "moves": len(own), "heldout_moves": len(others)},
         "methods": methods,
     }
