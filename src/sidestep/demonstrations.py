@@ -54,6 +54,11 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         """The number of trajectories."""
         return int(self.trajectory[-1]) + 1
 
+    @property
+    def counted(self) -> Float[Array, " moves"]:
+        """How much each move counts: its weight, or once."""
+        return jnp.ones(len(self)) if self.weight is None else self.weight
+
     def counting(self, trajectories: Bool[np.ndarray, " trajectories"]) -> "Demonstrations[Tasks]":
         """The same moves, of which only those of some trajectories count."""
         weight = np.asarray(trajectories, dtype=np.float64)[np.asarray(self.trajectory)]

@@ -98,7 +98,7 @@ def fit_map(
     if not (np.isfinite(settings.memory) and settings.memory > 0):
         raise InputError(f"expected GiB above 0, found {settings.memory}", field="memory")
     walkers = walkers or settings.people()
-    counted = np.ones(len(demonstrations)) if demonstrations.weight is None else np.asarray(demonstrations.weight)
+    counted = np.asarray(demonstrations.counted)
     prior = _prior_of(settings, model, each)
     if settings.terms != "actions":
         prior = Stood(prior, jnp.asarray(_begun(model, demonstrations, counted)))

@@ -176,7 +176,7 @@ def _tried(
         of_fold = scores(found.model, others, people, settings.horizon)
         held_out.append(of_fold)
         lapses.append(0.0 if people.lapse is None else float(people.lapse))
-        arrived = np.log(np.asarray(transition_probabilities(found.model, others)))[np.asarray(others.weight) > 0]
+        arrived = np.log(np.asarray(transition_probabilities(found.model, others)))[np.asarray(others.counted) > 0]
         actions += np.bincount(of_fold.trajectory, of_fold.log_policy, minlength=count)
         transitions += np.bincount(of_fold.trajectory, arrived, minlength=count)
     return Trial(settings, actions, transitions, len(shown), effective_share(held_out), float(np.mean(lapses)))

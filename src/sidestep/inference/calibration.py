@@ -59,8 +59,7 @@ def scores(
     )
     information = np.asarray(jnp.sum(jnp.exp(log_policy) * by_log_beta**2, axis=-1))
     moves, actions = np.arange(len(q)), np.asarray(demonstrations.actions)
-    weight = demonstrations.weight
-    counted = np.ones(len(q), dtype=bool) if weight is None else np.asarray(weight) > 0
+    counted = np.asarray(demonstrations.counted) > 0
     return Scores(
         np.asarray(by_log_beta)[moves, actions][counted],
         information[counted],

@@ -136,11 +136,8 @@ def choice_log_likelihood(
 def choices_of(demonstrations: Demonstrations) -> Choices:
     """The moves of each task as choices, equal ones counted."""
     task, states, actions = (np.asarray(getattr(demonstrations, name)) for name in ("task", "states", "actions"))
-    different, which, counts = np.unique(
-        np.stack([task, states, actions]), axis=1, return_inverse=True, return_counts=True
-    )
-    if demonstrations.weight is not None:
-        counts = np.bincount(which.ravel(), np.asarray(demonstrations.weight))
+    different, which = np.unique(np.stack([task, states, actions]), axis=1, return_inverse=True)
+    counts = np.bincount(which.ravel(), np.asarray(demonstrations.counted))
     sizes = np.bincount(different[0], minlength=len(demonstrations.tasks.terminal))
     # rounded up to a power of two, so that fits of other data need not be compiled again
     filled = np.arange(2 ** int(np.ceil(np.log2(max(sizes.max(), 16))))) < sizes[:, None]
@@ -175,7 +172,7 @@ def _log_policy(
 
 def _weighted(demonstrations: Demonstrations, parts: Float[Array, " moves"]) -> Float[Array, ""]:
     """The sum over moves, each by its weight."""
-    return parts.sum() if demonstrations.weight is None else parts @ demonstrations.weight.astype(parts.dtype)
+    return parts @ demonstrations.counted.astype(parts.dtype)
 
 
 def _nan_unless(condition: Bool[Array, ""]) -> Float[Array, ""]:
