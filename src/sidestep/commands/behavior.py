@@ -124,6 +124,14 @@ def choose_behavior(
     other = [*attempted(kind), *attempted(replace(kind, beta=_SHARPER * kind.beta))]
     gains = _best(other).nats - _best(own).nats if other else None
     found = (other if gains is not None and _is_worth_it(gains, own[0].moves) else own)[0]
+    found = _sharpened(found, attempted)
+    below, _ = doubtful(found.share, len(found.nats), _SURELY)
+    chosen = replace(found.settings, tempering=found.share if below else 1.0)
+    return Choice(chosen, [*_reasons(chosen, found, gains, settings), *passed_over], trials)
+
+
+def _sharpened(found: Trial, attempted: Callable[[Settings], list[Trial]]) -> Trial:
+    """The trial with β doubled for as long as that is called for."""
     for _ in range(_DOUBLINGS):
         if not doubtful(found.share, len(found.nats), _SURELY)[1]:
             break
@@ -131,9 +139,7 @@ def choose_behavior(
         if not after or after[0].nats.sum() <= found.nats.sum():
             break
         found = after[0]
-    below, _ = doubtful(found.share, len(found.nats), _SURELY)
-    chosen = replace(found.settings, tempering=found.share if below else 1.0)
-    return Choice(chosen, [*_reasons(chosen, found, gains, settings), *passed_over], trials)
+    return found
 
 
 def _is_worth_it(gains: Float[np.ndarray, " walks"], moves: int) -> bool:
