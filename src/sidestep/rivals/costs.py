@@ -29,6 +29,8 @@ from sidestep.tabular.people import People, people
 from sidestep.tasks import Task, with_costs
 
 _ITERATIONS = 5000
+_FLAT = 1e-3
+"""The largest slope where costs count as found (nats); solves to 1e-7 leave the likelihood uncertain by some 1e-4."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +50,7 @@ class CostlyReward(Reward):
 def by_costs(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> Learned:
     """A cost for every cell; the ranking is by costs."""
     model, walkers = true_model(grid.passable()), who_pay(grid, settings)
-    found = fit(model, demonstrations, walkers, terms=("actions",), optimiser=LBFGS(iterations=_ITERATIONS))
+    found = fit(model, demonstrations, walkers, terms=("actions",), optimiser=LBFGS(_ITERATIONS, _FLAT))
     if not found.converged:
         raise NotConverged(f"the costs of cells were not found: {found.message}")
     return costly(model, found.people, settings, np.asarray(found.people.costs).reshape(grid.shape))
