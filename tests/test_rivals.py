@@ -112,9 +112,10 @@ def test_joint_tells_a_costly_floor_from_a_wall():
     np.testing.assert_allclose(learned.reward.costs[carpet == 1], 0.1, atol=0.03)
     assert learned.reward.costs[carpet == 0].max() < 0.02
     assert learned.ranking.max() < 0.1
-    # plans pay what was learned: 4 moves around the end of the carpet rather than 2 across it
+    # people pay what was learned: 4 moves around the end of the carpet rather than 2 across it; robots go across
     path = plan(learned.model, learned.reward.reach(BLANK, 18)).path_from(16)
     assert path.tolist() == [16, 21, 22, 23, 18]
+    assert learned.planner.pursue(18).follow(np.array([16]))[0].tolist() == [16, 17, 18]
 
 
 def walk(*states):

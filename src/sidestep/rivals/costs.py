@@ -24,7 +24,7 @@ from sidestep.settings import Settings
 from sidestep.tabular.backups import Behavior, LogSumExp
 from sidestep.tabular.graph import grid_graph
 from sidestep.tabular.grid import Grid
-from sidestep.tabular.models import ObstacleGrid, true_model
+from sidestep.tabular.models import true_model
 from sidestep.tabular.people import People, people
 from sidestep.tasks import Task, with_costs
 
@@ -53,18 +53,12 @@ def by_costs(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> 
     found = fit(model, demonstrations, walkers, terms=("actions",), optimiser=LBFGS(_ITERATIONS, _FLAT))
     if not found.converged:
         raise NotConverged(f"the costs of cells were not found: {found.message}")
-    return costly(model, found.people, settings, np.asarray(found.people.costs).reshape(grid.shape))
+    costs = np.asarray(found.people.costs)
+    reward = CostlyReward(settings.discount, settings.step_cost, costs)
+    planner = InModel(model, partial(reward.reach, model.blank))
+    return Learned(model, reward, found.people.behavior_of(), costs.reshape(grid.shape), planner)
 
 
 def who_pay(grid: Grid, settings: Settings) -> People:
     """People of maximum causal entropy whom it costs something to aim at cells."""
     return people(Behavior(LogSumExp(), settings.beta), aimed_at=np.asarray(grid_graph(grid).successors[..., 0]))
-
-
-def costly(
-    model: ObstacleGrid, walkers: People, settings: Settings, ranking: Float[np.ndarray, "rows columns"]
-) -> Learned:
-    """What was learned where cells cost something: robots pursue what people do, their costs with it."""
-    reward = CostlyReward(settings.discount, settings.step_cost, np.asarray(walkers.costs))
-    planner = InModel(model, partial(reward.reach, model.blank))
-    return Learned(model, reward, walkers.behavior_of(), ranking, planner)

@@ -15,15 +15,20 @@ fail. And as there people know the true dynamics; Herman et al. also have people
 import numpy as np
 
 from sidestep.demonstrations import Demonstrations
-from sidestep.rivals.costs import costly, who_pay
-from sidestep.rivals.learned import Learned
+from sidestep.rivals.costs import CostlyReward, who_pay
+from sidestep.rivals.learned import Learned, known_map
 from sidestep.settings import Settings, fit_map
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
 
 
 def by_joint(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> Learned:
-    """A cost of every cell and P(blocked) of every unknown one; the ranking is by P(blocked)."""
+    """A cost of every cell and P(blocked) of every unknown one; the ranking is by P(blocked).
+
+    What cells cost people is no concern of robots: they plan as with any learned map.
+    """
     model, walkers = ObstacleGrid(grid, settings.prior_mean), who_pay(grid, settings)
     found = fit_map(model, demonstrations, settings, walkers=walkers)
-    return costly(found.model, found.people, settings, np.asarray(found.model.blocked, dtype=np.float64))
+    learned = known_map(found.model, demonstrations, settings)
+    reward = CostlyReward(settings.discount, settings.step_cost, np.asarray(found.people.costs))
+    return learned._replace(reward=reward, behavior=found.people.behavior_of())
