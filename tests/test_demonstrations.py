@@ -105,3 +105,9 @@ def test_refusals():
     wall = Grid(np.array([[Cell.FREE, Cell.FREE, Cell.OCCUPIED, Cell.FREE]]))
     with pytest.raises(InputError, match=r"row 2.*occupied"):
         demonstrations(walks([0, 3]), wall)
+
+
+def test_moves_count_once_or_by_their_weight():
+    found = gather([trajectory([0, 1, 2], [3, 3]), trajectory([1, 2], [3])], TASKS)
+    assert found.counted.tolist() == [1, 1, 1]
+    assert found.counting(np.array([False, True])).counted.tolist() == [0, 0, 1]

@@ -19,11 +19,29 @@ def test_a_corridor_costs_its_tries_and_its_bumps():
     np.testing.assert_allclose(values, -np.arange(3, -1, -1) * (tries + bump_cost * (p + (bumps - p) / 5)), rtol=1e-9)
 
 
-def test_who_goes_on_trying_to_leave_the_map_bumps_once_more():
+def test_a_move_that_is_sure_to_fail_costs_a_fifth_of_a_bump_a_try():
     model = ObstacleGrid(Grid(np.full((1, 3), Cell.FREE)))
     task = careful(model, 2, 4.0)
     up, down, left, right = np.asarray(task.reward)[0].tolist()
     assert (up, down, left, right) == (-1.8, -1.8, -1.8, -1)
+
+
+def test_what_is_more_probably_blocked_is_never_cheaper():
+    """R alone is: it is what each try is charged, and who is more often stopped tries more often."""
+    worth = []
+    for logit in np.linspace(-6, 6, 25):
+        model = ObstacleGrid(Grid(np.array([[Cell.FREE, Cell.UNKNOWN]])), np.array([0.0, logit]))
+        worth.append(float(plan(model, careful(model, 1)).solution.values[0]))
+    assert (np.diff(worth) < 0).all()
+
+
+def test_a_diagonal_move_fails_if_any_of_three_cells_is_blocked():
+    p, bump_cost = 0.25, 6.0
+    model = ObstacleGrid(Grid.unknown(2, 2, connectivity=8), float(np.log(p / (1 - p))))
+    across = np.flatnonzero((np.asarray(model.graph.successors)[0] == 3).any(axis=-1))
+    fails = 1 - (1 - p) ** 3
+    expected = -np.sqrt(2) - bump_cost * fails * (1 - fails + fails / 5)
+    np.testing.assert_allclose(np.asarray(careful(model, 3, bump_cost).reward)[0, across], [expected], rtol=1e-9)
 
 
 def test_people_have_shown_what_is_free():

@@ -44,12 +44,13 @@ Connected = Annotated[Literal["4", "8"], typer.Option(help="Moves: 4 directions,
 Backup = Annotated[BackupName, typer.Option(help="How walkers value a state by its actions.")]
 Beta = Annotated[float, typer.Option(help="How sharply walkers choose, in units of one over reward.")]
 Discount = Annotated[float, typer.Option(help="γ, above 0 and at most 1.")]
-Chosen = Annotated[
+Behaving = Annotated[
     Literal["given", "auto"],
-    typer.Option(help="auto: the reward, β, lapses and how much actions count are chosen by held-out walks."),
+    typer.Option(help="auto: reward, β, lapses and how much actions count, chosen by parts of the walks in turn."),
 ]
 BumpCost = Annotated[
-    float, typer.Option(help="What the first bump costs a robot beside the move, in cell sides; further ones, a fifth.")
+    float,
+    typer.Option(help="What the first bump at a place costs a robot, in cell sides; further ones, a fifth."),
 ]
 StepCost = Annotated[
     float | None,
@@ -110,7 +111,7 @@ def learn_command(
     ],
     map_file: Annotated[Path, typer.Option("--map", help="ROS map: what is already known.", metavar="MAP.yaml")],
     out: Folder,
-    behavior: Chosen = "given",
+    behavior: Behaving = "given",
     backup: Backup = Settings.backup,  # pyright: ignore[reportArgumentType]
     beta: Beta = Settings.beta,
     lapse: Annotated[float | None, typer.Option(help="The share of actions at random; none by default.")] = None,
@@ -257,7 +258,7 @@ def compare_command(
     map_file: Annotated[Path, typer.Option("--map", help="ROS map: what is already known.", metavar="MAP.yaml")],
     truth: Annotated[Path, typer.Option(help="The true map.", metavar="TRUE.yaml")],
     out: Folder,
-    behavior: Chosen = "given",
+    behavior: Behaving = "given",
     backup: Backup = Settings.backup,  # pyright: ignore[reportArgumentType]
     beta: Beta = Settings.beta,
     discount: Discount = Settings.discount,
@@ -276,7 +277,7 @@ def compare_command(
         seed=seed,
     )
     with working("starting") as say:
-        summary = compare(walks, map_file, truth, out, settings, hold_out, say, say if behavior == "auto" else None)
+        summary = compare(walks, map_file, truth, out, settings, hold_out, say, auto=behavior == "auto")
     columns = {
         "auc": "AUC",
         "average_precision": "average\nprecision",

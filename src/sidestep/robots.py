@@ -2,14 +2,16 @@
 
 A learned map says how probable a move is to fail, each time anew. A robot may assume more: obstacles stay where they
 are. Then a cell through which somebody walked is free, and what failed once fails again, so that a bump costs the way
-back and around. Who tried until it works would expect two tries at a wall with P(blocked) = ½, and think little of it.
-But who has bumped into a wall tries the next piece of it, and that is near. So a robot that wants to arrive soon, and
-bumps into nothing if it can, pursues
+back and around. Who only counted tries would expect two at a wall with P(blocked) = ½, and think little of it.
+
+But who has bumped into a wall tries the next piece of it, and that is near. So a robot plans as if behind every
+obstacle there were another one to try, as probably blocked: P/(1 − P) bumps until it gets through, at least one with
+probability P. The first costs `bump_cost`, each further one a fifth of that. This comes out, together with the lengths
+of the tries, if it pursues
 
     R(s, a) = −length(a) − bump_cost · P · (1 − P + P/5),        P = P(a leads nowhere from s),        γ = 1,
 
-in the model in which cells that people walked through are known to be free: who tries until it works bumps P/(1 − P)
-times, at least once with probability P, and the first bump costs `bump_cost`, each further one a fifth of that.
+in the model in which cells that people walked through are known to be free. Every doubtful move is charged by itself.
 """
 
 from collections.abc import Sequence
@@ -27,7 +29,7 @@ from sidestep.tabular.models import ObstacleGrid
 from sidestep.tasks import Task, reach
 
 BUMP_COST = 40.0
-"""What the first bump costs beside the move itself, in cell sides: a long way around."""
+"""What the first bump at a place costs beside the move itself, in cell sides: a long way around."""
 _FURTHER = 0.2
 """The share of it that every further bump costs: the way to the next piece of a wall."""
 

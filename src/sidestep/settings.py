@@ -107,7 +107,7 @@ def fit_map(
         # where people walked is known without a solve: begin there
         model = fit(model, demonstrations, walkers, prior=prior, terms=("transitions",)).model
     if afresh and isinstance(optimiser, Resilient):
-        model = _taken_as_blocked(model, demonstrations, counted > 0)
+        model = _taken_as_blocked(model, demonstrations, counts=counted > 0)
     return fit(
         model,
         demonstrations,
@@ -166,7 +166,7 @@ def most_iterations(settings: Settings) -> int:
 
 
 def _taken_as_blocked(
-    model: ObstacleGrid, demonstrations: Demonstrations, counted: Bool[np.ndarray, " moves"]
+    model: ObstacleGrid, demonstrations: Demonstrations, counts: Bool[np.ndarray, " moves"]
 ) -> ObstacleGrid:
     """The model, with all unknown cells that nobody visited, in moves that count, as good as blocked.
 
@@ -175,6 +175,6 @@ def _taken_as_blocked(
     """
     visited = np.zeros(model.graph.states, dtype=bool)
     for states in (demonstrations.states, demonstrations.next_states):
-        visited[np.asarray(states)[counted]] = True
+        visited[np.asarray(states)[counts]] = True
     unseen = jnp.asarray(~visited & (np.asarray(model.known).ravel() == Cell.UNKNOWN))
     return model.with_parameters(jnp.where(unseen, _CLOSED, model.parameters))

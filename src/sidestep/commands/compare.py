@@ -16,7 +16,7 @@ from sidestep.errors import ImproperTask, InputError, NotConverged
 from sidestep.evaluation import evaluate
 from sidestep.io.demonstrations import demonstrations_of_moves
 from sidestep.io.files import write_json
-from sidestep.io.gridding import grid_walks
+from sidestep.io.gridding import Moves, grid_walks
 from sidestep.io.maps import read_map
 from sidestep.io.walks import read_walks
 from sidestep.plotting.maps import Panel, figure_learned, save
@@ -52,18 +52,20 @@ def compare(
     settings: Settings,
     hold_out: float = 0.2,
     report: Callable[[str], None] = lambda _: None,
-    choosing: Callable[[str], None] | None = None,
+    auto: bool = False,
 ) -> dict[str, Any]:
     """Learns by every method from some of the walks, scores all, and writes `compare.png` and `summary.json`.
 
     - `hold_out`: the share of walks, drawn by the settings' seed, that are not learned from. How probable their actions
       are under what was learned, in nats a move, is `heldout_log_likelihood`.
-    - `choosing`: called with what is tried while it is chosen how people behave (`commands.behavior`), for all methods
-      and by the walks that are learned from; without it, they behave as the settings say.
+    - `auto`: how people behave is chosen by the walks that are learned from (`commands.behavior`) before any method
+      learns. All but cloning take over the reward and β, those who learn from actions by `fit_map` the tempering.
+      Lapses are learned by behavior-aware modeling; the transitions alone keep the share that learning begins with.
 
     The summary has `methods.<name>` with the scores of `evaluate`, that (null if a held-out goal's values are not
     found), and `seconds`; with nothing but the reason, `failed`, for a method that finds no values at all.
-    Raises `InputError` for files that do not fit, and a share that leaves no walk to learn from or none to score.
+    Raises `InputError` for files that do not fit, and a share that leaves no walk to learn from or none to score; with
+    `auto` also what `choose_behavior` does.
     """
     given = read_map(map_file, connectivity=settings.connectivity)
     truth = read_truth(truth_file, given)
@@ -73,12 +75,11 @@ def compare(
         raise InputError(f"expected a share of the {len(walks)} walks, found {hold_out}", field="hold_out")
     drawn = np.random.default_rng(settings.seed).permutation(len(walks))
     parts = [grid_walks(walks.select(np.sort(some)), given) for some in (drawn[held:], drawn[:held])]
-    choice = choose_behavior(given, parts[0], settings, report=choosing) if choosing else None
-    settings = choice.settings if choice else settings
-    own, others = (
-        demonstrations_of_moves(moves, given, discount=settings.discount, step_cost=settings.step_cost)
-        for moves in parts
-    )
+    own, others = (_shown(moves, given, settings) for moves in parts)
+    choice = choose_behavior(given, parts[0], settings, report=report) if auto else None
+    if choice:
+        settings = choice.settings
+        own, others = (_shown(moves, given, settings) for moves in parts)
     methods, pictures = {}, []
     for name, learn in METHODS.items():
         report(f"learning by {name}")
@@ -109,6 +110,10 @@ def compare(
     save(figure_learned(panels, columns=3, label="P(blocked), or costs, from least to most"), folder / "compare.png")
     write_json(folder / "summary.json", summary)
     return summary
+
+
+def _shown(moves: Moves, grid: Grid, settings: Settings) -> Demonstrations:
+    return demonstrations_of_moves(moves, grid, discount=settings.discount, step_cost=settings.step_cost)
 
 
 def _panel(name: str, learned: Lesson, given: Grid, truth: Grid, shown: Demonstrations) -> Panel:

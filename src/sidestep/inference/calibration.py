@@ -59,12 +59,12 @@ def scores(
     )
     information = np.asarray(jnp.sum(jnp.exp(log_policy) * by_log_beta**2, axis=-1))
     moves, actions = np.arange(len(q)), np.asarray(demonstrations.actions)
-    counted = np.asarray(demonstrations.counted) > 0
+    counts = np.asarray(demonstrations.counted) > 0
     return Scores(
-        np.asarray(by_log_beta)[moves, actions][counted],
-        information[counted],
-        np.asarray(log_policy)[moves, actions][counted],
-        np.asarray(demonstrations.trajectory)[counted],
+        np.asarray(by_log_beta)[moves, actions][counts],
+        information[counts],
+        np.asarray(log_policy)[moves, actions][counts],
+        np.asarray(demonstrations.trajectory)[counts],
     )
 
 

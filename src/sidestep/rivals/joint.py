@@ -8,8 +8,8 @@ what came of it,
 
 is climbed in the costs' k and the cells' logits θ together, with the prior of the costs (`tabular.people`) and, of the
 logits, the settings' own and what the walks' first cells say (`fit_map`). As there, people act by maximum causal
-entropy, whatever backup the settings name: the one thing in which this differs from `costs` is then that moves may
-fail. And as there people know the true dynamics; Herman et al. also have people whose beliefs differ from them.
+entropy, whatever backup the settings name: they differ from those of `costs` in that their moves may fail. And as
+there people know the true dynamics; Herman et al. also have people whose beliefs differ from them.
 """
 
 import numpy as np

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Shaped
+from jaxtyping import Array, Bool, Float, Int
 
 from sidestep.demonstrations import Demonstrations
 from sidestep.tabular.backups import Behavior, Gradient
@@ -92,14 +92,15 @@ def log_policies(
 
 
 class Choices(NamedTuple):
-    """What was done in pursuit of a task: action `actions` in state `states`, `counts` times, or by so much weight.
+    """What was done in pursuit of a task: action `actions` in state `states`, and how much it counts in all.
 
-    With a leading `tasks` axis, for several tasks; shorter lists are filled up with counts of 0.
+    `counts` says how often it was done, where moves have no weights. With a leading `tasks` axis, for several tasks;
+    shorter lists are filled up with counts of 0.
     """
 
     states: Int[Array, "*tasks choices"]
     actions: Int[Array, "*tasks choices"]
-    counts: Shaped[Array, "*tasks choices"]
+    counts: Float[Array, "*tasks choices"]
 
 
 def choice_log_likelihood(
@@ -172,7 +173,7 @@ def _log_policy(
 
 def _weighted(demonstrations: Demonstrations, parts: Float[Array, " moves"]) -> Float[Array, ""]:
     """The sum over moves, each by its weight."""
-    return parts @ demonstrations.counted.astype(parts.dtype)
+    return jnp.sum(parts * demonstrations.counted.astype(parts.dtype))
 
 
 def _nan_unless(condition: Bool[Array, ""]) -> Float[Array, ""]:
