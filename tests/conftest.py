@@ -18,6 +18,13 @@ settings.register_profile("sidestep", deadline=None, max_examples=25)
 settings.load_profile("sidestep")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _nothing_stays_compiled():
+    """What all modules compile takes more mappings of memory than Linux lets a process have: 65,530."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture(scope="module")
 def unoptimised():
     """Compiled quickly rather than well, for tests that compile large functions and run them briefly."""
