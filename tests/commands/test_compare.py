@@ -70,7 +70,7 @@ def test_what_one_method_cannot_do_is_no_reason_to_say_nothing_of_the_others(off
     assert np.isfinite(methods["behavior"]["auc"])
 
 
-def test_behavior_is_chosen_by_the_walks_that_are_learned_from_and_for_all(office, tmp_path, monkeypatch):
+def test_behavior_is_chosen_by_the_walks_that_are_learned_from(office, tmp_path, monkeypatch):
     monkeypatch.setattr(compare, "METHODS", {name: METHODS[name] for name in ("behavior", "transitions")})
     files = (office / "walks.csv", "--map", office / "half.yaml", "--truth", office / "true.yaml", "--out", tmp_path)
     with console.capture() as captured:
