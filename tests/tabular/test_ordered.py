@@ -329,7 +329,7 @@ def settled_rounds():
     values = np.asarray(found.values)[order]
     solved = values.copy()
     valuing = Valuing(KERNELS[BoltzmannAverage], one, 0 * one)
-    rounds = Rounds(world, values, np.arange(420, dtype=np.int32), valuing, np.float64(1e-11), 1000)
+    rounds = Rounds(world, values, np.arange(420, dtype=np.int32), valuing, np.float64(1e-11), 1000, 1000)
     assert rounds.until_still().converged
     return rounds, solved
 
@@ -380,6 +380,19 @@ def test_a_start_that_leads_astray_costs_no_more_than_it_was_trusted(seed, toler
     warm = solve(open_model, goal, walkers, solver=solver, start=start)
     assert warm.sweeps <= cold.sweeps + trusted + 1
     np.testing.assert_allclose(warm.values, cold.values, rtol=10 * tolerance)
+
+
+def test_a_start_nearby_is_not_given_up_though_it_takes_many_rounds():
+    truth = office(120, 120, 4)
+    wall = truth.known.reshape(-1) == 1
+    logits = np.where(wall, 4.0, -4.0)
+    model, nearby = (ObstacleGrid(truth.forget(), jnp.asarray(share * logits)) for share in (1.0, 1.02))
+    goal = reach(truth.forget(), int(np.flatnonzero(~wall)[0]), discount=1.0, step_cost=1.0)
+    walkers, solver = Behavior(LogSumExp(), 5.0), Ordered(tolerance=1e-5)
+    start = solve(model, goal, walkers, solver=solver).start
+    cold, warm = (solve(nearby, goal, walkers, solver=solver, start=each) for each in (None, start))
+    assert warm.sweeps < cold.sweeps
+    np.testing.assert_allclose(warm.values, cold.values, rtol=1e-4)
 
 
 def test_a_start_is_trusted_for_a_while_even_if_no_tolerance_is_left():

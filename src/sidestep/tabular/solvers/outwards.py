@@ -24,6 +24,8 @@ _TRUST = 1.2
 
 A start that leads astray makes changes run along a front that the old order cannot follow, a stretch a round.
 """
+_TRUSTED_ROUNDS = 4
+"""How many rounds it may take for each of these sweeps; most rounds solve few states, and are cheap."""
 
 
 class _Asked(NamedTuple):
@@ -65,11 +67,13 @@ def find_values(
     if (start > nothing).any():
         digits = -np.log10(max(asked.tolerance, np.finfo(start.dtype).eps))
         trusted = int(np.ceil(_TRUST * max(1.0, digits)))
-        outcome = _start_from(start, order, asked, min(trusted, max_sweeps), found)
+        trusted = min(trusted, max_sweeps)
+        outcome = _start_from(start, order, asked, trusted, _TRUSTED_ROUNDS * trusted, found)
     if not outcome.converged and outcome.sweeps < max_sweeps:
         # where values led astray, their order is no better
         cold, known_order = np.full_like(start, nothing), np.full_like(order, -1) if outcome.sweeps else order
-        again = _start_from(cold, known_order, asked, max_sweeps - outcome.sweeps, found)
+        left = max_sweeps - outcome.sweeps
+        again = _start_from(cold, known_order, asked, left, left, found)
         outcome = again._replace(sweeps=outcome.sweeps + again.sweeps)
     write(found, found.order, outcome)
 
@@ -82,7 +86,12 @@ def _anything_missing(asked: _Asked) -> bool:
 
 
 def _start_from(
-    start: Float[np.ndarray, " states"], order: Int[np.ndarray, " states"], asked: _Asked, max_sweeps: int, found: Found
+    start: Float[np.ndarray, " states"],
+    order: Int[np.ndarray, " states"],
+    asked: _Asked,
+    max_sweeps: int,
+    max_rounds: int,
+    found: Found,
 ) -> Outcome:
     """Solves from values and an order that may serve; writes down the values and the order that did."""
     begun = _begin(start, order, asked) if positions(order) is not None else None
@@ -92,7 +101,7 @@ def _start_from(
             given.successors, given.probabilities, given.reward, given.terminal, float(given.discount)
         )
         begun = _begin(start, best, asked)
-    rounds = Rounds(begun.world, begun.values, begun.favourite, asked.valuing, asked.tolerance, max_sweeps)
+    rounds = Rounds(begun.world, begun.values, begun.favourite, asked.valuing, asked.tolerance, max_sweeps, max_rounds)
     outcome = rounds.until_still()
     found.values[begun.order] = begun.values
     found.order[:] = begun.order

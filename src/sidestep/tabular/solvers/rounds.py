@@ -45,6 +45,7 @@ class Rounds:
     """Values on their way to the fixed point, states by position; and how much has been done so far.
 
     - `values`: are changed where they are.
+    - `max_sweeps`, `max_rounds`: when to give up: so often a state was solved on average, or after so many rounds.
     - `number`: of the last sweep over any states; `first`: of the first one of the present round.
     - `rounds`: how many have been begun; `solved`: how many states have been solved, in all sweeps together.
     """
@@ -57,10 +58,11 @@ class Rounds:
         valuing: Valuing,
         tolerance: np.floating,
         max_sweeps: int,
+        max_rounds: int,
     ):
         states = len(values)
         self.world, self.values, self.valuing, self.tolerance = world, values, valuing, tolerance
-        self.max_sweeps = max_sweeps
+        self.max_sweeps, self.max_rounds = max_sweeps, max_rounds
         self.marks = Marks(values.copy(), favourite, np.zeros(states, np.int32), np.zeros(states, np.int32))
         self.everywhere = np.arange(states, dtype=np.int32)
         size = max(_SMALLEST_STRETCH, int(_STRETCH * states**0.5))
@@ -166,4 +168,4 @@ class Rounds:
 
     def _given_up(self) -> bool:
         # rounds count too: a few states that never settle should not keep all others waiting
-        return self.solved >= self.max_sweeps * len(self.values) or self.rounds >= self.max_sweeps
+        return self.solved >= self.max_sweeps * len(self.values) or self.rounds >= self.max_rounds
