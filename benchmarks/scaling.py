@@ -10,22 +10,26 @@ value and gradient of the walkers' action log-likelihood with respect to all cel
 - **cold**: starting from nothing;
 - **warm**: after a step of an optimiser, starting from what the solve before it left (values, order, adjoint). The step
   is along the gradient, its largest component `--step` long; with `--step-by-sign` every component is that long;
+- **region**: the same, but that only the states are solved that mattered to the solve before (`Ordered` alone leaves
+  the others out), as a fit of a large map does until it has converged;
 - **Dijkstra**: `scipy.sparse.csgraph.dijkstra` from the goal over the expected cost of every move, the matrix given.
 
 The three take turns in one process and medians count. Peak memory is that of a process of its own that builds the
-problem and takes one cold and one warm gradient: the largest resident set of the whole process, imports and compiler
+problem and takes a gradient of each kind: the largest resident set of the whole process, imports and compiler
 included, and its excess over what was held after the imports.
 
 The **exponent** is that of the power law through the times from 128² cells on, and the worst one between two sizes
 in a row. Sizes are timed one after another, so on a machine that others use too the exponents of the units tell more:
 they are by how much more than Dijkstra's a gradient's cost grows.
 
-Records (`--json`): `name` (solver), `backup`, `cells`, `tasks`, `cold_seconds`, `warm_seconds`, `dijkstra_seconds`
-(medians), `cold_units`, `warm_units` (medians over turns of the ratio to the same turn's Dijkstra), `best_...` (the
-fastest turn), `cold_sweeps`, `warm_sweeps`, `converged`, `tolerance`, `step` (its largest component), `moves`,
-`turns`, `peak_bytes` (the whole process), `imports_bytes` (held after imports), `excess_bytes` (what the peak exceeds
-that by), `gradient_bytes` (peak while the gradients are taken, compilation included, less what was held before) and
-`building_bytes` (the peak before that). Beside them `exponents`: `name, backup, kind, fitted, worst`.
+Records (`--json`): `name` (solver), `backup`, `cells`, `tasks`, `cold_seconds`, `warm_seconds`, `region_seconds`,
+`dijkstra_seconds` (medians), `cold_units`, `warm_units`, `region_units` (medians over turns of the ratio to the same
+turn's Dijkstra), `best_...` (the fastest turn), `cold_sweeps`, `warm_sweeps`, `region_sweeps`, `region` (the share of
+the states that mattered), `region_error` (the largest difference between its gradient and the warm one, as a share of
+the largest component), `converged`, `tolerance`, `step` (its largest component), `moves`, `turns`, `peak_bytes` (the
+whole process), `imports_bytes` (held after imports), `excess_bytes` (what the peak exceeds that by), `gradient_bytes`
+(peak while the gradients are taken, compilation included, less what was held before) and `building_bytes` (the peak
+before that). Beside them `exponents`: `name, backup, kind, fitted, worst`.
 """
 
 import argparse
@@ -90,6 +94,10 @@ class Step(NamedTuple):
     converged: Bool[Array, ""]
 
 
+KINDS = ("cold", "warm", "region")
+"""The kinds of gradients that are timed."""
+
+
 def problem_of(world: World, name: str, backup: str, arguments: argparse.Namespace) -> Problem:
     """The problem in a world."""
     demos = world.demonstrations(arguments.discount, arguments.step_cost)
@@ -98,18 +106,23 @@ def problem_of(world: World, name: str, backup: str, arguments: argparse.Namespa
 
 
 @eqx.filter_jit
-def take(problem: Problem, parameters: Float[Array, "..."], start: Start) -> Step:
-    """The action log-likelihood and its gradient, from a start; the new start holds the new adjoint."""
+def take(
+    problem: Problem, parameters: Float[Array, "..."], start: Start, region: Bool[Array, "tasks states"] | None = None
+) -> Step:
+    """The action log-likelihood and its gradient, from a start; the new start holds the new adjoint.
+
+    With a region, only its states are solved.
+    """
+    region = jnp.ones(start.values.shape, dtype=bool) if region is None else region
 
     def objective(parameters: Array, adjoint: Array) -> tuple[Array, tuple]:
         model, begun = problem.model.with_parameters(parameters), start._replace(adjoint=adjoint)
 
-        def one(task: Task, choices: Choices, begun: Start) -> tuple[Array, Solution]:
-            return choice_log_likelihood(
-                model, task, choices, problem.behavior, begun, gradient=problem.gradient, solver=problem.solver
-            )
+        def one(task: Task, choices: Choices, begun: Start, region: Array) -> tuple[Array, Solution]:
+            how = {"gradient": problem.gradient, "solver": problem.solver, "region": region}
+            return choice_log_likelihood(model, task, choices, problem.behavior, begun, **how)
 
-        values, found = jax.vmap(one)(problem.demonstrations.tasks, problem.choices, begun)
+        values, found = jax.vmap(one)(problem.demonstrations.tasks, problem.choices, begun, region)
         return values.sum(), (found.start, found.sweeps, found.converged.all())
 
     differentiated = jax.value_and_grad(objective, argnums=(0, 1), has_aux=True)
@@ -124,14 +137,15 @@ def stepped(parameters: Array, gradient: Array, arguments: argparse.Namespace) -
     return parameters + arguments.step * direction / (1 if arguments.step_by_sign else largest)
 
 
-def cold_and_warm(problem: Problem, arguments: argparse.Namespace) -> Iterator[Step]:
-    """A gradient from nothing, then one after a step, each when it is asked for."""
+def of_all_kinds(problem: Problem, arguments: argparse.Namespace) -> Iterator[Step]:
+    """A gradient of each of `KINDS`, each when it is asked for."""
     at = problem.model.parameters
     found = jax.block_until_ready(take(problem, at, problem.cold_start()))
     yield found
     at = jax.block_until_ready(stepped(at, found.gradient, arguments))
     start = found.start
     yield jax.block_until_ready(take(problem, at, start))
+    yield jax.block_until_ready(take(problem, at, start, start.region))
 
 
 # ---------------------------------------------------------------------------------------------------- measuring
@@ -142,7 +156,7 @@ def measure(
 ) -> list[dict[str, Any]]:
     """The records of one map and backup, a record a solver; Dijkstra and all solvers take turns."""
     problems = {name: problem_of(world, name, backup, arguments) for name in names}
-    steps = {name: list(cold_and_warm(problem, arguments)) for name, problem in problems.items()}
+    steps = {name: list(of_all_kinds(problem, arguments)) for name, problem in problems.items()}
     moves = expected_costs(world.model)
 
     def search() -> float:
@@ -153,14 +167,16 @@ def measure(
         start = jax.block_until_ready(problem.cold_start())
         return measuring.seconds_of(lambda: jax.block_until_ready(take(problem, problem.model.parameters, start)))
 
-    def warm(name: str) -> float:
+    def warm(name: str, within: bool = False) -> float:
         problem, first = problems[name], steps[name][0]
         at = jax.block_until_ready(stepped(problem.model.parameters, first.gradient, arguments))
-        return measuring.seconds_of(lambda: jax.block_until_ready(take(problem, at, first.start)))
+        region = jax.block_until_ready(first.start.region) if within else None
+        return measuring.seconds_of(lambda: jax.block_until_ready(take(problem, at, first.start, region)))
 
     calls = {"dijkstra": search}
     for name in names:
         calls |= {f"cold {name}": partial(cold, name), f"warm {name}": partial(warm, name)}
+        calls[f"region {name}"] = partial(warm, name, within=True)
     taken = measuring.in_turns(calls, arguments.turns, arguments.budget)
     return [
         {
@@ -183,7 +199,7 @@ def _times(taken: Mapping[str, Sequence[float]], name: str) -> dict[str, Any]:
     """Medians, in seconds and in units of the search in the same turn."""
     searches = taken["dijkstra"]
     found: dict[str, Any] = {"dijkstra_seconds": measuring.median(searches), "best_dijkstra_seconds": min(searches)}
-    for kind in ("cold", "warm"):
+    for kind in KINDS:
         own = taken[f"{kind} {name}"]
         found[f"{kind}_seconds"] = measuring.median(own)
         found[f"best_{kind}_seconds"] = min(own)
@@ -195,11 +211,16 @@ def _times(taken: Mapping[str, Sequence[float]], name: str) -> dict[str, Any]:
 
 def _went(steps: Sequence[Step]) -> dict[str, Any]:
     """The sweeps of the values, and whether values and adjoints all converged; they must."""
-    cold, warm = steps
     # an adjoint that did not converge leaves a gradient of NaN
-    if not all(step.converged and jnp.isfinite(step.gradient).all() for step in (cold, warm)):
+    if not all(step.converged and jnp.isfinite(step.gradient).all() for step in steps):
         raise NotConverged("the values or the adjoint did not converge: try another tolerance or backup")
-    return {"cold_sweeps": int(cold.sweeps.max()), "warm_sweeps": int(warm.sweeps.max()), "converged": True}
+    cold, warm, region = steps
+    return {
+        **{f"{kind}_sweeps": int(step.sweeps.max()) for kind, step in zip(KINDS, steps, strict=True)},
+        "region": float(cold.start.region.mean()),
+        "region_error": float(jnp.abs(region.gradient - warm.gradient).max() / jnp.abs(warm.gradient).max()),
+        "converged": True,
+    }
 
 
 def _memory(size: int, saved: Path, name: str, backup: str, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -213,14 +234,14 @@ def _memory(size: int, saved: Path, name: str, backup: str, arguments: argparse.
 
 
 def measure_memory(asked: str, imports: int) -> None:
-    """Takes one cold and one warm gradient in this process and prints what it needed."""
+    """Takes a gradient of each kind in this process and prints what it needed."""
     given = json.loads(asked)
     arguments = argparse.Namespace(**given)
     problem = problem_of(load(Path(given["world"])), given["name"], given["backup"], arguments)
     jax.block_until_ready(problem)
     built, building = measuring.held_bytes(), measuring.peak_bytes()
     known = measuring.reset_peak()
-    for _ in cold_and_warm(problem, arguments):
+    for _ in of_all_kinds(problem, arguments):
         pass
     taking = measuring.peak_bytes()
     peak = max(building, taking)
@@ -237,7 +258,8 @@ def exponents(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     rows = []
     for name, backup in dict.fromkeys((record["name"], record["backup"]) for record in records):
         own = [r for r in records if (r["name"], r["backup"]) == (name, backup) and r["cells"] >= FROM_CELLS]
-        for kind in ("cold_seconds", "warm_seconds", "dijkstra_seconds", "cold_units", "warm_units"):
+        seconds = [f"{kind}_seconds" for kind in (*KINDS, "dijkstra")]
+        for kind in (*seconds, *(f"{kind}_units" for kind in KINDS)):
             if len(own) > 1:
                 fitted, worst = power_law([r["cells"] for r in own], [r[kind] for r in own])
                 rows.append({"name": name, "backup": backup, "kind": kind, "fitted": fitted, "worst": worst})
@@ -252,16 +274,16 @@ def power_law(sizes: Sequence[float], times: Sequence[float]) -> tuple[float, fl
 
 def print_records(records: Sequence[Mapping[str, Any]], arguments: argparse.Namespace) -> None:
     """The tables."""
-    columns = ("map", "solver", "backup", "cold ms", "warm ms", "Dijkstra ms", "cold units", "warm units")
-    columns += ("sweeps", "peak MiB", "imports", "excess", "gradients")
+    columns = ("map", "solver", "backup", *(f"{kind} ms" for kind in (*KINDS, "unit")))
+    columns += (*(f"{kind} units" for kind in KINDS), "matters", "peak MiB", "imports", "excess", "gradients")
     rows = [
         (
             f"{round(record['cells'] ** 0.5)}²",
             record["name"],
             record["backup"],
-            *(measuring.milliseconds(record[key]) for key in ("cold_seconds", "warm_seconds", "dijkstra_seconds")),
-            *(measuring.number(record[key], ".2f") for key in ("cold_units", "warm_units")),
-            f"{record['cold_sweeps']}, {record['warm_sweeps']}",
+            *(measuring.milliseconds(record[f"{kind}_seconds"]) for kind in (*KINDS, "dijkstra")),
+            *(measuring.number(record[f"{kind}_units"], ".2f") for kind in KINDS),
+            measuring.number(record["region"], ".2f"),
             *(measuring.mebibytes(record[f"{key}_bytes"]) for key in ("peak", "imports", "excess", "gradient")),
         )
         for record in records

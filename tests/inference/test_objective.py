@@ -9,7 +9,7 @@ from walled import BLANK
 
 from sidestep.inference import batches
 from sidestep.inference.batches import planned
-from sidestep.inference.objective import MEMORY, Objective, Problem
+from sidestep.inference.objective import MEMORY, Objective, Problem, _of_actions
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.graph import grid_graph
@@ -159,6 +159,66 @@ def test_what_changed_since_is_counted_from_where_a_part_was_solved(a_task_a_bat
     assert once.parts[0] is first
     twice, _ = objective.evaluate(at(POINT + 2 * direction), starts, known=once.parts, negligible=0.1)
     assert twice.parts[0] is not first
+
+
+@pytest.fixture
+def evaluated(monkeypatch):
+    """For each batch that is evaluated, whether all states were to be solved."""
+    asked = []
+
+    def of_actions(problem, parameters, batch, starts, everywhere, mesh):
+        asked.append(everywhere)
+        return _of_actions(problem, parameters, batch, starts, everywhere, mesh)
+
+    monkeypatch.setattr("sidestep.inference.objective._of_actions", of_actions)
+    return asked
+
+
+def test_where_little_has_changed_only_states_that_mattered_are_solved(a_task_a_batch, evaluated):
+    objective, whole = a_task_a_batch
+    found, starts = objective.evaluate(at(POINT), objective.cold_starts())
+    moved = at(POINT + 1e-3 * BENT)
+    changes = [np.abs(part.slope.model * 1e-3 * BENT).sum() / abs(part.actions) for part in found.parts]
+    little = float(np.mean(np.sort(changes)[1:3]))
+    exact, _ = whole.evaluate(moved, whole.cold_starts())
+    evaluated.clear()
+    again, _ = objective.evaluate(moved, starts, known=found.parts, little=little)
+    assert evaluated == [not change < little for change in changes]
+    assert set(evaluated) == {False, True}
+    np.testing.assert_allclose(again[:4], exact[:4], rtol=1e-8)
+    evaluated.clear()
+    objective.evaluate(moved, starts, known=found.parts)
+    objective.evaluate(moved, starts, little=little)
+    assert evaluated == [True] * 10
+
+
+def test_states_that_come_to_matter_are_solved_after_all(a_task_a_batch, evaluated):
+    """Where solves of the states that are said to matter leave no gradient, all states are solved."""
+    objective, whole = a_task_a_batch
+    found, starts = objective.evaluate(at(POINT), objective.cold_starts())
+    moved = at(POINT + 0.1 * BENT)
+    exact, _ = whole.evaluate(moved, whole.cold_starts())
+    hardly_any = [start._replace(adjoint=jnp.zeros_like(start.adjoint).at[:, 12].set(1.0)) for start in starts]
+    evaluated.clear()
+    again, left = objective.evaluate(moved, hardly_any, known=found.parts, little=np.inf)
+    assert evaluated == [False, True] * 5
+    np.testing.assert_allclose(again[:4], exact[:4], rtol=1e-8)
+    np.testing.assert_allclose(again.slope.model, exact.slope.model, rtol=1e-7, atol=1e-7)
+    assert all(np.isfinite(start.adjoint).all() for start in left)
+
+
+def test_values_that_fail_are_not_solved_again(a_task_a_batch, evaluated):
+    """They would do no better. And where nothing is known of a part, all states are solved."""
+    objective, _ = a_task_a_batch
+    found, starts = objective.evaluate(at(POINT), objective.cold_starts())
+    hasty = Objective(problem_of(Ordered(max_sweeps=1)), MEMORY, takes_over=True)
+    evaluated.clear()
+    again, _ = hasty.evaluate(at(POINT + BENT), starts, known=found.parts, little=np.inf)
+    assert np.isnan(again.objective)
+    assert evaluated == [False] * 5
+    evaluated.clear()
+    objective.evaluate(at(POINT), starts, known=again.parts, little=np.inf)
+    assert evaluated == [True] * 5
 
 
 def test_long_solves_to_take_over_come_in_batches_of_no_more_tasks_than_cores():

@@ -329,7 +329,8 @@ def settled_rounds():
     values = np.asarray(found.values)[order]
     solved = values.copy()
     valuing = Valuing(KERNELS[BoltzmannAverage], one, 0 * one)
-    rounds = Rounds(world, values, np.arange(420, dtype=np.int32), valuing, np.float64(1e-11), 1000, 1000)
+    everyone = np.arange(420, dtype=np.int32)
+    rounds = Rounds(world, values, everyone, everyone, valuing, np.float64(1e-11), 1000, 1000)
     assert rounds.until_still().converged
     return rounds, solved
 

@@ -12,9 +12,11 @@ batch's tasks and the shares are added up (JAX's SPMD; on several machines, the 
 What a batch's solves leave behind (values, adjoints, orders) is where those of the next evaluation start. It stays on
 the device whose tasks they are; everything else that an evaluation yields, all processes have.
 
-An evaluation may also take over parts of an earlier one: what a batch adds is known, to first order, to change by less
-than Σ |∂ log L/∂θ · Δθ|, and where the tasks of a batch are elsewhere than the parameters that have changed that is
-nothing. It is an estimate, so who asks for one must look again before relying on it.
+An evaluation may also save work by what it knows of an earlier one: what a batch adds is known, to first order, to
+change by less than Σ |∂ log L/∂θ · Δθ|. Where the tasks of a batch are elsewhere than the parameters that have changed
+that is nothing, and the part is taken over. Where it is little, only the states are solved that mattered before; if
+others have come to matter (see `process`), the batch is evaluated again, all states solved. These are estimates, so who
+asks for them must look again before relying on them.
 """
 
 from collections.abc import Sequence
@@ -159,12 +161,15 @@ class Objective:
         tolerance: float | None = None,
         known: Sequence[Part] = (),
         negligible: float = 0.0,
+        little: float = 0.0,
     ) -> tuple[Evaluation, list[Start]]:
         """The objective at θ, and where the next evaluation may start.
 
         - `tolerance`: that of the solves, where the solver leaves it open. The objective is NaN if a solve failed.
         - `known`: the parts of an earlier evaluation with the same tolerance. Those at the same θ are taken over, and
           those to which, by their slope, the way from their θ to this one makes a difference below `negligible` (nats).
+        - `little`: as a share of what a batch added, the difference that this way may make for only those states to be
+          solved that mattered.
         """
         slope, (transitions, prior) = jax.tree.map(np.asarray, _apart_from_actions(self.problem, parameters))
         here = jax.tree.map(np.asarray, parameters)
@@ -175,7 +180,10 @@ class Objective:
             if known and _unchanged(known[index], here, negligible):
                 part, after = known[index], start
             else:
-                found, by, after, how = _of_actions(solving, parameters, batch, start, self.mesh)
+                everywhere = not known or not _changed_by(known[index], here) < little * abs(known[index].actions)
+                found, by, after, how = _of_actions(solving, parameters, batch, start, everywhere, self.mesh)
+                if not everywhere and jnp.isfinite(found) and not _finite(by):
+                    found, by, after, how = _of_actions(solving, parameters, batch, after, True, self.mesh)
                 part = Part(here, float(found), jax.tree.map(np.asarray, by), how)
             actions += part.actions
             slope = jax.tree.map(np.add, slope, part.slope)
@@ -192,13 +200,22 @@ def tasks_mesh(devices: Sequence[Any] | None = None) -> Mesh:
     return Mesh(np.asarray(jax.devices() if devices is None else devices), (AXIS,))
 
 
+def _finite(slope: PyTree[Array]) -> bool:
+    return all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(slope))
+
+
 def _unchanged(part: Part, parameters: PyTree[np.ndarray], negligible: float) -> bool:
     """Whether a part is at the same θ, or, by its slope, as good as that."""
     moves = jax.tree.leaves(jax.tree.map(np.subtract, parameters, part.parameters))
-    if not any(move.any() for move in moves):
-        return True
-    slopes = jax.tree.leaves(part.slope)
-    return sum(float(np.abs(slope * move).sum()) for slope, move in zip(slopes, moves, strict=True)) < negligible
+    return not any(move.any() for move in moves) or _changed_by(part, parameters) < negligible
+
+
+def _changed_by(part: Part, parameters: PyTree[np.ndarray]) -> float:
+    """By how many nats at most, to first order, what a batch adds has changed since."""
+    changes = jax.tree.map(
+        lambda slope, now, then: np.abs(slope * (now - then)).sum(), part.slope, parameters, part.parameters
+    )
+    return float(sum(jax.tree.leaves(changes)))
 
 
 @eqx.filter_jit
@@ -218,12 +235,12 @@ def _apart_from_actions(problem: Problem, parameters: Parameters) -> tuple[PyTre
 
 
 def _of_actions(
-    problem: Problem, parameters: PyTree, batch: Batch, starts: Start, mesh: Mesh | None
+    problem: Problem, parameters: PyTree, batch: Batch, starts: Start, everywhere: bool, mesh: Mesh | None
 ) -> tuple[Array, PyTree, Start, Solved]:
     """The actions' log-likelihood over the tasks of a batch, the slope of the loss, new starts, how the solves went."""
     if mesh is None:
-        return _share(problem, parameters, batch, starts)
-    part, slope, left, solved = _shares(problem, parameters, batch, starts, mesh)
+        return _share(problem, parameters, batch, starts, jnp.asarray(everywhere))
+    part, slope, left, solved = _shares(problem, parameters, batch, starts, jnp.asarray(everywhere), mesh)
     # Devices that wait for each other give up after some seconds, and one may have far more to do than the others: so
     # they first finish all their work, and only then is it added up.
     jax.block_until_ready((part, slope))
@@ -233,12 +250,12 @@ def _of_actions(
 
 @eqx.filter_jit
 def _share(
-    problem: Problem, parameters: Parameters, batch: Batch, starts: Start
+    problem: Problem, parameters: Parameters, batch: Batch, starts: Start, everywhere: Bool[Array, ""]
 ) -> tuple[Array, PyTree, Start, Solved]:
     """`_of_actions` on one device."""
 
     def of_one(
-        model: TransitionModel, people: People, task: Task, person: Array, choices: Choices, start: Start
+        model: TransitionModel, people: People, task: Task, person: Array, choices: Choices, start: Start, region: Array
     ) -> tuple[Array, tuple]:
         value, found = choice_log_likelihood(
             model,
@@ -249,6 +266,7 @@ def _share(
             horizon=problem.horizon,
             gradient=problem.gradient,
             solver=problem.solver,
+            region=region,
         )
         stuck = (choices.counts > 0) & ~reachable(found.values[choices.states])
         return value, (found.start, Solved(found.sweeps, found.residual, found.converged, stuck))
@@ -257,10 +275,11 @@ def _share(
         model = problem.model.with_parameters(parameters.model)
         people = problem.people.with_parameters(parameters.people)
         given = starts._replace(adjoint=adjoint)
-        each = jax.vmap(of_one, in_axes=(None, None, 0, 0, 0, 0))
-        values, left = each(model, people, batch.tasks, batch.person, batch.choices, given)
+        each = jax.vmap(of_one, in_axes=(None, None, 0, 0, 0, 0, 0))
+        values, left = each(model, people, batch.tasks, batch.person, batch.choices, given, region)
         return -problem.tempering.astype(values.dtype) * values.sum(), left
 
+    region = starts.region | everywhere
     # the gradient by the old adjoint is the new one
     gradient = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
     (value, (left, solved)), (slope, adjoint) = gradient(parameters, starts.adjoint)
@@ -269,14 +288,14 @@ def _share(
 
 @eqx.filter_jit
 def _shares(
-    problem: Problem, parameters: PyTree, batch: Batch, starts: Start, mesh: Mesh
+    problem: Problem, parameters: PyTree, batch: Batch, starts: Start, everywhere: Bool[Array, ""], mesh: Mesh
 ) -> tuple[Array, PyTree, Start, Solved]:
     """`_share` of every device; sums over its tasks have an axis of devices in front."""
-    known, settings = eqx.partition((problem, parameters), eqx.is_array)
+    known, settings = eqx.partition((problem, parameters, everywhere), eqx.is_array)
 
     def share(known: PyTree, batch: Batch, starts: Start) -> tuple[Array, PyTree, Start, Solved]:
-        problem, parameters = eqx.combine(known, settings)
-        part, slope, left, solved = _share(problem, parameters, batch, starts)
+        problem, parameters, everywhere = eqx.combine(known, settings)
+        part, slope, left, solved = _share(problem, parameters, batch, starts, everywhere)
         part, slope = jax.tree.map(lambda leaf: leaf[None], (part, slope))
         return part, slope, left, solved
 

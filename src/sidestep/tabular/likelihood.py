@@ -113,11 +113,13 @@ def choice_log_likelihood(
     horizon: int | None = None,
     gradient: Gradient = "exact",
     solver: Solver | None = None,
+    region: Bool[Array, " states"] | None = None,
 ) -> tuple[Float[Array, ""], Solution]:
     """Σ log π_θ(a | s) over the choices made in pursuit of one task, and the task's solution (from `start`).
 
-    NaN if its values did not converge. Over the tasks of `choices_of(demonstrations)` it adds up to
-    `action_log_likelihood`.
+    The arguments are those of `solve`. NaN if its values did not converge. Over the tasks of
+    `choices_of(demonstrations)`
+    it adds up to `action_log_likelihood`.
     """
     solution = solve(
         model,
@@ -128,6 +130,7 @@ def choice_log_likelihood(
         solver=solver,
         start=start,
         visited=choices.states,
+        region=region,
     )
     q = solution.action_values
     total = jnp.sum(choices.counts.astype(q.dtype) * _log_policy(behavior, q, choices.actions))

@@ -59,6 +59,7 @@ def solve(
     solver: Solver | None = None,
     start: Start | None = None,
     visited: Int[Array, "*tasks visited"] | None = None,
+    region: Bool[Array, "*tasks states"] | None = None,
 ) -> Solution:
     """The values of one task, or of a stack of tasks, for people who behave as `behavior` says under `model`.
 
@@ -70,6 +71,9 @@ def solve(
       new adjoint λ, for the next solve to start from.
     - `visited`: the states whose action values are wanted; by default all. Asking for few saves time and memory when
       they are differentiated.
+    - `region`: the states that have to be solved, by default all; `start.region` are those that mattered to what the
+      solve that left the start was asked for. The others are brought up to date only roughly. That saves time; if they
+      turn out to matter, derivatives are NaN (see `process`).
 
     The numbers have the dtype of the model's probabilities. May be used under `jit`, `vmap` and `grad`. Look at
     `converged` before you use the numbers; `check_proper` tells beforehand whether values exist.
@@ -83,7 +87,9 @@ def solve(
     solver = solver or solver_for(behavior.backup, model.graph.states)
     begin = start or _cold_start(solver, model.graph.states, dtype, task.terminal.shape[:-1])
 
-    def one(task: Task, start: Start, visited: Array | None) -> Solution:
+    whole = jnp.ones(task.terminal.shape, dtype=bool) if region is None else region
+
+    def one(task: Task, start: Start, visited: Array | None, region: Array) -> Solution:
         process = DecisionProcess(
             model.graph.successors,
             probabilities,
@@ -94,7 +100,7 @@ def solve(
         )
         some = jnp.zeros(0, jnp.int32) if visited is None else visited
         if horizon is None:
-            found, rows = _solve_fixed_point(process, behavior, gradient, solver, start, some)
+            found, rows = _solve_fixed_point(process, behavior, gradient, solver, start, some, region)
         else:
             values = finite_horizon(process, behavior.backup, behavior.beta, horizon, gradient)
             residual = jnp.asarray(0, values.dtype)
@@ -110,7 +116,8 @@ def solve(
         left = Start(jax.lax.stop_gradient(values), start.adjoint, found.order)
         return Solution(values, q, found.sweeps, found.residual, found.converged, left)
 
-    return jax.vmap(one)(task, begin, visited) if task.terminal.ndim == 2 else one(task, begin, visited)
+    arguments = task, begin, visited, whole
+    return jax.vmap(one)(*arguments) if task.terminal.ndim == 2 else one(*arguments)
 
 
 def _cold_start(solver: Solver, states: int, dtype: jnp.dtype, tasks: tuple[int, ...]) -> Start:
@@ -151,12 +158,13 @@ def _solve_fixed_point(
     solver: Solver,
     start: Start,
     visited: Int[Array, " visited"],
+    region: Bool[Array, " states"],
 ) -> tuple[Sweeps, Float[Array, "visited actions outcomes"]]:
     varying = (process.probabilities, process.reward, process.final_reward, process.discount, behavior.beta)
     held = jax.lax.stop_gradient(varying)
     given = (process.successors, process.terminal)
-    found = solver.values(_process(given, held), behavior.backup, held[-1], jax.lax.stop_gradient(start))
-    given = (*given, solver, found.order, visited)
+    found = solver.values(_process(given, held), behavior.backup, held[-1], jax.lax.stop_gradient(start), region)
+    given = (*given, solver, found.order, region, visited)
     solved: tuple[Array, Array] = _implicit(behavior.backup, gradient, given, varying, found.values, start.adjoint)
     return found._replace(values=solved[0]), solved[1]
 
@@ -194,10 +202,10 @@ def _implicit_forward(backup: Backup, gradient: Gradient, given: tuple, varying:
 
 def _implicit_backward(backup: Backup, gradient: Gradient, saved: tuple, cotangents: tuple[Array, Array]):
     given, varying, values, adjoint = saved
-    solver, order, visited = given[2:]
+    solver, order, region, visited = given[2:]
     process, beta = _process(given, varying), varying[-1]
     start = Start(values, adjoint, order)
-    by, found = solver.pull_back(process, backup, beta, gradient, values, cotangents[0], start)
+    by, found = solver.pull_back(process, backup, beta, gradient, values, cotangents[0], start, region)
     by = by._replace(probabilities=by.probabilities.at[visited].add(cotangents[1]))
     return None, tuple(by), jnp.zeros_like(values), found.values
 

@@ -1,11 +1,12 @@
 """The adjoint, from the farthest state back to where a task ends, and the gradient by it. On the host.
 
 `passing` holds a single sweep. Residuals are passed on from a thousandth of their sum down, the threshold falling
-tenfold from sweep to sweep, until all that is left is less than the tolerance's share of the sum.
+tenfold from sweep to sweep, until all that is left is less than the tolerance's share of the sum. If states that were
+left out when the values were solved turn out to matter, there is no gradient (see `process`).
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from sidestep.tabular.solvers.given import Found, Outcome, given_from, positions, sizes, write
 from sidestep.tabular.solvers.host import heed_interrupts, shared_out
@@ -17,6 +18,8 @@ _COARSEST = 1e-3
 """The first threshold, as a share of the sum of what is to be passed on; so that small residuals add up first."""
 _FINER = 0.1
 """By how much the threshold shrinks from sweep to sweep."""
+_TRUST = 100
+"""How many sweeps are tried where states were left out; whoever walks in circles there never gets rid of residuals."""
 
 
 def pull_back(
@@ -31,12 +34,13 @@ def pull_back(
     cotangent: Float[np.ndarray, " states"],
     start: Float[np.ndarray, " states"],
     order: Int[np.ndarray, " states"],
+    region: Bool[np.ndarray, " states"],
     tolerance: Float[np.ndarray, ""],
 ) -> None:
     """Writes the gradient `into` the arrays of `HostGradients`, and the adjoint into those of `Found`.
 
     `kind` and `tie` as in `Valuing`, `process` as in `given_from`; `values` are the solution, `cotangent` is the
-    gradient by them, `start` an adjoint to start from.
+    gradient by them, `start` an adjoint to start from, `region` is as for `Solver.pull_back`.
     """
     number = values.dtype.type
     by, found = HostGradients(*into[0]), Found(*into[1])
@@ -53,8 +57,12 @@ def pull_back(
     known = np.where(np.isfinite(start), start, number(0))
     actions, outcomes, width = sizes(given)
     shares = _no_shares(width, setting, known[order], cotangent[order])
-    run = passing_for(actions, outcomes, width)
-    outcome = _pass_on_until_gone(run, setting, shares, number(total), number(tolerance), max_sweeps)
+    run, whole = passing_for(actions, outcomes, width), region.all()
+    sweeps = max_sweeps if whole else min(max_sweeps, _TRUST)
+    outcome = _pass_on_until_gone(run, setting, shares, number(total), number(tolerance), sweeps)
+    if outcome.converged and not whole:
+        cost = _cost_of_leaving_out(run, setting, shares, region)
+        outcome = outcome._replace(residual=cost, converged=bool(cost <= tolerance))
     if not outcome.converged:
         _fill(np.nan, found.values, *by)
         write(found, order, outcome)
@@ -96,6 +104,14 @@ def _no_shares(width: int, setting: Setting, adjoint: np.ndarray, residual: np.n
         adjoint=adjoint,
         residual=residual,
     )
+
+
+def _cost_of_leaving_out(run: Passing, setting: Setting, shares: Shares, region: Bool[np.ndarray, " states"]) -> float:
+    """What states outside the region cost that were left as they were, as a share of Σ |λ V|."""
+    reached = setting.values > setting.reached
+    size = np.abs(shares.adjoint * np.where(reached, setting.values, 0)[setting.order]).sum()
+    cost = run.left_out(setting, shares.adjoint, region)
+    return float(cost / size) if size > 0 else 0.0
 
 
 def _pass_on_until_gone(

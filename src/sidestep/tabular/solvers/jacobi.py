@@ -17,6 +17,7 @@ from sidestep.tabular.solvers.process import (
     Beta,
     DecisionProcess,
     Gradients,
+    Region,
     Solver,
     Start,
     Sweeps,
@@ -42,8 +43,9 @@ class Jacobi(Solver):
         """No values, no adjoint; an order is not used."""
         return Start(jnp.full(states, lowest(dtype), dtype), jnp.zeros(states, dtype), jnp.zeros(0, jnp.int32))
 
-    def values(self, process: DecisionProcess, backup: Backup, beta: Beta, start: Start) -> Sweeps:
-        """V of the fixed point."""
+    def values(self, process: DecisionProcess, backup: Backup, beta: Beta, start: Start, region: Region) -> Sweeps:
+        """V of the fixed point, of all states whatever the region."""
+        del region
         split = _split(process)
         reward = jnp.broadcast_to(process.reward, process.successors.shape[:2]).T
 
@@ -67,8 +69,10 @@ class Jacobi(Solver):
         values: Float[Array, " states"],
         cotangent: Float[Array, " states"],
         start: Start,
+        region: Region,
     ) -> tuple[Gradients, Sweeps]:
         """The gradient by all that the values depend on: the adjoint, and one backup pulled back by JAX."""
+        del region
         # states that cannot reach a terminal state have no values to speak of, and no part in the gradient
         live = reachable(values) & ~process.terminal
 

@@ -20,6 +20,7 @@ from sidestep.tabular.solvers.process import (
     Beta,
     DecisionProcess,
     Gradients,
+    Region,
     Solver,
     Start,
     Sweeps,
@@ -55,13 +56,13 @@ class Ordered(Solver):
         """No values, no adjoint and no order."""
         return Start(jnp.full(states, lowest(dtype), dtype), jnp.zeros(states, dtype), _no_order(states))
 
-    def values(self, process: DecisionProcess, backup: Backup, beta: Beta, start: Start) -> Sweeps:
-        """V of the fixed point."""
+    def values(self, process: DecisionProcess, backup: Backup, beta: Beta, start: Start, region: Region) -> Sweeps:
+        """V of the fixed point, of all states where the start's values turn out to be of no use."""
         kind, tie = _machine_code(backup, start.values.dtype)
         # another solver may have left an order of no states
         order = start.order if start.order.shape == start.values.shape else _no_order(len(start.values))
         tolerance = self.tolerance_for(start.values.dtype)
-        given = (_fields(process), lower_bound(process), beta, start.values, order, tolerance)
+        given = (_fields(process), lower_bound(process), beta, start.values, order, region, tolerance)
         solve = partial(find_values, kind, tie, self.max_sweeps)
         return Sweeps(*on_the_host(solve, given, _shapes_of_sweeps(start.values, order)))
 
@@ -74,6 +75,7 @@ class Ordered(Solver):
         values: Float[Array, " states"],
         cotangent: Float[Array, " states"],
         start: Start,
+        region: Region,
     ) -> tuple[Gradients, Sweeps]:
         """The gradient by all that the values depend on, in a share of the time that they took."""
         kind, tie = _machine_code(backup, values.dtype)
@@ -84,6 +86,7 @@ class Ordered(Solver):
             cotangent,
             start.adjoint,
             start.order,
+            region,
             self.tolerance_for(values.dtype),
         )
         by = (process.probabilities, process.reward, process.final_reward, process.discount, beta)

@@ -1,13 +1,14 @@
-"""Values, from where a task ends outwards, on the host: what to start from, and in which order.
+"""Values, from where a task ends outwards, on the host: what to start from, in which order, and which states.
 
 An earlier solve's values are taken on trust for some sweeps; if they have not converged by then, the solve starts from
-no values and in a new order. An order is kept as long as few states want to go to a farther one.
+no values and in a new order. An order is kept as long as few states want to go to a farther one. States outside the
+region are left as they are after one sweep, as long as an earlier solve's values serve; from no values, all are solved.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from sidestep.tabular.solvers.given import Found, Given, Outcome, given_from, positions, sizes, write
 from sidestep.tabular.solvers.host import shared_out
@@ -47,12 +48,13 @@ def find_values(
     beta: Float[np.ndarray, ""],
     start: Float[np.ndarray, " states"],
     order: Int[np.ndarray, " states"],
+    region: Bool[np.ndarray, " states"],
     tolerance: Float[np.ndarray, ""],
 ) -> None:
     """Writes values and how they were found `into` the arrays of `Found`.
 
     `kind` and `tie` as in `Valuing`, `process` as in `given_from`, `bound` as in `_Asked`, `start` and `order` as in
-    `Start`.
+    `Start`, `region` as for `Solver.values`.
     """
     number = start.dtype.type
     valuing = Valuing(kind, number(beta), number(tie))
@@ -64,16 +66,16 @@ def find_values(
         return
     nothing = number(lowest(start.dtype))
     outcome = Outcome(0, np.inf, False)
-    if (start > nothing).any():
+    if (start > nothing).any() and region.any():
         digits = -np.log10(max(asked.tolerance, np.finfo(start.dtype).eps))
         trusted = int(np.ceil(_TRUST * max(1.0, digits)))
         trusted = min(trusted, max_sweeps)
-        outcome = _start_from(start, order, asked, trusted, _TRUSTED_ROUNDS * trusted, found)
+        outcome = _start_from(start, order, region, asked, trusted, _TRUSTED_ROUNDS * trusted, found)
     if not outcome.converged and outcome.sweeps < max_sweeps:
         # where values led astray, their order is no better
         cold, known_order = np.full_like(start, nothing), np.full_like(order, -1) if outcome.sweeps else order
         left = max_sweeps - outcome.sweeps
-        again = _start_from(cold, known_order, asked, left, left, found)
+        again = _start_from(cold, known_order, np.ones_like(region), asked, left, left, found)
         outcome = again._replace(sweeps=outcome.sweeps + again.sweeps)
     write(found, found.order, outcome)
 
@@ -88,6 +90,7 @@ def _anything_missing(asked: _Asked) -> bool:
 def _start_from(
     start: Float[np.ndarray, " states"],
     order: Int[np.ndarray, " states"],
+    region: Bool[np.ndarray, " states"],
     asked: _Asked,
     max_sweeps: int,
     max_rounds: int,
@@ -101,7 +104,10 @@ def _start_from(
             given.successors, given.probabilities, given.reward, given.terminal, float(given.discount)
         )
         begun = _begin(start, best, asked)
-    rounds = Rounds(begun.world, begun.values, begun.favourite, asked.valuing, asked.tolerance, max_sweeps, max_rounds)
+    which = np.flatnonzero(region[begun.order]).astype(np.int32)
+    rounds = Rounds(
+        begun.world, begun.values, begun.favourite, which, asked.valuing, asked.tolerance, max_sweeps, max_rounds
+    )
     outcome = rounds.until_still()
     found.values[begun.order] = begun.values
     found.order[:] = begun.order

@@ -16,7 +16,7 @@ import numpy as np
 
 from sidestep.tabular.solvers.compiled import compiled, inlined
 from sidestep.tabular.solvers.given import Given
-from sidestep.tabular.solvers.sweeping import BOLTZMANN, HARD_MAX, MELLOWMAX, Valuing
+from sidestep.tabular.solvers.sweeping import BOLTZMANN, HARD_MAX, MELLOWMAX, Valuing, backed_up
 
 
 class Setting(NamedTuple):
@@ -72,6 +72,7 @@ class Passing(NamedTuple):
 
     fill_in: Any
     pass_on: Any
+    left_out: Any
     pull_back: Any
 
 
@@ -119,6 +120,14 @@ def _expected(setting, state, a, outcomes):  # pragma: no cover
 
 
 @inlined()
+def _action_value(setting, state, a, outcomes):  # pragma: no cover
+    """Q(s, a)."""
+    given = setting.given
+    reward = given.reward[state if given.reward.shape[0] > 1 else 0, a if given.reward.shape[1] > 1 else 0]
+    return reward + given.discount * _expected(setting, state, a, outcomes)
+
+
+@inlined()
 def _fill_in(i, actions, outcomes, setting, shares, q, policy):  # pragma: no cover
     """The entries of the state at position i. Of a state without values to speak of, nothing is passed on."""
     given, state = setting.given, setting.order[i]
@@ -131,8 +140,7 @@ def _fill_in(i, actions, outcomes, setting, shares, q, policy):  # pragma: no co
     if given.terminal[state] or not setting.values[state] > setting.reached:
         return
     for a in range(actions):
-        reward = given.reward[state if given.reward.shape[0] > 1 else 0, a if given.reward.shape[1] > 1 else 0]
-        q[a] = reward + given.discount * _expected(setting, state, a, outcomes)
+        q[a] = _action_value(setting, state, a, outcomes)
     shares.beta[i] = weigh(setting.valuing, setting.exact, q, shares.weights[i], policy)
     leaving, policy_leaving = 0.0 * given.discount, 0.0 * given.discount
     for a in range(actions):
@@ -193,6 +201,22 @@ def passing_for(actions: int, outcomes: int, width: int) -> Passing:
         return at_work, left_alone
 
     @compiled()
+    def left_out(setting, adjoint, region):  # pragma: no cover
+        """Σ |λ (B(Q) − V)| over the states outside the region."""
+        given, values = setting.given, setting.values
+        advantage, leaving = np.empty(actions, values.dtype), np.ones(actions, values.dtype)
+        cost = 0.0 * given.discount
+        for i in range(len(adjoint)):
+            state = setting.order[i]
+            if region[state] or adjoint[i] == 0 or given.terminal[state] or not values[state] > setting.reached:
+                continue
+            for a in range(actions):
+                advantage[a] = _action_value(setting, state, a, outcomes) - values[state]
+            gain, _ = backed_up(setting.valuing, advantage, leaving)
+            cost += abs(adjoint[i] * gain)
+        return cost
+
+    @compiled()
     def pull_back(begin, end, setting, found, weights, beta, adjoint, by):  # pragma: no cover
         """Fills in the gradients `by` φ with λᵀ ∂F/∂φ, and λ with the states' own numbers, for a range of positions.
 
@@ -221,4 +245,4 @@ def passing_for(actions: int, outcomes: int, width: int) -> Passing:
                         gained = values[after] - values[state]
                         by.probabilities[state, a, k] += share * given.discount * gained
 
-    return Passing(fill_in, pass_on, pull_back)
+    return Passing(fill_in, pass_on, left_out, pull_back)

@@ -24,6 +24,15 @@ W(s, s′) = γ Σ_a w(a) Σ_{k → s′} P(s, a, k) and w are the weights of th
 policy). Self-loops are divided out as above. Both iterations have the same spectrum at the fixed point (for the exact
 gradient), so the adjoint converges where the values did.
 
+**Region.** λ(s) is what a change of V(s) is worth. So a state s whose equation does not hold, because it has not been
+solved, costs λ(s) (B(Q(s, ·)) − V(s)) to first order: nothing where λ is 0. A solve may leave out states that did not
+matter under a model nearby; λ, which is solved over all states, tells afterwards what that has cost,
+
+    Σ_{s left out} |λ(s) (B(Q(s, ·)) − V(s))|,
+
+and that has to be within the tolerance of Σ |λ(s) V(s)|. It does not see what lies beyond the first order, where the
+model has changed much; so only loose solves on the way to a fit's result leave states out.
+
 At discount 1 the values of states that cannot reach a terminal state are −∞; they are held at `lowest(dtype)`, so low
 that an action which may lead there is never taken.
 """
@@ -40,6 +49,7 @@ from sidestep.tabular.backups import Backup, Gradient
 
 Beta = Float[Scalar, ""]
 Tolerance = float | Float[Array, ""] | None
+Region = Bool[Array, " states"]
 
 
 class DecisionProcess(eqx.Module):
@@ -89,6 +99,12 @@ class Start(NamedTuple):
     adjoint: Float[Array, "*tasks states"]
     order: Int[Array, "*tasks ordered"]
 
+    @property
+    def region(self) -> Bool[Array, "*tasks states"]:
+        """The states that mattered to what the earlier solve was asked for, by its adjoint; all where it is unknown."""
+        matters = self.adjoint != 0
+        return matters | ~matters.any(axis=-1, keepdims=True)
+
 
 class Gradients(NamedTuple):
     """The gradient of a scalar by all that values depend on; shapes as in `DecisionProcess`."""
@@ -132,8 +148,8 @@ class Solver(eqx.Module):
         """The start when nothing is known."""
 
     @abc.abstractmethod
-    def values(self, process: DecisionProcess, backup: Backup, beta: Beta, start: Start) -> Sweeps:
-        """V of the fixed point."""
+    def values(self, process: DecisionProcess, backup: Backup, beta: Beta, start: Start, region: Region) -> Sweeps:
+        """V of the fixed point; states outside the region may be near it only, if `start` is."""
 
     @abc.abstractmethod
     def pull_back(
@@ -145,10 +161,11 @@ class Solver(eqx.Module):
         values: Float[Array, " states"],
         cotangent: Float[Array, " states"],
         start: Start,
+        region: Region,
     ) -> tuple[Gradients, Sweeps]:
         """λᵀ ∂F/∂φ for the adjoint λ of g = `cotangent` at the fixed point `values`; `values` of the sweeps is λ.
 
-        Both are NaN if λ did not converge.
+        Both are NaN if λ did not converge, or if states outside the region matter that were left out (see above).
         """
 
     def tolerance_for(self, dtype: jnp.dtype) -> float | Float[Array, ""]:

@@ -1,14 +1,15 @@
 """Rounds of sweeps until values are still: which states are swept when, and when to stop. On the host.
 
-`sweeping` holds a single sweep. A round goes over all states once:
+`sweeping` holds a single sweep. A round goes once over all states that are to be solved; where these are not all, a
+round over all states comes first, so that those left out have moved with the others by and large.
 
-1. For the Boltzmann average and the log-sum-exp, up to 8 rounds sweep all states at once, with everything farther
+1. For the Boltzmann average and the log-sum-exp, up to 8 rounds sweep all of them at once, with everything farther
    shifted. If changes grow from one round to the next, all is taken back to the first values, and this ends.
-2. Then rounds go stretch by stretch, some 32 √states states each: a stretch is swept until it is still, at most 30
+2. Then rounds go stretch by stretch, some 32 √states of them each: a stretch is swept until it is still, at most 30
    times, before the next one. Its states stay in the processor's cache, and those behind it have settled when it
    begins. For these two backups the states beyond the stretch are shifted, in the first 16 rounds (those of step 1
    among them).
-3. When no stretch begins with a change beyond the tolerance, a sweep over all states, without exception or shift and
+3. When no stretch begins with a change beyond the tolerance, a sweep over all of them, without exception or shift and
    from the values as they are, decides whether the values have converged.
 
 The other backups are not shifted: on a real map (mellowmax, the depot) it saved nothing.
@@ -45,6 +46,7 @@ class Rounds:
     """Values on their way to the fixed point, states by position; and how much has been done so far.
 
     - `values`: are changed where they are.
+    - `which`: the positions of the states that are to be solved, ascending.
     - `max_sweeps`, `max_rounds`: when to give up: so often a state was solved on average, or after so many rounds.
     - `number`: of the last sweep over any states; `first`: of the first one of the present round.
     - `rounds`: how many have been begun; `solved`: how many states have been solved, in all sweeps together.
@@ -55,22 +57,26 @@ class Rounds:
         world: Numbered,
         values: Float[np.ndarray, " states"],
         favourite: Int[np.ndarray, " states"],
+        which: Int[np.ndarray, " solved"],
         valuing: Valuing,
         tolerance: np.floating,
         max_sweeps: int,
         max_rounds: int,
     ):
-        states = len(values)
+        self.which, self.all = which, np.arange(len(values), dtype=np.int32)
         self.world, self.values, self.valuing, self.tolerance = world, values, valuing, tolerance
         self.max_sweeps, self.max_rounds = max_sweeps, max_rounds
-        self.marks = Marks(values.copy(), favourite, np.zeros(states, np.int32), np.zeros(states, np.int32))
-        self.everywhere = np.arange(states, dtype=np.int32)
-        size = max(_SMALLEST_STRETCH, int(_STRETCH * states**0.5))
-        self.stretches = np.split(self.everywhere, range(size, states, size))
+        never = np.zeros((2, len(values)), np.int32)
+        self.marks = Marks(values.copy(), favourite, *never)
+        size = max(_SMALLEST_STRETCH, int(_STRETCH * len(which) ** 0.5))
+        self.stretches = np.split(which, range(size, len(which), size))
         self.number = self.first = self.rounds = self.solved = 0
 
     def until_still(self) -> Outcome:
-        """Sweeps until a sweep over all states changes none by more than the tolerance, or too much has been done."""
+        """Sweeps until a sweep over `which` changes none by more than the tolerance, or too much has been done."""
+        if len(self.which) < len(self.all):
+            self._begin_round()
+            self._sweep(self.all, shifted=0 if self.valuing.kind in _SHIFTED else len(self.all))
         residual = self._all_at_once() if self.valuing.kind in _SHIFTED else np.inf
         converged = False
         while not (converged or self._given_up() or np.isnan(residual)):
@@ -78,7 +84,7 @@ class Rounds:
             if residual <= self.tolerance and not self._given_up():
                 residual = self._once_more()
                 converged = bool(residual <= self.tolerance)
-        return Outcome(-(-self.solved // len(self.values)), float(residual), converged)
+        return Outcome(-(-self.solved // len(self.all)), float(residual), converged)
 
     def _all_at_once(self) -> float:
         """Step 1; the largest change in the last round, infinite if all was taken back."""
@@ -87,12 +93,12 @@ class Rounds:
             if self._given_up():
                 break
             self._begin_round()
-            residual, at_work = self._sweep(self.everywhere, shifted=0)
+            residual, at_work = self._sweep(self.which, shifted=0)
             if not residual <= _GROWING * last:
                 self.values[:] = first_values
                 return np.inf
             last = residual
-            if residual <= self.tolerance or at_work <= _FEW * len(self.values):
+            if residual <= self.tolerance or at_work <= _FEW * len(self.which):
                 break
         return last
 
@@ -128,14 +134,14 @@ class Rounds:
         """Step 3, from the values as they are, so that all cores can share in it; the largest change."""
         self._begin_round()
         self.number += 1
-        self.solved += len(self.values)
-        into = np.empty_like(self.values)
+        self.solved += len(self.which)
+        into = self.values.copy()
 
         def solve(begin: int, end: int) -> float:
-            return self._solve(self.everywhere[begin:end], into, shifted=len(into), everyone=True)[0]
+            return self._solve(self.which[begin:end], into, shifted=len(into), everyone=True)[0]
 
-        residual = float(np.max(shared_out(solve, len(into))))
-        np.copyto(self.values, into, where=~self.world.fixed)
+        residual = float(np.max(shared_out(solve, len(self.which))))
+        self.values[:] = into
         # none saw what became of the others, whichever came first
         marks, moved = self.marks, self.marks.changed == self.number
         self.number += 1

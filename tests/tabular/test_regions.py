@@ -1,0 +1,146 @@
+"""Solves of the states that matter only: beside solves of all states, and what leaving states out costs."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from problems import BACKUPS, generic_task, obstacle_problem, relative_error
+
+from sidestep.domains.offices import office
+from sidestep.tabular.backups import Behavior
+from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.solve import solve
+from sidestep.tabular.solvers.jacobi import Jacobi
+from sidestep.tabular.solvers.ordered import Ordered
+from sidestep.tabular.solvers.process import DecisionProcess, Solver, Start
+from sidestep.tasks import reach
+
+each_backup = pytest.mark.parametrize("name", BACKUPS)
+SOLVER = Ordered(tolerance=1e-9)
+TRUTH = office(50, 50, 1)
+FREE = np.flatnonzero(TRUTH.known.reshape(-1) == 0)
+GOAL = int(FREE[0])
+MODEL = ObstacleGrid(TRUTH.forget(), jnp.asarray(np.where(TRUTH.known.reshape(-1) == 1, 4.0, -4.0)))
+NEARBY = MODEL.with_parameters(MODEL.parameters + 0.05 * np.sin(np.arange(TRUTH.size)))
+
+
+def near_the_goal():
+    """Visited states: the free cells nearest to the goal, so that much of the map does not matter."""
+    values = solve(MODEL, task(), Behavior(BACKUPS["hard max"], 5.0)).values
+    return jnp.asarray(FREE[np.argsort(-np.asarray(values)[FREE])[1:30]])
+
+
+def task():
+    return reach(TRUTH.forget(), GOAL, discount=1.0, step_cost=1.0)
+
+
+@eqx.filter_jit
+def likelihood_like(model, people, visited, start, region, solver: Solver = SOLVER):
+    """A sum over the visited states' action values: (sum, solution), its gradient by the parameters, and λ."""
+
+    def total(parameters, adjoint):
+        begin = start._replace(adjoint=adjoint)
+        given = {"solver": solver, "start": begin, "region": region}
+        found = solve(model.with_parameters(parameters), task(), people, **given)
+        wanted = found.action_values[visited]
+        return jnp.sum(jnp.cos(jnp.arange(wanted.size)) * wanted.ravel()), found
+
+    return jax.value_and_grad(total, (0, 1), has_aux=True)(model.parameters, start.adjoint)
+
+
+def all_states():
+    return jnp.ones(TRUTH.size, dtype=bool)
+
+
+def solved_nearby(people, visited):
+    """What a solve of the model nearby left to start from."""
+    cold = SOLVER.cold_start(TRUTH.size, jnp.dtype(jnp.float64))
+    (_, found), (_, adjoint) = likelihood_like(NEARBY, people, visited, cold, all_states())
+    return found.start._replace(adjoint=adjoint)
+
+
+def test_where_nothing_is_known_all_states_matter():
+    start = SOLVER.cold_start(3, jnp.dtype(jnp.float64))
+    assert start.region.tolist() == [True, True, True]
+    assert start._replace(adjoint=jnp.asarray([0.0, -2.0, 1e-30])).region.tolist() == [False, True, True]
+    assert start._replace(adjoint=jnp.full(3, jnp.nan)).region.all()
+    two = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), start)
+    two = two._replace(adjoint=jnp.asarray([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
+    assert two.region.tolist() == [[True, True, True], [False, True, False]]
+
+
+@pytest.mark.parametrize("name", [name for name in BACKUPS if name != "hard max"])
+def test_states_that_do_not_matter_are_not_solved_and_make_no_difference(name):
+    people, visited = Behavior(BACKUPS[name], 5.0), near_the_goal()
+    start = solved_nearby(people, visited)
+    region = np.asarray(start.region)
+    assert 0 < region.mean() < 0.7
+    (whole, solved), (slope, adjoint) = likelihood_like(MODEL, people, visited, start, all_states())
+    (part, found), (its_slope, its_adjoint) = likelihood_like(MODEL, people, visited, start, start.region)
+    assert found.converged
+    assert part == pytest.approx(float(whole), rel=1e-8)
+    assert relative_error(its_slope, slope) < 1e-6
+    assert relative_error(its_adjoint, adjoint) < 1e-6
+    assert found.sweeps < solved.sweeps
+    # one sweep is not enough
+    equations = people.backup.value(found.action_values, people.beta) - found.values
+    assert jnp.abs(equations)[~region].max() > 1e-6
+
+
+def test_from_values_of_no_use_all_states_are_solved():
+    people, visited = Behavior(BACKUPS["Boltzmann"], 5.0), near_the_goal()
+    cold = SOLVER.cold_start(TRUTH.size, jnp.dtype(jnp.float64))
+    (whole, solved), (slope, _) = likelihood_like(MODEL, people, visited, cold, all_states())
+    for label, region in {"some": solved_nearby(people, visited).region, "none": ~all_states()}.items():
+        (part, found), (its_slope, _) = likelihood_like(MODEL, people, visited, cold, region)
+        np.testing.assert_array_equal(found.values, solved.values, err_msg=label)
+        assert part == whole, label
+        assert relative_error(its_slope, slope) < 1e-9, label
+
+
+def test_sweeps_over_all_states_at_once_leave_none_out():
+    people, visited = Behavior(BACKUPS["Boltzmann"], 5.0), near_the_goal()
+    start = solved_nearby(people, visited)._replace(order=jnp.zeros(0, jnp.int32))
+    solver = Jacobi(tolerance=1e-9)
+    (whole, _), (slope, _) = likelihood_like(MODEL, people, visited, start, all_states(), solver)
+    (part, _), (its_slope, _) = likelihood_like(MODEL, people, visited, start, start.region, solver)
+    assert part == whole
+    np.testing.assert_array_equal(its_slope, slope)
+
+
+@each_backup
+def test_what_leaving_a_state_out_costs(name):
+    """λ (B(Q) − V) is by how much a sum over values is wrong; beyond the tolerance there is no gradient."""
+    problem, backup, beta = obstacle_problem(4), BACKUPS[name], jnp.asarray(5.0)
+    wanted, weights = generic_task(problem, 0.9), jnp.cos(jnp.arange(12))
+    left, moved = int(np.flatnonzero(~np.asarray(wanted.terminal))[3]), 1e-4
+    right = solve(problem.model, wanted, Behavior(backup, beta), solver=Ordered(tolerance=1e-12)).values
+
+    def backed_up(values):
+        expected = jnp.einsum("sat,t->sa", problem.dense(problem.model.parameters), values)
+        return jnp.where(wanted.terminal, wanted.final_reward, backup.value(wanted.reward + 0.9 * expected, beta))
+
+    values = right.at[left].add(moved)
+    for _ in range(500):
+        values = backed_up(values).at[left].set(right[left] + moved)
+    adjoint = jnp.linalg.solve(jnp.eye(12) - jax.jacobian(backed_up)(values).T, weights)
+    cost = adjoint[left] * (backed_up(values) - values)[left]
+    assert cost == pytest.approx(float(weights @ (right - values)), rel=1e-2)
+
+    process = DecisionProcess(
+        problem.model.graph.successors,
+        problem.model.probabilities(),
+        wanted.reward,
+        wanted.final_reward,
+        wanted.terminal,
+        wanted.discount,
+    )
+    share = float(jnp.abs(cost) / jnp.abs(adjoint * values).sum())
+    start = Start(values, jnp.zeros(12), jnp.arange(12, dtype=jnp.int32))
+    for tolerance, others, converged in ((1.01, left, True), (0.99, left, False), (0.99, (left + 1) % 12, True)):
+        region = jnp.arange(12) != others
+        solver = Ordered(tolerance=tolerance * share)
+        by, found = solver.pull_back(process, backup, beta, "exact", values, weights, start, region)
+        assert bool(found.converged) == converged
+        assert all(bool(jnp.isfinite(part).all()) == converged for part in (*by, found.values))
