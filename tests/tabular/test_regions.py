@@ -11,6 +11,7 @@ from sidestep.domains.offices import office
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.solve import solve
+from sidestep.tabular.solvers import inwards
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.solvers.ordered import Ordered
 from sidestep.tabular.solvers.process import DecisionProcess, Solver, Start
@@ -83,7 +84,9 @@ def test_states_that_do_not_matter_are_not_solved_and_make_no_difference(name):
     assert relative_error(its_slope, slope) < 1e-6
     assert relative_error(its_adjoint, adjoint) < 1e-6
     assert found.sweeps < solved.sweeps
-    # one sweep is not enough
+    # the others have moved along, but one sweep is not enough
+    behind, before = (jnp.abs(values - solved.values)[~region].mean() for values in (found.values, start.values))
+    assert behind < before / 3
     equations = people.backup.value(found.action_values, people.beta) - found.values
     assert jnp.abs(equations)[~region].max() > 1e-6
 
@@ -144,3 +147,15 @@ def test_what_leaving_a_state_out_costs(name):
         by, found = solver.pull_back(process, backup, beta, "exact", values, weights, start, region)
         assert bool(found.converged) == converged
         assert all(bool(jnp.isfinite(part).all()) == converged for part in (*by, found.values))
+
+
+def test_where_states_were_left_out_an_adjoint_that_takes_long_is_given_up(monkeypatch):
+    """Whoever walks in circles among values that do not hold would keep it from ending for long."""
+    people, visited = Behavior(BACKUPS["Boltzmann"], 5.0), near_the_goal()
+    start = solved_nearby(people, visited)._replace(adjoint=jnp.zeros(TRUTH.size))
+    all_but_one = all_states().at[int(FREE[-1])].set(False)
+    for most, region, given_up in ((100, all_but_one, False), (1, all_but_one, True), (1, all_states(), False)):
+        monkeypatch.setattr(inwards, "_TRUST", most)
+        (_, found), (slope, _) = likelihood_like(MODEL, people, visited, start, region)
+        assert found.converged
+        assert bool(jnp.isnan(slope).all()) == given_up
