@@ -123,6 +123,8 @@ def score(problem: Problem, settings: Settings, auto: bool, methods: Sequence[st
         except (ImproperTask, NotConverged) as error:
             Console(stderr=True).print(f"{problem.name}, {name}: {error}")
             continue
+        if not learned.converged:
+            Console(stderr=True).print(f"{problem.name}, {name}: did not converge")
         scores[name] = {key: {**found, "heldout_log_likelihood": nats_a_move(learned, others)}[key] for key in SCORES}
     return scores
 

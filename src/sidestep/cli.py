@@ -293,6 +293,8 @@ def compare_command(
     for name, scores in summary["methods"].items():
         if "failed" in scores:
             errors.print(f"note: nothing by {name}: {scores['failed']}", markup=False, soft_wrap=True)
+        elif not scores["converged"]:
+            errors.print(f"note: {name} did not converge; its scores are those of where it stopped", soft_wrap=True)
     console.print(f"picture and numbers in {out}")
 
 

@@ -51,6 +51,7 @@ def test_every_method_has_every_score(office, compared):
         for key in ("legal_share", "arriving_share", "heldout_log_likelihood", "seconds"):
             assert np.isfinite(scores[key])
         assert scores["arriving_share"] >= scores["legal_share"]
+        assert scores["converged"] is True
         assert (scores["regret"] is None) == (scores["arriving_share"] < 1)
         for key in ("auc", "average_precision"):
             assert scores[key] is None if name == "cloning" else np.isfinite(scores[key])
@@ -68,6 +69,25 @@ def test_what_one_method_cannot_do_is_no_reason_to_say_nothing_of_the_others(off
     assert methods["costs"]["auc"] is methods["costs"]["seconds"] is None
     assert methods["costs"]["failed"] in " ".join(capsys.readouterr().err.split())
     assert np.isfinite(methods["behavior"]["auc"])
+
+
+def test_who_has_not_converged_is_named(office, tmp_path, monkeypatch, capsys):
+    def hurried(name):
+        return lambda grid, shown, settings: METHODS[name](grid, shown, replace(settings, iterations=1))
+
+    monkeypatch.setattr(compare, "METHODS", {name: hurried(name) for name in ("behavior", "visits", "joint")})
+    files = (office / "walks.csv", "--map", office / "half.yaml", "--truth", office / "true.yaml", "--out", tmp_path)
+    assert call("compare", *files) == 0
+    methods = json.loads((tmp_path / "summary.json").read_text())["methods"]
+    assert {name: scores["converged"] for name, scores in methods.items()} == {
+        "behavior": False,
+        "visits": True,
+        "joint": False,
+    }
+    notes = capsys.readouterr().err
+    assert "behavior did not converge" in notes
+    assert "joint did not converge" in notes
+    assert "visits" not in notes
 
 
 def test_behavior_is_chosen_by_the_walks_that_are_learned_from(office, tmp_path, monkeypatch):

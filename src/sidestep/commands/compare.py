@@ -40,7 +40,7 @@ METHODS: Mapping[str, Method] = MappingProxyType(
     }
 )
 """The methods by name: behavior-aware modeling first, then its rivals."""
-_SCORES = ("auc", "average_precision", "legal_share", "regret", "heldout_log_likelihood", "seconds")
+_SCORES = ("auc", "average_precision", "legal_share", "regret", "heldout_log_likelihood", "seconds", "converged")
 """What is told of every method, null where it failed."""
 
 
@@ -63,9 +63,9 @@ def compare(
       Lapses are learned by behavior-aware modeling; the transitions alone keep the share that learning begins with.
 
     The summary has `methods.<name>` with the scores of `evaluate`, that (null if a held-out goal's values are not
-    found), and `seconds`; with nothing but the reason, `failed`, for a method that finds no values at all.
-    Raises `InputError` for files that do not fit, and a share that leaves no walk to learn from or none to score; with
-    `auto` also what `choose_behavior` does.
+    found), `seconds`, and whether it `converged`; with nothing but the reason, `failed`, for a method that finds no
+    values at all. Raises `InputError` for files that do not fit, and a share that leaves no walk to learn from or none
+    to score; with `auto` also what `choose_behavior` does.
     """
     given = read_map(map_file, connectivity=settings.connectivity)
     truth = read_truth(truth_file, given)
@@ -95,7 +95,12 @@ def compare(
             methods[name] = {**dict.fromkeys(_SCORES), "failed": str(error)}
             continue
         heldout = nats_a_move(learned, others)
-        methods[name] = {**scores, "heldout_log_likelihood": heldout, "seconds": round(seconds, 3)}
+        methods[name] = {
+            **scores,
+            "heldout_log_likelihood": heldout,
+            "seconds": round(seconds, 3),
+            "converged": learned.converged,
+        }
         pictures.append(_panel(name, learned, given, truth, own))
     summary = {
         "command": "compare",

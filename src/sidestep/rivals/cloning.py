@@ -38,12 +38,13 @@ _ITERATIONS = 2000
 class Cloned:
     """A policy for every goal on a map.
 
-    - `weights`: w of every action, and `intercepts`.
+    - `weights`: w of every action, and `intercepts`. `converged`: as in `Lesson`.
     """
 
     grid: Grid
     weights: Float[np.ndarray, "actions features"]
     intercepts: Float[np.ndarray, " actions"]
+    converged: bool
     ranking: None = None
     shares: None = None
 
@@ -96,7 +97,8 @@ def _fitted(grid: Grid, demonstrations: Demonstrations, counts: Bool[np.ndarray,
     nowhere = csr_array((len(every), _DIRECTION + (1 + _COMPASS) * grid.size))
     regression = LogisticRegression(C=freedom, max_iter=_ITERATIONS)
     regression.fit(vstack([features, nowhere], format="csr"), np.append(actions, every))
-    return Cloned(grid, regression.coef_, np.asarray(regression.intercept_))
+    converged = bool((regression.n_iter_ < _ITERATIONS).all())
+    return Cloned(grid, regression.coef_, np.asarray(regression.intercept_), converged)
 
 
 def _moves(demonstrations: Demonstrations) -> tuple[Int[np.ndarray, " moves"], ...]:

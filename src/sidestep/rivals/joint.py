@@ -31,4 +31,4 @@ def by_joint(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> 
     found = fit_map(model, demonstrations, settings, walkers=walkers)
     learned = known_map(found.model, demonstrations, settings)
     reward = CostlyReward(settings.discount, settings.step_cost, np.asarray(found.people.costs))
-    return learned._replace(reward=reward, behavior=found.people.behavior_of())
+    return learned._replace(reward=reward, behavior=found.people.behavior_of(), converged=found.converged)

@@ -47,6 +47,11 @@ class Lesson(Protocol):
         """The same from 0 to 1, to be drawn: P(blocked), where there is such a thing."""
         ...
 
+    @property
+    def converged(self) -> bool:
+        """Whether the search for it ended where it was meant to; so it does where nothing is searched for."""
+        ...
+
     def log_policies(self, demonstrations: Demonstrations) -> Float[np.ndarray, " moves"]:
         """How probable every action of some demonstrations is taken to be, in nats.
 
@@ -61,6 +66,7 @@ class Learned(NamedTuple):
     - `model`: what is known of the world. `reward`: what people pursue in it. `behavior`: how they act on it.
     - `ranking`: of cells, higher for those that are more surely obstacles; P(blocked) where there is such a thing.
     - `planner`: what a robot does that knows all this.
+    - `converged`: as in `Lesson`.
     """
 
     model: ObstacleGrid
@@ -68,6 +74,7 @@ class Learned(NamedTuple):
     behavior: Behavior
     ranking: Float[np.ndarray, "rows columns"]
     planner: Planner
+    converged: bool = True
 
     @property
     def shares(self) -> Float[np.ndarray, "rows columns"]:
@@ -114,7 +121,8 @@ def known_map(
 def by_behavior(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> Learned:
     """Behavior-aware modeling, as `sidestep learn` has it."""
     found = fit_map(ObstacleGrid(grid, settings.prior_mean), demonstrations, settings)
-    return known_map(found.model, demonstrations, settings)._replace(behavior=found.people.behavior_of())
+    learned = known_map(found.model, demonstrations, settings)
+    return learned._replace(behavior=found.people.behavior_of(), converged=found.converged)
 
 
 def by_transitions(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> Learned:
