@@ -89,7 +89,8 @@ def values(problem: Problem, parameters: Parameters) -> Found:
 
 def adjoint(problem: Problem, parameters: Parameters) -> Found:
     """The gradient by the adjoint, from nothing."""
-    found = take(problem, parameters, problem.cold_start())
+    start = problem.cold_start()
+    found = take(problem, parameters, start, start.region)
     return jnp.where(found.converged, found.gradient, jnp.nan), found.sweeps[0]
 
 

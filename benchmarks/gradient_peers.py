@@ -145,7 +145,8 @@ def exact_gradient(problem: Problem) -> Array:
     for tolerance in EXACT:
         solver = Ordered(tolerance=tolerance, max_sweeps=1_000)
         strict = eqx.tree_at(lambda p: p.solver, problem, solver)
-        found = take(strict, problem.model.parameters, problem.cold_start())
+        cold = problem.cold_start()
+        found = take(strict, problem.model.parameters, cold, cold.region)
         if bool(found.converged):
             return found.gradient
     raise NotConverged("the values or the adjoint did not converge: try a smaller β or another backup")
@@ -181,11 +182,12 @@ def with_warm(method: Method, problem: Problem, arguments: argparse.Namespace) -
     if method.name in ONLY_VALUES:
         return method
     problem = method_function(method.name, problem, 0)[1]
-    first = take(problem, problem.model.parameters, problem.cold_start())
+    cold = problem.cold_start()
+    first = take(problem, problem.model.parameters, cold, cold.region)
     at = stepped(problem.model.parameters, first.gradient, arguments)
     at, start = jax.block_until_ready((at, first.start))
-    if bool(take(problem, at, start).converged):
-        method.warm = lambda: jax.block_until_ready(take(problem, at, start))
+    if bool(take(problem, at, start, cold.region).converged):
+        method.warm = lambda: jax.block_until_ready(take(problem, at, start, cold.region))
     return method
 
 

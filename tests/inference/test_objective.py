@@ -7,6 +7,7 @@ import pytest
 from spread import BENT, GOALS, at, demonstrations
 from walled import BLANK
 
+from sidestep.demonstrations import Trajectory, gather
 from sidestep.inference import batches
 from sidestep.inference.batches import planned
 from sidestep.inference.objective import MEMORY, Objective, Problem, _of_actions
@@ -20,6 +21,7 @@ from sidestep.tabular.people import people
 from sidestep.tabular.solvers.host import cores
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.solvers.ordered import Ordered
+from sidestep.tasks import reach
 
 SOLVERS = {"jacobi": Jacobi(), "ordered": Ordered()}
 PEOPLE = Behavior(BoltzmannAverage(), 10.0)
@@ -61,6 +63,17 @@ def test_batches_add_up_to_the_likelihood_and_the_prior(name, memory):
     np.testing.assert_allclose(found.slope.model, slope, rtol=1e-9, atol=1e-9 * np.abs(slope).max())
 
 
+def test_one_compiled_function_serves_data_of_many_sizes():
+    """More walks and goals come in arrays of the same shapes, as long as they fit into one batch."""
+    shapes = []
+    for goals in (5, 6, 8):
+        walks = [Trajectory(np.arange(goal, -1, -1), np.full(goal, 2), 0) for goal in range(1, goals - 3)]
+        tasks = [reach(BLANK, 5 * goal % 24) for goal in range(goals)]
+        objective = Objective(problem_of(shown=gather(walks, tasks)), MEMORY)
+        shapes.append(jax.tree.map(jnp.shape, (objective.batches, objective.arrivals)))
+    assert shapes[0] == shapes[1] == shapes[2]
+
+
 def test_the_less_memory_the_more_batches():
     memories = (MEMORY, 46 * ONE_TASK, 25 * ONE_TASK, 1.0)
     objectives = [Objective(problem_of(), memory) for memory in memories]
@@ -71,7 +84,7 @@ def test_the_less_memory_the_more_batches():
         assert len({batch.tasks.terminal.shape for batch in objective.batches}) == 1
 
 
-@pytest.mark.parametrize(("tasks", "devices", "expected"), [(5, 1, 5), (5, 4, 8), (8, 4, 8), (3, 4, 4)])
+@pytest.mark.parametrize(("tasks", "devices", "expected"), [(5, 1, 8), (5, 4, 8), (8, 4, 8), (3, 4, 4), (9, 2, 16)])
 def test_devices_share_tasks_equally(tasks, devices, expected):
     assert planned(MODEL, Jacobi(), tasks, MEMORY, devices) == (expected, True, False)
 
@@ -269,7 +282,7 @@ def test_a_solve_that_fails_makes_the_objective_nan():
     objective = Objective(problem_of(Jacobi(max_sweeps=2)), MEMORY)
     found, _ = objective.evaluate(at(POINT), objective.cold_starts())
     assert np.isnan(found.objective)
-    assert not np.asarray(found.solved[0].converged).any()
+    assert not np.asarray(found.solved[0].converged)[:TASKS].any()
 
 
 def test_tasks_that_fill_up_a_batch_count_for_nothing():

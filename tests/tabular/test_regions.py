@@ -15,7 +15,7 @@ from sidestep.tabular.solvers import inwards
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.solvers.ordered import Ordered
 from sidestep.tabular.solvers.process import DecisionProcess, Solver, Start
-from sidestep.tasks import reach
+from sidestep.tasks import reach, stack_tasks
 
 each_backup = pytest.mark.parametrize("name", BACKUPS)
 SOLVER = Ordered(tolerance=1e-9)
@@ -155,7 +155,38 @@ def test_where_states_were_left_out_an_adjoint_that_takes_long_is_given_up(monke
     start = solved_nearby(people, visited)._replace(adjoint=jnp.zeros(TRUTH.size))
     all_but_one = all_states().at[int(FREE[-1])].set(False)
     for most, region, given_up in ((100, all_but_one, False), (1, all_but_one, True), (1, all_states(), False)):
-        monkeypatch.setattr(inwards, "_TRUST", most)
+        monkeypatch.setattr(inwards, "_MOST_SWEEPS", most)
         (_, found), (slope, _) = likelihood_like(MODEL, people, visited, start, region)
         assert found.converged
         assert bool(jnp.isnan(slope).all()) == given_up
+
+
+@pytest.mark.parametrize("gradient", ["exact", "fixed_policy"])
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_tasks_of_a_batch_have_regions_of_their_own(gradient, dtype):
+    """As each by itself; one that nothing is asked of, and discounts below 1, with them."""
+    grid, people = TRUTH.forget(), Behavior(BACKUPS["log-sum-exp"], 5.0)
+    model = MODEL.with_parameters(MODEL.parameters.astype(dtype))
+    tasks = stack_tasks(
+        [reach(grid, int(FREE[0]), discount=1.0, step_cost=1.0), reach(grid, int(FREE[-1]), discount=0.9)]
+    )
+    visited = jnp.asarray([FREE[1:6], FREE[-7:-2]])
+    solver = Ordered()
+
+    def total(adjoint, tasks, visited, start, region):
+        begin = start._replace(adjoint=adjoint)
+        given = {"solver": solver, "gradient": gradient, "start": begin, "visited": visited, "region": region}
+        return jnp.sum(solve(model, tasks, people, **given).action_values)
+
+    cold = solver.cold_start(TRUTH.size, jnp.dtype(dtype))
+    start = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), cold)
+    start = solve(model, tasks, people, solver=solver, gradient=gradient, start=start).start
+    adjoint = jax.grad(total)(start.adjoint, tasks, visited, start, jnp.ones_like(start.region))
+    start = start._replace(adjoint=adjoint)
+    assert 0 < start.region[0].mean() < 0.7
+    together = jax.grad(total)(adjoint, tasks, visited, start, start.region)
+    for index in range(2):
+        one = jax.tree.map(lambda leaf, index=index: leaf[index], (tasks, visited, start, start.region))
+        alone = jax.grad(total)(one[2].adjoint, *one)
+        np.testing.assert_array_equal(together[index], alone)
+        assert relative_error(alone, adjoint[index]) < (1e-6 if dtype == jnp.float64 else 1e-3)

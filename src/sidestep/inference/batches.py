@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from sidestep.demonstrations import Demonstrations
-from sidestep.tabular.likelihood import Choices, choices_of
+from sidestep.tabular.likelihood import Choices, choices_of, rounded_up
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.people import People
 from sidestep.tabular.solvers.host import cores
@@ -53,7 +53,8 @@ def planned(
 
     They fit into `memory` bytes on each device; one of a task a device always is possible. If evaluations are to take
     over what batches added to earlier ones (`takes_over`), and solves take long, a batch on a single device has no more
-    tasks than there are cores: the fewer, the more often it can.
+    tasks than there are cores: the fewer, the more often it can. Where solves do not take long and all fit into one
+    batch, its size is rounded up to a power of two, so that one compiled function serves other data too.
     """
     probabilities, parameters = jax.eval_shape(model.probabilities), jax.eval_shape(lambda: model.parameters)
     item = probabilities.dtype.itemsize
@@ -68,7 +69,10 @@ def planned(
     takes_over = takes_over and long and devices == 1 and keeps_starts and parts <= free / 2
     most = max(1, int((free - (parts if takes_over else 0)) / (_WORKSPACE.get(type(solver), 3) * size)))
     rounds = math.ceil(share / (min(most, cores()) if takes_over else most))
-    return Planned(devices * math.ceil(share / rounds), keeps_starts, takes_over)
+    together = math.ceil(share / rounds)
+    if rounds == 1 and model.graph.states < LARGE:
+        together = min(most, rounded_up(together))
+    return Planned(devices * together, keeps_starts, takes_over)
 
 
 def batches_of(demonstrations: Demonstrations, people: People, together: int) -> list[Batch]:

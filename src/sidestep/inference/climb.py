@@ -1,8 +1,9 @@
 """The climb of a fit: from point to point up the objective, with solves as exact as the optimiser needs.
 
-On large maps the solves of the first points are loose, and leave out states that do not matter. Where the optimiser
-has converged, or finds no step that gains anything, the same point is looked at again with exact solves of all states,
-and the climb goes on from there; it ends only on these.
+On large maps the solves of the first points are loose. Where the optimiser has converged, or finds no step that gains
+anything, the same point is looked at again with exact solves and the climb goes on from there; it ends only on exact
+ones. A rough look, which tells whether a step is worth a proper one, takes over what has hardly changed, and solves
+only the states that mattered where little has.
 """
 
 from collections.abc import Callable
@@ -100,7 +101,7 @@ class Climb:
                 return Summit(parameters, history, self._solved_at(x), bool(settled), message or unsaid)
 
     def _look(self, x: np.ndarray, rough: bool = False) -> _Point:
-        """The objective at x; a rough look takes over what seems to be as it was when last looked at."""
+        """The objective at x; a rough look saves work where little seems to have changed since the last one."""
         if np.array_equal(x, self.last.x):
             return self.last
         rough = rough and bool(self.known)
@@ -110,7 +111,7 @@ class Climb:
             self.tolerances[0],
             self.known,
             self.negligible if rough else 0.0,
-            _LITTLE if len(self.tolerances) > 1 else 0.0,
+            _LITTLE if rough and len(self.tolerances) > 1 else 0.0,
         )
         parts = np.array([found.objective, found.actions, found.transitions, found.prior])
         point, self.known = _Point(x, parts, np.asarray(ravel_pytree(found.slope)[0])), found.parts
@@ -174,10 +175,7 @@ class Climb:
 _NEGLIGIBLE = 2e-5
 """What may be left out of a rough look, all batches of tasks together, as a share of the objective."""
 _LITTLE = 0.01
-"""Up to which change of what a batch adds, as a share of it, loose solves leave out states that did not matter.
-
-On the depot, states that were left out had come to matter in 3 of 100 solves below that, and nearly always above .1.
-"""
+"""Up to which change of what a batch adds, as a share of it, loose rough looks leave out states that did not matter."""
 
 
 def _tolerances(problem: Problem, optimiser: Optimiser) -> list[float | None]:

@@ -27,7 +27,7 @@ from sidestep.inference.objective import MEMORY, Objective, Problem, Solved
 from sidestep.inference.optimisers import LBFGS, Ascent, Optimiser
 from sidestep.inference.priors import Normal, Prior
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, Gradient
-from sidestep.tabular.likelihood import ALL_TERMS, Term, transition_probabilities
+from sidestep.tabular.likelihood import ALL_TERMS, Term, arrivals_of, transition_probabilities
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.people import People, people
 from sidestep.tabular.solve import check_proper
@@ -156,17 +156,19 @@ def _check_settings(terms: tuple[Term, ...], gradient: Gradient, behavior: Behav
 def _check_moves(problem: Problem) -> None:
     """Every move must be one that the model has, and, if transitions count, one that it thinks possible."""
     model, demos = problem.model, problem.demonstrations
-    if demos.tasks.terminal.shape[-1] != model.graph.states or int(demos.actions.max()) >= model.graph.actions:
+    if (
+        demos.tasks.terminal.shape[-1] != model.graph.states
+        or int(np.asarray(demos.actions).max()) >= model.graph.actions
+    ):
         raise InputError(
             f"expected demonstrations in the model's {model.graph.states} states with its {model.graph.actions} actions"
-            f", found {demos.tasks.terminal.shape[-1]} states and actions up to {int(demos.actions.max())}",
+            f", found {demos.tasks.terminal.shape[-1]} states and actions up to {int(np.asarray(demos.actions).max())}",
             field="demonstrations",
         )
     if "transitions" not in problem.terms:
         return
-    impossible = np.flatnonzero(np.asarray(transition_probabilities(model, demos)) == 0)
-    if len(impossible):
-        move = impossible[0]
+    if (np.asarray(transition_probabilities(model, arrivals_of(demos))) == 0).any():
+        move = np.flatnonzero(np.asarray(transition_probabilities(model, demos)) == 0)[0]
         raise InputError(
             f"action {int(demos.actions[move])} in state {int(demos.states[move])} led to state "
             f"{int(demos.next_states[move])}, which the model (what the map knows, say) holds to be impossible",

@@ -35,7 +35,14 @@ from sidestep.inference.batches import Batch, batches_of, planned
 from sidestep.inference.checkpoints import fingerprint
 from sidestep.inference.priors import Prior
 from sidestep.tabular.backups import Gradient
-from sidestep.tabular.likelihood import Choices, Term, choice_log_likelihood, transition_log_likelihood
+from sidestep.tabular.likelihood import (
+    Arrivals,
+    Choices,
+    Term,
+    arrival_log_likelihood,
+    arrivals_of,
+    choice_log_likelihood,
+)
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.people import People, Traits
 from sidestep.tabular.solvers.process import Solver, Start, reachable
@@ -129,8 +136,10 @@ class Objective:
             else []
         )
         self.batches = [_shared_out(batch, mesh) for batch in batches]
-        # devices need not hold what only the transitions depend on
-        self.solving = _on_all(eqx.tree_at(lambda problem: problem.demonstrations, problem, None), mesh)
+        # of the demonstrations, batches and arrivals are all that is needed
+        self.lasting = eqx.tree_at(lambda problem: problem.demonstrations, problem, None)
+        self.solving = _on_all(self.lasting, mesh)
+        self.arrivals = arrivals_of(problem.demonstrations)
 
     @property
     def processes(self) -> list[int]:
@@ -168,22 +177,23 @@ class Objective:
         - `tolerance`: that of the solves, where the solver leaves it open. The objective is NaN if a solve failed.
         - `known`: the parts of an earlier evaluation with the same tolerance. Those at the same θ are taken over, and
           those to which, by their slope, the way from their θ to this one makes a difference below `negligible` (nats).
-        - `little`: as a share of what a batch added, the difference that this way may make for only those states to be
-          solved that mattered.
+        - `little`: only the states that mattered are solved where this way changes a batch's part by less than this
+          share of it.
         """
-        slope, (transitions, prior) = jax.tree.map(np.asarray, _apart_from_actions(self.problem, parameters))
+        slope, (transitions, prior) = jax.tree.map(
+            np.asarray, _apart_from_actions(self.lasting, self.arrivals, parameters)
+        )
         here = jax.tree.map(np.asarray, parameters)
         parameters, tolerance = _on_all((parameters, tolerance), self.mesh)
         solving = _with_tolerance(self.solving, tolerance)
         actions, solved, parts, left = 0.0, [], [], []
         for index, (batch, start) in enumerate(zip(self.batches, starts, strict=True)):
-            if known and _unchanged(known[index], here, negligible):
+            change = _changed_by(known[index], here) if known else np.inf
+            if change == 0 or change < negligible:
                 part, after = known[index], start
             else:
-                everywhere = not known or not _changed_by(known[index], here) < little * abs(known[index].actions)
-                found, by, after, how = _of_actions(solving, parameters, batch, start, everywhere, self.mesh)
-                if not everywhere and jnp.isfinite(found) and not _finite(by):
-                    found, by, after, how = _of_actions(solving, parameters, batch, after, True, self.mesh)
+                everywhere = not (known and change < little * abs(known[index].actions))
+                found, by, after, how = _evaluated(solving, parameters, batch, start, everywhere, self.mesh)
                 part = Part(here, float(found), jax.tree.map(np.asarray, by), how)
             actions += part.actions
             slope = jax.tree.map(np.add, slope, part.slope)
@@ -200,26 +210,30 @@ def tasks_mesh(devices: Sequence[Any] | None = None) -> Mesh:
     return Mesh(np.asarray(jax.devices() if devices is None else devices), (AXIS,))
 
 
-def _finite(slope: PyTree[Array]) -> bool:
-    return all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(slope))
-
-
-def _unchanged(part: Part, parameters: PyTree[np.ndarray], negligible: float) -> bool:
-    """Whether a part is at the same θ, or, by its slope, as good as that."""
-    moves = jax.tree.leaves(jax.tree.map(np.subtract, parameters, part.parameters))
-    return not any(move.any() for move in moves) or _changed_by(part, parameters) < negligible
-
-
 def _changed_by(part: Part, parameters: PyTree[np.ndarray]) -> float:
-    """By how many nats at most, to first order, what a batch adds has changed since."""
-    changes = jax.tree.map(
-        lambda slope, now, then: np.abs(slope * (now - then)).sum(), part.slope, parameters, part.parameters
-    )
-    return float(sum(jax.tree.leaves(changes)))
+    """By how many nats at most, to first order, what a batch adds has changed since; 0 only at the same θ."""
+    moves = jax.tree.map(np.subtract, parameters, part.parameters)
+    if not any(move.any() for move in jax.tree.leaves(moves)):
+        return 0.0
+    changes = jax.tree.map(lambda slope, move: np.abs(slope * move).sum(), part.slope, moves)
+    return max(float(sum(jax.tree.leaves(changes))), np.finfo(np.float64).tiny)
+
+
+def _evaluated(
+    problem: Problem, parameters: PyTree, batch: Batch, starts: Start, everywhere: bool, mesh: Mesh | None
+) -> tuple[Array, PyTree, Start, Solved]:
+    """`_of_actions`, of all states if without some of them there is no slope."""
+    found, slope, left, solved = _of_actions(problem, parameters, batch, starts, everywhere, mesh)
+    if everywhere or not jnp.isfinite(found) or all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(slope)):
+        return found, slope, left, solved
+    kept = jnp.where(jnp.isfinite(left.adjoint), left.adjoint, starts.adjoint)
+    return _of_actions(problem, parameters, batch, left._replace(adjoint=kept), True, mesh)
 
 
 @eqx.filter_jit
-def _apart_from_actions(problem: Problem, parameters: Parameters) -> tuple[PyTree, tuple[Array, Array]]:
+def _apart_from_actions(
+    problem: Problem, arrivals: Arrivals, parameters: Parameters
+) -> tuple[PyTree, tuple[Array, Array]]:
     """The slope of the loss's other parts, and the parts: the transitions' log-likelihood and the log prior."""
 
     def loss(parameters: Parameters) -> tuple[Array, tuple[Array, Array]]:
@@ -228,7 +242,7 @@ def _apart_from_actions(problem: Problem, parameters: Parameters) -> tuple[PyTre
         prior = prior + problem.people.with_parameters(parameters.people).log_density().astype(prior.dtype)
         if "transitions" in problem.terms:
             model = problem.model.with_parameters(parameters.model)
-            transitions = transition_log_likelihood(model, problem.demonstrations)
+            transitions = arrival_log_likelihood(model, arrivals)
         return -transitions - prior, (transitions, prior)
 
     return jax.grad(loss, has_aux=True)(parameters)

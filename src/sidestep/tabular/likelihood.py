@@ -118,8 +118,7 @@ def choice_log_likelihood(
     """Σ log π_θ(a | s) over the choices made in pursuit of one task, and the task's solution (from `start`).
 
     The arguments are those of `solve`. NaN if its values did not converge. Over the tasks of
-    `choices_of(demonstrations)`
-    it adds up to `action_log_likelihood`.
+    `choices_of(demonstrations)` it adds up to `action_log_likelihood`.
     """
     solution = solve(
         model,
@@ -143,8 +142,7 @@ def choices_of(demonstrations: Demonstrations) -> Choices:
     different, which = np.unique(np.stack([task, states, actions]), axis=1, return_inverse=True)
     counts = np.bincount(which.ravel(), np.asarray(demonstrations.counted))
     sizes = np.bincount(different[0], minlength=len(demonstrations.tasks.terminal))
-    # rounded up to a power of two, so that fits of other data need not be compiled again
-    filled = np.arange(2 ** int(np.ceil(np.log2(max(sizes.max(), 16))))) < sizes[:, None]
+    filled = np.arange(rounded_up(max(int(sizes.max()), 16))) < sizes[:, None]
 
     def padded(part: np.ndarray) -> Array:
         whole = np.zeros(filled.shape, part.dtype if part.dtype.kind == "f" else np.int32)
@@ -152,6 +150,37 @@ def choices_of(demonstrations: Demonstrations) -> Choices:
         return jnp.asarray(whole)
 
     return Choices(padded(different[1]), padded(different[2]), padded(counts))
+
+
+class Arrivals(NamedTuple):
+    """Where actions led: `actions` in `states` to `next_states`, and how much each counts in all."""
+
+    states: Int[Array, " arrivals"]
+    actions: Int[Array, " arrivals"]
+    next_states: Int[Array, " arrivals"]
+    counts: Float[Array, " arrivals"]
+
+
+def arrivals_of(demonstrations: Demonstrations) -> Arrivals:
+    """The moves of all tasks as arrivals, equal ones counted; filled up by the first one, with counts of 0."""
+    moves = np.stack([np.asarray(getattr(demonstrations, name)) for name in ("states", "actions", "next_states")])
+    different, which = np.unique(moves, axis=1, return_inverse=True)
+    counts = np.bincount(which.ravel(), np.asarray(demonstrations.counted))
+    missing = rounded_up(max(len(counts), 16)) - len(counts)
+    filled = np.concatenate([different, np.repeat(different[:, :1], missing, axis=1)], axis=1)
+    states, actions, next_states = (jnp.asarray(part) for part in filled)
+    return Arrivals(states, actions, next_states, jnp.asarray(np.pad(counts, (0, missing))))
+
+
+def arrival_log_likelihood(model: TransitionModel, arrivals: Arrivals) -> Float[Array, ""]:
+    """Σ ln T_θ(s, a, s′) over arrivals; those of demonstrations add up to `transition_log_likelihood`."""
+    each = jnp.log(transition_probabilities(model, arrivals))
+    return jnp.sum(each * arrivals.counts.astype(each.dtype))
+
+
+def rounded_up(count: int) -> int:
+    """The next power of two, so that one compiled function serves data of many sizes."""
+    return 2 ** int(np.ceil(np.log2(count)))
 
 
 def visited_action_values(
@@ -188,8 +217,8 @@ def transition_log_likelihood(model: TransitionModel, demonstrations: Demonstrat
     return _weighted(demonstrations, jnp.log(transition_probabilities(model, demonstrations)))
 
 
-def transition_probabilities(model: TransitionModel, demonstrations: Demonstrations) -> Float[Array, " moves"]:
+def transition_probabilities(model: TransitionModel, moves: Demonstrations | Arrivals) -> Float[Array, " moves"]:
     """T_θ(s, a, s′) of every move."""
-    states, actions = demonstrations.states, demonstrations.actions
-    leads_there = model.graph.successors[states, actions] == demonstrations.next_states[:, None]
+    states, actions = moves.states, moves.actions
+    leads_there = model.graph.successors[states, actions] == moves.next_states[:, None]
     return jnp.sum(jnp.where(leads_there, model.probabilities()[states, actions], 0), axis=-1)

@@ -23,6 +23,7 @@ from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solvers.choice import solver_for
 from sidestep.tabular.solvers.process import (
     DecisionProcess,
+    Region,
     Solver,
     Start,
     Sweeps,
@@ -67,13 +68,14 @@ def solve(
     - `gradient`: what derivatives of the solution mean, "exact" or "fixed_policy" (eqs. 9, 10).
     - `solver`: how the fixed point is found; by default as `solver_for` chooses.
     - `start`: what an earlier solution of the same task or tasks left; without it, the solve starts from nothing. The
-      solution does not depend on it beyond the tolerance. Differentiating with respect to `start.adjoint` yields the
-      new adjoint λ, for the next solve to start from.
+      solution (in the region) does not depend on it beyond the tolerance. Differentiating with respect to
+      `start.adjoint` yields the new adjoint λ, for the next solve to start from.
     - `visited`: the states whose action values are wanted; by default all. Asking for few saves time and memory when
       they are differentiated.
     - `region`: the states that have to be solved, by default all; `start.region` are those that mattered to what the
-      solve that left the start was asked for. The others are brought up to date only roughly. That saves time; if they
-      turn out to matter, derivatives are NaN (see `process`).
+      solve that left the start was asked for. `Ordered` brings the others up to date only roughly, which saves time.
+      Where they are seen to matter, derivatives are NaN; but a state that did not matter at all and does now goes
+      unseen (see `process`). So this is for guesses that are looked at again, like those of a line search.
 
     The numbers have the dtype of the model's probabilities. May be used under `jit`, `vmap` and `grad`. Look at
     `converged` before you use the numbers; `check_proper` tells beforehand whether values exist.
@@ -87,7 +89,7 @@ def solve(
     solver = solver or solver_for(behavior.backup, model.graph.states)
     begin = start or _cold_start(solver, model.graph.states, dtype, task.terminal.shape[:-1])
 
-    whole = jnp.ones(task.terminal.shape, dtype=bool) if region is None else region
+    solved = jnp.ones(task.terminal.shape, dtype=bool) if region is None else region
 
     def one(task: Task, start: Start, visited: Array | None, region: Array) -> Solution:
         process = DecisionProcess(
@@ -116,7 +118,7 @@ def solve(
         left = Start(jax.lax.stop_gradient(values), start.adjoint, found.order)
         return Solution(values, q, found.sweeps, found.residual, found.converged, left)
 
-    arguments = task, begin, visited, whole
+    arguments = task, begin, visited, solved
     return jax.vmap(one)(*arguments) if task.terminal.ndim == 2 else one(*arguments)
 
 
@@ -158,7 +160,7 @@ def _solve_fixed_point(
     solver: Solver,
     start: Start,
     visited: Int[Array, " visited"],
-    region: Bool[Array, " states"],
+    region: Region,
 ) -> tuple[Sweeps, Float[Array, "visited actions outcomes"]]:
     varying = (process.probabilities, process.reward, process.final_reward, process.discount, behavior.beta)
     held = jax.lax.stop_gradient(varying)

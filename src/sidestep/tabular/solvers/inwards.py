@@ -18,7 +18,7 @@ _COARSEST = 1e-3
 """The first threshold, as a share of the sum of what is to be passed on; so that small residuals add up first."""
 _FINER = 0.1
 """By how much the threshold shrinks from sweep to sweep."""
-_TRUST = 100
+_MOST_SWEEPS = 100
 """How many sweeps are tried where states were left out; whoever walks in circles there never gets rid of residuals."""
 
 
@@ -58,7 +58,7 @@ def pull_back(
     actions, outcomes, width = sizes(given)
     shares = _no_shares(width, setting, known[order], cotangent[order])
     run, whole = passing_for(actions, outcomes, width), region.all()
-    sweeps = max_sweeps if whole else min(max_sweeps, _TRUST)
+    sweeps = max_sweeps if whole else min(max_sweeps, _MOST_SWEEPS)
     outcome = _pass_on_until_gone(run, setting, shares, number(total), number(tolerance), sweeps)
     if outcome.converged and not whole:
         cost = _cost_of_leaving_out(run, setting, shares, region)
@@ -111,7 +111,7 @@ def _cost_of_leaving_out(run: Passing, setting: Setting, shares: Shares, region:
     reached = setting.values > setting.reached
     size = np.abs(shares.adjoint * np.where(reached, setting.values, 0)[setting.order]).sum()
     cost = run.left_out(setting, shares.adjoint, region)
-    return float(cost / size) if size > 0 else 0.0
+    return float(cost / size) if size > 0 else float(np.inf if cost > 0 else cost)
 
 
 def _pass_on_until_gone(

@@ -2,7 +2,8 @@
 
 An earlier solve's values are taken on trust for some sweeps; if they have not converged by then, the solve starts from
 no values and in a new order. An order is kept as long as few states want to go to a farther one. States outside the
-region are left as they are after one sweep, as long as an earlier solve's values serve; from no values, all are solved.
+region are swept once and then only moved along, as long as an earlier solve's values serve; from no values, and if the
+region is empty, all are solved.
 """
 
 from typing import NamedTuple
@@ -66,7 +67,8 @@ def find_values(
         return
     nothing = number(lowest(start.dtype))
     outcome = Outcome(0, np.inf, False)
-    if (start > nothing).any() and region.any():
+    region = region if region.any() else np.ones_like(region)
+    if (start > nothing).any():
         digits = -np.log10(max(asked.tolerance, np.finfo(start.dtype).eps))
         trusted = int(np.ceil(_TRUST * max(1.0, digits)))
         trusted = min(trusted, max_sweeps)

@@ -30,8 +30,9 @@ matter under a model nearby; λ, which is solved over all states, tells afterwar
 
     Σ_{s left out} |λ(s) (B(Q(s, ·)) − V(s))|,
 
-and that has to be within the tolerance of Σ |λ(s) V(s)|. It does not see what lies beyond the first order, where the
-model has changed much; so only loose solves on the way to a fit's result leave states out.
+and that has to be within the tolerance of Σ |λ(s) V(s)|. This is to first order, and for the exact gradient. A way that
+nobody took, because λ is 0 there, may have become the best one without any of it being seen: so leave states out only
+in guesses that are looked at again.
 
 At discount 1 the values of states that cannot reach a terminal state are −∞; they are held at `lowest(dtype)`, so low
 that an action which may lead there is never taken.
@@ -122,7 +123,8 @@ class Sweeps(NamedTuple):
     `sweeps` says how often a state was solved; on average, where states are not all solved equally often.
     `residual` is the largest change in the last sweep relative to the value itself (or to what its actions are worth
     without staying, where that is larger), so that small values far from a goal count as much as large ones;
-    `converged` says that it is within the tolerance. The error is larger than the residual by up to 1/(1 − rate of
+    `converged` says that it is within the tolerance. Both are of the states that had to be solved; of an adjoint,
+    `residual` may be the cost of those left out. The error is larger than the residual by up to 1/(1 − rate of
     convergence).
     """
 

@@ -1,7 +1,7 @@
 """Rounds of sweeps until values are still: which states are swept when, and when to stop. On the host.
 
 `sweeping` holds a single sweep. A round goes once over all states that are to be solved; where these are not all, a
-round over all states comes first, so that those left out have moved with the others by and large.
+round over every state comes first, so that the others have moved with them by and large.
 
 1. For the Boltzmann average and the log-sum-exp, up to 8 rounds sweep all of them at once, with everything farther
    shifted. If changes grow from one round to the next, all is taken back to the first values, and this ends.
@@ -63,7 +63,7 @@ class Rounds:
         max_sweeps: int,
         max_rounds: int,
     ):
-        self.which, self.all = which, np.arange(len(values), dtype=np.int32)
+        self.which, self.every = which, np.arange(len(values), dtype=np.int32)
         self.world, self.values, self.valuing, self.tolerance = world, values, valuing, tolerance
         self.max_sweeps, self.max_rounds = max_sweeps, max_rounds
         never = np.zeros((2, len(values)), np.int32)
@@ -74,9 +74,9 @@ class Rounds:
 
     def until_still(self) -> Outcome:
         """Sweeps until a sweep over `which` changes none by more than the tolerance, or too much has been done."""
-        if len(self.which) < len(self.all):
+        if len(self.which) < len(self.every):
             self._begin_round()
-            self._sweep(self.all, shifted=0 if self.valuing.kind in _SHIFTED else len(self.all))
+            self._sweep(self.every, shifted=0 if self.valuing.kind in _SHIFTED else len(self.every))
         residual = self._all_at_once() if self.valuing.kind in _SHIFTED else np.inf
         converged = False
         while not (converged or self._given_up() or np.isnan(residual)):
@@ -84,7 +84,7 @@ class Rounds:
             if residual <= self.tolerance and not self._given_up():
                 residual = self._once_more()
                 converged = bool(residual <= self.tolerance)
-        return Outcome(-(-self.solved // len(self.all)), float(residual), converged)
+        return Outcome(-(-self.solved // len(self.every)), float(residual), converged)
 
     def _all_at_once(self) -> float:
         """Step 1; the largest change in the last round, infinite if all was taken back."""

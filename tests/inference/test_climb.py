@@ -1,0 +1,41 @@
+"""The climb of a fit: which of its looks save work."""
+
+from sidestep.commands.simulate import Walkers, walk
+from sidestep.demonstrations import gather
+from sidestep.domains.offices import office
+from sidestep.inference import batches, climb, objective
+from sidestep.inference.fit import fit
+from sidestep.inference.objective import Objective
+from sidestep.inference.optimisers import Resilient
+from sidestep.tabular.backups import Behavior, LogSumExp
+from sidestep.tabular.models import ObstacleGrid
+from sidestep.tasks import reach
+
+
+def test_states_are_left_out_only_where_a_step_is_tried(monkeypatch):
+    """And not once solves are exact; whether a step is taken is decided by all states."""
+    for module in (climb, batches):
+        monkeypatch.setattr(module, "LARGE", 1)
+    looks, solved = [], []
+    evaluate, of_actions = Objective.evaluate, objective._of_actions
+
+    def watched(self, parameters, starts, tolerance, known, negligible, little):
+        looks.append((tolerance, negligible > 0, little > 0))
+        return evaluate(self, parameters, starts, tolerance, known, negligible, little)
+
+    def of_batch(problem, parameters, batch, starts, everywhere, mesh):
+        solved.append((looks[-1], everywhere))
+        return of_actions(problem, parameters, batch, starts, everywhere, mesh)
+
+    monkeypatch.setattr(Objective, "evaluate", watched)
+    monkeypatch.setattr(objective, "_of_actions", of_batch)
+    truth = office(20, 24, 2)
+    trajectories, goals = walk(truth, Walkers(walks=24, goals=6, discount=1.0, step_cost=1.0))
+    shown = gather(trajectories, [reach(truth.forget(), goal, discount=1.0, step_cost=1.0) for goal in goals])
+    found = fit(
+        ObstacleGrid(truth.forget(), 0.0), shown, Behavior(LogSumExp(), 5.0), optimiser=Resilient(tolerance=1.0)
+    )
+    assert found.converged
+    assert {look for look, everywhere in solved if not everywhere} == {(Resilient.exactness, True, True)}
+    assert {rough for _, rough, _ in looks} == {False, True}
+    assert all(little == (rough and tolerance == Resilient.exactness) for tolerance, rough, little in looks)
