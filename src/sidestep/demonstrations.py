@@ -136,3 +136,25 @@ def gather(trajectories: Sequence[Trajectory], tasks: Sequence[Task]) -> Demonst
 def flat_moves(parts: Sequence[np.ndarray]) -> Int[Array, " moves"]:
     """Pieces of a flat array, one after another."""
     return jnp.asarray(np.concatenate(parts), dtype=jnp.int32)
+
+
+def filled_up(demonstrations: Demonstrations[Task]) -> Demonstrations[Task]:
+    """The same moves and tasks, and after them the first ones again, up to powers of two; see `rounded_up`.
+
+    Of results for every move, those from `len(demonstrations)` on are to be thrown away.
+    """
+    moves, tasks = len(demonstrations), len(demonstrations.tasks.terminal)
+
+    def filled(leaf: Array, count: int) -> Array:
+        array = np.asarray(leaf)
+        return jnp.asarray(np.concatenate([array, np.repeat(array[:1], rounded_up(count) - count, axis=0)]))
+
+    own = eqx.tree_at(lambda demos: demos.tasks, demonstrations, None)
+    filled_tasks = jax.tree.map(lambda leaf: filled(leaf, tasks), demonstrations.tasks)
+    filled_moves = jax.tree.map(lambda leaf: filled(leaf, moves), own)
+    return eqx.tree_at(lambda demos: demos.tasks, filled_moves, filled_tasks, is_leaf=lambda leaf: leaf is None)
+
+
+def rounded_up(count: int) -> int:
+    """The next power of two, so that one compiled function serves data of many sizes."""
+    return 2 ** int(np.ceil(np.log2(count)))

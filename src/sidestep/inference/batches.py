@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from sidestep.demonstrations import Demonstrations
-from sidestep.tabular.likelihood import Choices, choices_of, rounded_up
+from sidestep.demonstrations import Demonstrations, rounded_up
+from sidestep.tabular.likelihood import Choices, choices_of
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.people import People
 from sidestep.tabular.solvers.host import cores

@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from sidestep.demonstrations import Demonstrations
+from sidestep.demonstrations import Demonstrations, filled_up
 from sidestep.evaluation import Reward
 from sidestep.planners import Planner
 from sidestep.robots import robot
@@ -89,7 +89,7 @@ class Learned(NamedTuple):
         goals = np.asarray(demonstrations.tasks.terminal).argmax(axis=-1)
         tasks = stack_tasks([self.reward.reach(self.model.blank, int(goal)) for goal in goals])
         pursued = eqx.tree_at(lambda demos: demos.tasks, demonstrations, tasks)
-        return np.asarray(log_policies(self.model, pursued, self.behavior))
+        return np.asarray(log_policies(self.model, filled_up(pursued), self.behavior))[: len(demonstrations)]
 
 
 def nats_a_move(lesson: Lesson, others: Demonstrations) -> float | None:

@@ -8,11 +8,12 @@ People plan with the dynamics that they know, so both terms depend on θ: the *a
 
 from typing import Literal, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.demonstrations import Demonstrations
+from sidestep.demonstrations import Demonstrations, rounded_up
 from sidestep.tabular.backups import Behavior, Gradient
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import Solution, solve
@@ -74,6 +75,7 @@ def action_log_likelihood(
     return _weighted(demonstrations, each)
 
 
+@eqx.filter_jit
 def log_policies(
     model: TransitionModel,
     demonstrations: Demonstrations,
@@ -176,11 +178,6 @@ def arrival_log_likelihood(model: TransitionModel, arrivals: Arrivals) -> Float[
     """Σ ln T_θ(s, a, s′) over arrivals; those of demonstrations add up to `transition_log_likelihood`."""
     each = jnp.log(transition_probabilities(model, arrivals))
     return jnp.sum(each * arrivals.counts.astype(each.dtype))
-
-
-def rounded_up(count: int) -> int:
-    """The next power of two, so that one compiled function serves data of many sizes."""
-    return 2 ** int(np.ceil(np.log2(count)))
 
 
 def visited_action_values(

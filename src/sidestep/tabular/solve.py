@@ -82,11 +82,28 @@ def solve(
     """
     if horizon is not None and horizon < 1:
         raise InputError(f"expected at least one action, found {horizon}", field="horizon")
+    solver = solver or solver_for(behavior.backup, model.graph.states)
+    return _solve(model, task, behavior, horizon, gradient, solver, start, visited, region)
+
+
+# Compiled as a whole, or else the loops of a solver would be compiled anew with every call.
+@eqx.filter_jit
+def _solve(
+    model: TransitionModel,
+    task: Task,
+    behavior: Behavior,
+    horizon: int | None,
+    gradient: Gradient,
+    solver: Solver,
+    start: Start | None,
+    visited: Int[Array, "*tasks visited"] | None,
+    region: Bool[Array, "*tasks states"] | None,
+) -> Solution:
+    """`solve`, with the solver that was chosen."""
     probabilities = model.probabilities()
     dtype = probabilities.dtype
     behavior = eqx.tree_at(lambda people: people.beta, behavior, behavior.beta.astype(dtype))
 
-    solver = solver or solver_for(behavior.backup, model.graph.states)
     begin = start or _cold_start(solver, model.graph.states, dtype, task.terminal.shape[:-1])
 
     solved = jnp.ones(task.terminal.shape, dtype=bool) if region is None else region
