@@ -4,7 +4,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from sidestep.demonstrations import Trajectory, gather
+from sidestep.demonstrations import Trajectory, filled_up, gather, rounded_up
 from sidestep.errors import InputError
 from sidestep.io.demonstrations import demonstrations
 from sidestep.io.walks import walks_of_table
@@ -111,3 +111,20 @@ def test_moves_count_once_or_by_their_weight():
     found = gather([trajectory([0, 1, 2], [3, 3]), trajectory([1, 2], [3])], TASKS)
     assert found.counted.tolist() == [1, 1, 1]
     assert found.counting(np.array([False, True])).counted.tolist() == [0, 0, 1]
+
+
+def test_filled_up_with_the_first_moves_and_tasks_again():
+    found = gather([trajectory([1, 2, 2, 3], [3, 3, 3]), trajectory([2, 1, 0], [2, 2], task=1)], [*TASKS, TASKS[1]])
+    filled = filled_up(found)
+    assert (len(found), len(filled), len(filled.tasks.terminal)) == (5, 8, 4)
+    assert filled.states.tolist() == [*found.states.tolist(), 1, 1, 1]
+    assert filled.task.tolist() == [*found.task.tolist(), 0, 0, 0]
+    np.testing.assert_allclose(filled.tasks.discount, [0.95, 0.5, 0.5, 0.95])
+    assert filled.weight is None
+    weighed = filled_up(found.counting(np.array([False, True])))
+    assert weighed.counted.tolist() == [0, 0, 0, 1, 1, 0, 0, 0]
+
+
+@pytest.mark.parametrize(("count", "expected"), [(1, 1), (2, 2), (3, 4), (16, 16), (17, 32)])
+def test_rounded_up(count, expected):
+    assert rounded_up(count) == expected

@@ -1,5 +1,7 @@
 """The likelihood by hand, its terms, and what gives none."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,8 +10,14 @@ from sidestep.demonstrations import Trajectory, gather
 from sidestep.tabular.backups import Behavior, HardMax
 from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Grid
-from sidestep.tabular.likelihood import log_likelihood
+from sidestep.tabular.likelihood import (
+    arrival_log_likelihood,
+    arrivals_of,
+    log_likelihood,
+    transition_log_likelihood,
+)
 from sidestep.tabular.models import ObstacleGrid, TabularModel
+from sidestep.tabular.solve import solve
 from sidestep.tasks import reach
 
 # In a corridor of three cells, each blocked with p = 1/4, at γ = 1/2, a walker at 0 tries left, right, right;
@@ -88,3 +96,42 @@ def test_transitions_that_cannot_happen_have_likelihood_0():
     demos = gather([Trajectory(np.array([0, 2]), np.array([3]), 0)], [reach(grid, 1)])
     found = log_likelihood(ObstacleGrid(grid), demos, Behavior(HardMax(), 1.0), terms=("transitions",))
     assert found.total == -jnp.inf
+
+
+def test_arrivals_are_the_moves_counted():
+    """Equal moves of different tasks are one; each counts by its weight, and what fills up counts for nothing."""
+    grid = Grid.unknown(1, 3)
+    model = ObstacleGrid(grid, jnp.asarray([0.0, -1.0, -2.0]))
+    walks = [WALK, Trajectory(np.array([0, 0, 1]), np.array([3, 3]), 1)]
+    shown = gather(walks, [reach(grid, 2, discount=0.5), reach(grid, 1)])
+    for weight, counts in ((None, [1, 2, 2, 1]), (jnp.asarray([0.0, 1, 2, 0, 3, 0.5]), [0, 4, 2.5, 0])):
+        weighed = eqx.tree_at(lambda demos: demos.weight, shown, weight, is_leaf=lambda leaf: leaf is None)
+        arrivals = arrivals_of(weighed)
+        kinds = zip(arrivals.states.tolist(), arrivals.actions.tolist(), arrivals.next_states.tolist(), strict=True)
+        assert list(kinds)[:4] == [(0, 2, 0), (0, 3, 0), (0, 3, 1), (1, 3, 2)]
+        assert arrivals.counts.tolist() == [*counts, *[0] * 12]
+        expected = transition_log_likelihood(model, weighed)
+        assert float(arrival_log_likelihood(model, arrivals)) == pytest.approx(float(expected), rel=1e-12)
+
+
+@pytest.mark.parametrize("connectivity", [4, 8])
+def test_solves_are_compiled_once(connectivity):
+    """Of a map of this size and so many tasks; each compilation takes longer than many solves."""
+    grid = Grid.unknown(3, 7, connectivity=connectivity)
+    compiled = []
+
+    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
+        del duration_secs, kwargs
+        compiled.append("backend_compile" in event)
+
+    people = Behavior(HardMax(), BETA)
+    makers = [lambda logit, goal=goal: (ObstacleGrid(grid, logit), reach(grid, goal)) for goal in (3, 8)]
+    for make in makers:
+        solve(*make(-1.0), people)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        for make in makers:
+            solve(*make(-2.0), people)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert not any(compiled)
