@@ -212,9 +212,10 @@ def _times(taken: Mapping[str, Sequence[float]], name: str) -> dict[str, Any]:
 def _went(steps: Sequence[Step]) -> dict[str, Any]:
     """The sweeps of the values, and whether values and adjoints all converged; they must."""
     # an adjoint that did not converge leaves a gradient of NaN
-    if not all(step.converged and jnp.isfinite(step.gradient).all() for step in steps[:2]):
+    if not all(step.converged and jnp.isfinite(step.gradient).all() for step in steps[:2]) or not steps[2].converged:
         raise NotConverged("the values or the adjoint did not converge: try another tolerance or backup")
     cold, warm, region = steps
+    # NaN if other states were seen to matter
     error = jnp.abs(region.gradient - warm.gradient).max() / jnp.abs(warm.gradient).max()
     return {
         **{f"{kind}_sweeps": int(step.sweeps.max()) for kind, step in zip(KINDS, steps, strict=True)},

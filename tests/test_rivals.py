@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sidestep.demonstrations import Trajectory, gather
+from sidestep.rivals import cloning
 from sidestep.rivals.cloning import by_cloning
 from sidestep.rivals.constraints import by_constraints
 from sidestep.rivals.costs import CostlyReward, by_costs
@@ -182,3 +183,9 @@ def test_cloning_takes_actions_to_be_as_probable_as_its_policy_says(walks):
         policy = learned.policy(GOALS[int(walks.task[move])])
         assert each[move] == pytest.approx(np.log(policy[int(walks.states[move]), int(walks.actions[move])]))
     assert each.mean() > np.log(0.5)
+
+
+@pytest.mark.parametrize(("most", "converged"), [(1, False), (2000, True)])
+def test_cloning_says_whether_it_converged(walks, monkeypatch, most, converged):
+    monkeypatch.setattr(cloning, "_ITERATIONS", most)
+    assert by_cloning(BLANK, walks, Settings()).converged == converged

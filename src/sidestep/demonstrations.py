@@ -141,7 +141,8 @@ def flat_moves(parts: Sequence[np.ndarray]) -> Int[Array, " moves"]:
 def filled_up(demonstrations: Demonstrations[Task]) -> Demonstrations[Task]:
     """The same moves and tasks, and after them the first ones again, up to powers of two; see `rounded_up`.
 
-    Of results for every move, those from `len(demonstrations)` on are to be thrown away.
+    Of results for every move, those from `len(demonstrations)` on are to be thrown away. Trajectories mean nothing any
+    more, and weights count twice.
     """
     moves, tasks = len(demonstrations), len(demonstrations.tasks.terminal)
 

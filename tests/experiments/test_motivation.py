@@ -24,7 +24,7 @@ def with_costs(form: Form, cost: float) -> Learned:
     """Who takes nothing to be in the way, and every cell to cost the same."""
     reward = CostlyReward(form.settings.discount, form.settings.step_cost, np.full(BLANK.size, cost))
     free = ObstacleGrid(BLANK.passable())
-    return Learned(free, reward, form.settings.behavior(), np.zeros(BLANK.shape), robot(free, []))
+    return Learned(free, reward, form.settings.behavior(), np.zeros(BLANK.shape), robot(free, []), True)
 
 
 def steps_to_the_goal(starts):
@@ -61,7 +61,7 @@ def test_a_robot_that_fears_nothing_walks_into_the_wall():
 def test_mud_takes_five_times_as_long_and_who_knows_it_goes_the_best_way():
     form, world = FORMS["steps"], true_world()
     known = Learned(
-        world, reward_of(form.settings), form.settings.behavior(), np.asarray(world.blocked), robot(world, [])
+        world, reward_of(form.settings), form.settings.behavior(), np.asarray(world.blocked), robot(world, []), True
     )
     in_mud = 3 * COLUMNS + 9
     trial = tried(known, form, in_mud, 10.0)

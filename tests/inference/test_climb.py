@@ -1,5 +1,8 @@
 """The climb of a fit: which of its looks save work."""
 
+import jax
+import numpy as np
+
 from sidestep.commands.simulate import Walkers, walk
 from sidestep.demonstrations import gather
 from sidestep.domains.offices import office
@@ -16,12 +19,19 @@ def test_states_are_left_out_only_where_a_step_is_tried(monkeypatch):
     """And not once solves are exact; whether a step is taken is decided by all states."""
     for module in (climb, batches):
         monkeypatch.setattr(module, "LARGE", 1)
-    looks, solved = [], []
+    looks, solved, again = [], [], []
     evaluate, of_actions = Objective.evaluate, objective._of_actions
 
     def watched(self, parameters, starts, tolerance, known, negligible, little):
         looks.append((tolerance, negligible > 0, little > 0))
-        return evaluate(self, parameters, starts, tolerance, known, negligible, little)
+        found, left = evaluate(self, parameters, starts, tolerance, known, negligible, little)
+        assert little > 0 or all(part.everywhere for part in found.parts)
+        again.extend(
+            part.everywhere
+            for part in known
+            if little == 0 and all(map(np.array_equal, jax.tree.leaves(part.parameters), jax.tree.leaves(parameters)))
+        )
+        return found, left
 
     def of_batch(problem, parameters, batch, starts, everywhere, mesh):
         solved.append((looks[-1], everywhere))
@@ -38,4 +48,6 @@ def test_states_are_left_out_only_where_a_step_is_tried(monkeypatch):
     assert found.converged
     assert {look for look, everywhere in solved if not everywhere} == {(Resilient.exactness, True, True)}
     assert {rough for _, rough, _ in looks} == {False, True}
+    # proper looks come after rough ones at the same point, some of whose parts are not of all states
+    assert set(again) == {False, True}
     assert all(little == (rough and tolerance == Resilient.exactness) for tolerance, rough, little in looks)

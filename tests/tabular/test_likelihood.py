@@ -96,6 +96,7 @@ def test_transitions_that_cannot_happen_have_likelihood_0():
     demos = gather([Trajectory(np.array([0, 2]), np.array([3]), 0)], [reach(grid, 1)])
     found = log_likelihood(ObstacleGrid(grid), demos, Behavior(HardMax(), 1.0), terms=("transitions",))
     assert found.total == -jnp.inf
+    assert arrival_log_likelihood(ObstacleGrid(grid), arrivals_of(demos)) == -jnp.inf
 
 
 def test_arrivals_are_the_moves_counted():
@@ -126,12 +127,14 @@ def test_solves_are_compiled_once(connectivity):
 
     people = Behavior(HardMax(), BETA)
     makers = [lambda logit, goal=goal: (ObstacleGrid(grid, logit), reach(grid, goal)) for goal in (3, 8)]
-    for make in makers:
-        solve(*make(-1.0), people)
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
         for make in makers:
+            solve(*make(-1.0), people)
+        assert any(compiled)
+        compiled.clear()
+        for make in makers:
             solve(*make(-2.0), people)
+        assert not any(compiled)
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
-    assert not any(compiled)

@@ -164,7 +164,7 @@ def test_where_states_were_left_out_an_adjoint_that_takes_long_is_given_up(monke
 @pytest.mark.parametrize("gradient", ["exact", "fixed_policy"])
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_tasks_of_a_batch_have_regions_of_their_own(gradient, dtype):
-    """As each by itself; one that nothing is asked of, and discounts below 1, with them."""
+    """As each by itself; also with a discount below 1."""
     grid, people = TRUTH.forget(), Behavior(BACKUPS["log-sum-exp"], 5.0)
     model = MODEL.with_parameters(MODEL.parameters.astype(dtype))
     tasks = stack_tasks(

@@ -142,7 +142,7 @@ def walks(form: Form, seed: int) -> Demonstrations:
 def learned(form: Form, demonstrations: Demonstrations) -> dict[str, Learned]:
     """The truth, and what each method makes of the walks on a map of which nothing is known."""
     world, settings = true_world(), form.settings
-    truth = Learned(world, reward_of(settings), settings.behavior(), np.asarray(world.blocked), robot(world, []))
+    truth = Learned(world, reward_of(settings), settings.behavior(), np.asarray(world.blocked), robot(world, []), True)
     return {"truth": truth} | {name: learn(_blank(), demonstrations, settings) for name, learn in METHODS.items()}
 
 

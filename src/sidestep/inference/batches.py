@@ -53,8 +53,9 @@ def planned(
 
     They fit into `memory` bytes on each device; one of a task a device always is possible. If evaluations are to take
     over what batches added to earlier ones (`takes_over`), and solves take long, a batch on a single device has no more
-    tasks than there are cores: the fewer, the more often it can. Where solves do not take long and all fit into one
-    batch, its size is rounded up to a power of two, so that one compiled function serves other data too.
+    tasks than there are cores: the fewer, the more often it can. Where solves do not take long and there is
+    room, a device's share of a single batch is rounded up to a power of two, for one compiled function to serve other
+    data too.
     """
     probabilities, parameters = jax.eval_shape(model.probabilities), jax.eval_shape(lambda: model.parameters)
     item = probabilities.dtype.itemsize
@@ -71,7 +72,10 @@ def planned(
     rounds = math.ceil(share / (min(most, cores()) if takes_over else most))
     together = math.ceil(share / rounds)
     if rounds == 1 and model.graph.states < LARGE:
-        together = min(most, rounded_up(together))
+        rounded = rounded_up(together)
+        added = (rounded - share) * model.graph.states * (2 * item + 4) + _FIXED * size
+        fits = rounded * _WORKSPACE.get(type(solver), 3) * size + starts + added <= memory
+        together = rounded if fits else together
     return Planned(devices * together, keeps_starts, takes_over)
 
 

@@ -2,8 +2,8 @@
 
 On large maps the solves of the first points are loose. Where the optimiser has converged, or finds no step that gains
 anything, the same point is looked at again with exact solves and the climb goes on from there; it ends only on exact
-ones. A rough look, which tells whether a step is worth a proper one, takes over what has hardly changed, and solves
-only the states that mattered where little has.
+ones. A rough look, which tells whether a step is worth a proper one, takes over batches of tasks that have hardly
+changed; in those that have changed little, loose solves are of the states only that mattered.
 """
 
 from collections.abc import Callable

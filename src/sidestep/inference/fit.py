@@ -104,6 +104,7 @@ def fit(
     optimiser = optimiser or LBFGS()
     someone = people(behavior) if isinstance(behavior, Behavior) else behavior
     _check_settings(terms, gradient, someone.behavior, optimiser)
+    horizon = None if horizon is None else int(horizon)
     if not 0 < tempering <= 1:
         raise InputError(f"expected a share above 0 and at most 1, found {tempering}", field="tempering")
     check_proper(someone.tasks_of(demonstrations.tasks), someone.behavior_of(), model.graph.actions, horizon)

@@ -90,12 +90,16 @@ class Solved(NamedTuple):
 
 
 class Part(NamedTuple):
-    """What the tasks of a batch add to the actions' log-likelihood and to the slope of the loss, and at which θ."""
+    """What the tasks of a batch add to the actions' log-likelihood and to the slope of the loss, and at which θ.
+
+    `everywhere`: whether all states were solved.
+    """
 
     parameters: PyTree[np.ndarray]
     actions: float
     slope: PyTree[np.ndarray]
     solved: Solved
+    everywhere: bool
 
 
 class Evaluation(NamedTuple):
@@ -136,10 +140,15 @@ class Objective:
             else []
         )
         self.batches = [_shared_out(batch, mesh) for batch in batches]
-        # of the demonstrations, batches and arrivals are all that is needed
-        self.lasting = eqx.tree_at(lambda problem: problem.demonstrations, problem, None)
+        # of the data, batches and arrivals are all that is needed
+        self.lasting = eqx.tree_at(
+            lambda problem: (problem.demonstrations, problem.people.person),
+            problem,
+            (None, None),
+            is_leaf=lambda leaf: leaf is None,
+        )
         self.solving = _on_all(self.lasting, mesh)
-        self.arrivals = arrivals_of(problem.demonstrations)
+        self.arrivals = arrivals_of(problem.demonstrations) if "transitions" in problem.terms else None
 
     @property
     def processes(self) -> list[int]:
@@ -175,8 +184,9 @@ class Objective:
         """The objective at θ, and where the next evaluation may start.
 
         - `tolerance`: that of the solves, where the solver leaves it open. The objective is NaN if a solve failed.
-        - `known`: the parts of an earlier evaluation with the same tolerance. Those at the same θ are taken over, and
-          those to which, by their slope, the way from their θ to this one makes a difference below `negligible` (nats).
+        - `known`: the parts of an earlier evaluation with the same tolerance. Those at the same θ are taken over if all
+          states were solved (or, with `little`, need not be), and those to which, by their slope, the way from their θ
+          to this one makes a difference below `negligible` (nats).
         - `little`: only the states that mattered are solved where this way changes a batch's part by less than this
           share of it.
         """
@@ -189,12 +199,14 @@ class Objective:
         actions, solved, parts, left = 0.0, [], [], []
         for index, (batch, start) in enumerate(zip(self.batches, starts, strict=True)):
             change = _changed_by(known[index], here) if known else np.inf
-            if change == 0 or change < negligible:
+            if change < negligible or (change == 0 and (known[index].everywhere or little > 0)):
                 part, after = known[index], start
             else:
                 everywhere = not (known and change < little * abs(known[index].actions))
-                found, by, after, how = _evaluated(solving, parameters, batch, start, everywhere, self.mesh)
-                part = Part(here, float(found), jax.tree.map(np.asarray, by), how)
+                (found, by, after, how), everywhere = _evaluated(
+                    solving, parameters, batch, start, everywhere, self.mesh
+                )
+                part = Part(here, float(found), jax.tree.map(np.asarray, by), how, everywhere)
             actions += part.actions
             slope = jax.tree.map(np.add, slope, part.slope)
             solved.append(part.solved)
@@ -221,18 +233,18 @@ def _changed_by(part: Part, parameters: PyTree[np.ndarray]) -> float:
 
 def _evaluated(
     problem: Problem, parameters: PyTree, batch: Batch, starts: Start, everywhere: bool, mesh: Mesh | None
-) -> tuple[Array, PyTree, Start, Solved]:
-    """`_of_actions`, of all states if without some of them there is no slope."""
+) -> tuple[tuple[Array, PyTree, Start, Solved], bool]:
+    """`_of_actions`, of all states if without some of them there is no slope; and whether it was of all."""
     found, slope, left, solved = _of_actions(problem, parameters, batch, starts, everywhere, mesh)
     if everywhere or not jnp.isfinite(found) or all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(slope)):
-        return found, slope, left, solved
+        return (found, slope, left, solved), everywhere
     kept = jnp.where(jnp.isfinite(left.adjoint), left.adjoint, starts.adjoint)
-    return _of_actions(problem, parameters, batch, left._replace(adjoint=kept), True, mesh)
+    return _of_actions(problem, parameters, batch, left._replace(adjoint=kept), True, mesh), True
 
 
 @eqx.filter_jit
 def _apart_from_actions(
-    problem: Problem, arrivals: Arrivals, parameters: Parameters
+    problem: Problem, arrivals: Arrivals | None, parameters: Parameters
 ) -> tuple[PyTree, tuple[Array, Array]]:
     """The slope of the loss's other parts, and the parts: the transitions' log-likelihood and the log prior."""
 
@@ -240,7 +252,7 @@ def _apart_from_actions(
         prior = problem.prior.log_density(parameters.model)
         transitions = jnp.zeros_like(prior)
         prior = prior + problem.people.with_parameters(parameters.people).log_density().astype(prior.dtype)
-        if "transitions" in problem.terms:
+        if arrivals is not None:
             model = problem.model.with_parameters(parameters.model)
             transitions = arrival_log_likelihood(model, arrivals)
         return -transitions - prior, (transitions, prior)

@@ -13,6 +13,7 @@ makes the actions of other walks most probable.
 Nothing is learned of cells, so they are not ranked. A robot follows the policy greedily, see `sidestep.planners`.
 """
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,15 +91,17 @@ def by_cloning(grid: Grid, demonstrations: Demonstrations, settings: Settings) -
 def _fitted(grid: Grid, demonstrations: Demonstrations, counts: Bool[np.ndarray, " moves"], freedom: float) -> Cloned:
     """The regression on the moves that count, and on one of each action, nowhere, lest one be thought impossible."""
     # a second to load, and few need it
+    from sklearn.exceptions import ConvergenceWarning
     from sklearn.linear_model import LogisticRegression
 
     states, actions, goals = (part[counts] for part in _moves(demonstrations))
     features, every = _features(grid, states, goals), np.arange(grid.connectivity)
     nowhere = csr_array((len(every), _DIRECTION + (1 + _COMPASS) * grid.size))
     regression = LogisticRegression(C=freedom, max_iter=_ITERATIONS)
-    regression.fit(vstack([features, nowhere], format="csr"), np.append(actions, every))
-    converged = bool((regression.n_iter_ < _ITERATIONS).all())
-    return Cloned(grid, regression.coef_, np.asarray(regression.intercept_), converged)
+    with warnings.catch_warnings(record=True, category=ConvergenceWarning) as complaints:
+        warnings.simplefilter("always", ConvergenceWarning)
+        regression.fit(vstack([features, nowhere], format="csr"), np.append(actions, every))
+    return Cloned(grid, regression.coef_, np.asarray(regression.intercept_), converged=not complaints)
 
 
 def _moves(demonstrations: Demonstrations) -> tuple[Int[np.ndarray, " moves"], ...]:

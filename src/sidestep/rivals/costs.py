@@ -57,7 +57,7 @@ def by_costs(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> 
     costs = np.asarray(found.people.costs)
     reward = CostlyReward(settings.discount, settings.step_cost, costs)
     planner = InModel(model, partial(reward.reach, model.blank))
-    return Learned(model, reward, found.people.behavior_of(), costs.reshape(grid.shape), planner)
+    return Learned(model, reward, found.people.behavior_of(), costs.reshape(grid.shape), planner, found.converged)
 
 
 def who_pay(grid: Grid, settings: Settings) -> People:

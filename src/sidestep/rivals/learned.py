@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from sidestep.demonstrations import Demonstrations, filled_up
 from sidestep.evaluation import Reward
+from sidestep.inference.batches import LARGE
 from sidestep.planners import Planner
 from sidestep.robots import robot
 from sidestep.scoring import visit_ranking
@@ -74,7 +75,7 @@ class Learned(NamedTuple):
     behavior: Behavior
     ranking: Float[np.ndarray, "rows columns"]
     planner: Planner
-    converged: bool = True
+    converged: bool
 
     @property
     def shares(self) -> Float[np.ndarray, "rows columns"]:
@@ -89,7 +90,10 @@ class Learned(NamedTuple):
         goals = np.asarray(demonstrations.tasks.terminal).argmax(axis=-1)
         tasks = stack_tasks([self.reward.reach(self.model.blank, int(goal)) for goal in goals])
         pursued = eqx.tree_at(lambda demos: demos.tasks, demonstrations, tasks)
-        return np.asarray(log_policies(self.model, filled_up(pursued), self.behavior))[: len(demonstrations)]
+        # where solves take long, compiling once more is the lesser evil
+        few = self.model.graph.states < LARGE
+        shown = filled_up(pursued) if few else pursued
+        return np.asarray(log_policies(self.model, shown, self.behavior))[: len(demonstrations)]
 
 
 def nats_a_move(lesson: Lesson, others: Demonstrations) -> float | None:
@@ -115,7 +119,7 @@ def known_map(
     """A map as what was learned: robots know it and where people walked. Without a ranking, cells have P(blocked)."""
     ranking = np.asarray(model.blocked, dtype=np.float64) if ranking is None else ranking
     planner = robot(model, np.concatenate(demonstrations.paths()))
-    return Learned(model, reward_of(settings), settings.behavior(), ranking, planner)
+    return Learned(model, reward_of(settings), settings.behavior(), ranking, planner, converged=True)
 
 
 def by_behavior(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> Learned:

@@ -75,7 +75,6 @@ def action_log_likelihood(
     return _weighted(demonstrations, each)
 
 
-@eqx.filter_jit
 def log_policies(
     model: TransitionModel,
     demonstrations: Demonstrations,
@@ -86,6 +85,19 @@ def log_policies(
     solver: Solver | None = None,
 ) -> Float[Array, " moves"]:
     """log π_θ(a | s) of every move; NaN if a task's values did not converge."""
+    horizon = None if horizon is None else int(horizon)
+    return _log_policies(model, demonstrations, behavior, horizon, gradient, solver)
+
+
+@eqx.filter_jit
+def _log_policies(
+    model: TransitionModel,
+    demonstrations: Demonstrations,
+    behavior: Behavior,
+    horizon: int | None,
+    gradient: Gradient,
+    solver: Solver | None,
+) -> Float[Array, " moves"]:
     tasks, task, states = demonstrations.tasks, demonstrations.task, demonstrations.states
     solution = solve(model, tasks, behavior, horizon=horizon, gradient=gradient, solver=solver)
     q = visited_action_values(model, tasks, solution.values, task, states)
@@ -176,7 +188,8 @@ def arrivals_of(demonstrations: Demonstrations) -> Arrivals:
 
 def arrival_log_likelihood(model: TransitionModel, arrivals: Arrivals) -> Float[Array, ""]:
     """Σ ln T_θ(s, a, s′) over arrivals; those of demonstrations add up to `transition_log_likelihood`."""
-    each = jnp.log(transition_probabilities(model, arrivals))
+    # what counts for nothing must not be impossible
+    each = jnp.log(jnp.where(arrivals.counts > 0, transition_probabilities(model, arrivals), 1))
     return jnp.sum(each * arrivals.counts.astype(each.dtype))
 
 

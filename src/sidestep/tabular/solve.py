@@ -83,6 +83,7 @@ def solve(
     if horizon is not None and horizon < 1:
         raise InputError(f"expected at least one action, found {horizon}", field="horizon")
     solver = solver or solver_for(behavior.backup, model.graph.states)
+    horizon = None if horizon is None else int(horizon)
     return _solve(model, task, behavior, horizon, gradient, solver, start, visited, region)
 
 
