@@ -330,7 +330,7 @@ def settled_rounds():
     solved = values.copy()
     valuing = Valuing(KERNELS[BoltzmannAverage], one, 0 * one)
     everyone = np.arange(420, dtype=np.int32)
-    rounds = Rounds(world, values, everyone, everyone, valuing, np.float64(1e-11), 1000, 1000)
+    rounds = Rounds(world, values, everyone.copy(), everyone, valuing, np.float64(1e-11), 1000, 1000)
     assert rounds.until_still().converged
     return rounds, solved
 
