@@ -106,7 +106,8 @@ def _start_from(
             given.successors, given.probabilities, given.reward, given.terminal, float(given.discount)
         )
         begun = _begin(start, best, asked)
-    which = np.flatnonzero(region[begun.order]).astype(np.int32)
+    everyone = np.arange(len(order), dtype=np.int32)
+    which = everyone if region.all() else everyone[region[begun.order]]
     rounds = Rounds(
         begun.world, begun.values, begun.favourite, which, asked.valuing, asked.tolerance, max_sweeps, max_rounds
     )

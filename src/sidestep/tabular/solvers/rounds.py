@@ -63,7 +63,7 @@ class Rounds:
         max_sweeps: int,
         max_rounds: int,
     ):
-        self.which, self.every = which, np.arange(len(values), dtype=np.int32)
+        self.which = which
         self.world, self.values, self.valuing, self.tolerance = world, values, valuing, tolerance
         self.max_sweeps, self.max_rounds = max_sweeps, max_rounds
         never = np.zeros((2, len(values)), np.int32)
@@ -74,9 +74,10 @@ class Rounds:
 
     def until_still(self) -> Outcome:
         """Sweeps until a sweep over `which` changes none by more than the tolerance, or too much has been done."""
-        if len(self.which) < len(self.every):
+        if len(self.which) < len(self.values):
             self._begin_round()
-            self._sweep(self.every, shifted=0 if self.valuing.kind in _SHIFTED else len(self.every))
+            everyone = np.arange(len(self.values), dtype=np.int32)
+            self._sweep(everyone, shifted=0 if self.valuing.kind in _SHIFTED else len(everyone))
         residual = self._all_at_once() if self.valuing.kind in _SHIFTED else np.inf
         converged = False
         while not (converged or self._given_up() or np.isnan(residual)):
@@ -84,7 +85,7 @@ class Rounds:
             if residual <= self.tolerance and not self._given_up():
                 residual = self._once_more()
                 converged = bool(residual <= self.tolerance)
-        return Outcome(-(-self.solved // len(self.every)), float(residual), converged)
+        return Outcome(-(-self.solved // len(self.values)), float(residual), converged)
 
     def _all_at_once(self) -> float:
         """Step 1; the largest change in the last round, infinite if all was taken back."""
