@@ -138,11 +138,13 @@ def stepped(parameters: Array, gradient: Array, arguments: argparse.Namespace) -
 def of_all_kinds(problem: Problem, arguments: argparse.Namespace) -> Iterator[Step]:
     """A gradient of each of `KINDS`, each when it is asked for."""
     at = problem.model.parameters
-    cold = problem.cold_start()
-    found = jax.block_until_ready(take(problem, at, cold, cold.region))
+    start = problem.cold_start()
+    found = jax.block_until_ready(take(problem, at, start, start.region))
+    start = found.start
     yield found
     at = jax.block_until_ready(stepped(at, found.gradient, arguments))
-    start = found.start
+    # nothing is kept that a fit would not keep
+    del found
     yield jax.block_until_ready(take(problem, at, start, jnp.ones_like(start.region)))
     yield jax.block_until_ready(take(problem, at, start, start.region))
 

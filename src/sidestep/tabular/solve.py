@@ -212,7 +212,8 @@ def _implicit(
     adjoint out of the backward pass.
     """
     del backup, gradient, adjoint
-    return values, varying[0][given[-1]]
+    solver, visited = given[2], given[-1]
+    return values, solver.rows(varying[0], visited)
 
 
 def _implicit_forward(backup: Backup, gradient: Gradient, given: tuple, varying: tuple, values: Array, adjoint: Array):

@@ -53,6 +53,15 @@ def write(found: Found, order: Int[np.ndarray, " states"], outcome: Outcome) -> 
     found.sweeps[...], found.residual[...], found.converged[...] = outcome
 
 
+def look_up(
+    into: Float[np.ndarray, "some actions outcomes"],
+    probabilities: Float[np.ndarray, "states actions outcomes"],
+    states: Int[np.ndarray, " some"],
+) -> None:
+    """Writes the probabilities of some states `into` an array."""
+    np.take(probabilities, states, axis=0, out=into)
+
+
 def sizes(given: Given) -> tuple[int, int, int]:
     """The number of actions, of outcomes, and the most outcomes of an action that leave the state (at least 1)."""
     _, actions, outcomes = given.successors.shape

@@ -1,5 +1,6 @@
 """The bridge from JAX to the host: NumPy code called from compiled JAX code, the tasks of a batch side by side."""
 
+import ctypes
 import os
 import threading
 from collections.abc import Callable, Sequence
@@ -36,6 +37,8 @@ def on_the_host(solve: Callable[..., None], given: tuple, shapes: Any) -> Any:
             solve(result, *jax.tree.unflatten(given_structure, [array[*task, ...] for array in arrays]))
 
         _side_by_side(solve_one, list(np.ndindex(batch)))
+        if sum(result.nbytes for result in into) >= _WORTH_GIVING_BACK:
+            _give_back()
 
     found = buffer_callback(solve_all, result_leaves, vmap_method="expand_dims")(*given_leaves)
     return jax.tree.unflatten(result_structure, found)
@@ -97,6 +100,27 @@ def shared_out(work: Callable[[int, int], Any], count: int) -> list[Any]:
     if parts == 1:
         return [work(0, count)]
     return list(_threads().map(work, ends[:-1], ends[1:]))
+
+
+_WORTH_GIVING_BACK = 2**22
+"""How many bytes of results a call should have for what it held besides to be given back."""
+
+
+def _give_back() -> None:
+    """Gives free memory back to the system, where the C library keeps it until it is told otherwise (glibc's does).
+
+    It keeps it for each thread apart, and JAX calls from whichever thread it likes, so that every one of them would
+    come to keep what the largest solve needed.
+    """
+    trim = getattr(_c_library(), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+
+
+@cache
+def _c_library() -> ctypes.CDLL | None:
+    """The C library that this process runs with; None where there is no asking for it."""
+    return ctypes.CDLL(None) if os.name == "posix" else None
 
 
 def cores() -> int:

@@ -9,10 +9,11 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from sidestep.errors import InputError
 from sidestep.tabular.backups import Backup, BoltzmannAverage, Gradient, HardMax, LogSumExp, Mellowmax
+from sidestep.tabular.solvers.given import look_up
 from sidestep.tabular.solvers.host import on_the_host, shapes_of
 from sidestep.tabular.solvers.inwards import pull_back
 from sidestep.tabular.solvers.outwards import find_values
@@ -94,6 +95,16 @@ class Ordered(Solver):
         solve = partial(pull_back, kind, tie, gradient == "exact", self.max_sweeps)
         gradients, found = on_the_host(solve, given, shapes)
         return Gradients(*gradients), Sweeps(*found)
+
+    def rows(
+        self, probabilities: Float[Array, "states actions outcomes"], visited: Int[Array, " visited"]
+    ) -> Float[Array, "visited actions outcomes"]:
+        """The probabilities of some states, looked up in the array that the host is given anyway.
+
+        The compiler would make all of them a second time to look these up.
+        """
+        shape = jax.ShapeDtypeStruct((*visited.shape, *probabilities.shape[1:]), probabilities.dtype)
+        return on_the_host(look_up, (probabilities, visited), shape)
 
 
 def _machine_code(backup: Backup, dtype: jnp.dtype) -> tuple[int, float]:

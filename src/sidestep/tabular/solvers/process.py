@@ -170,6 +170,12 @@ class Solver(eqx.Module):
         Both are NaN if λ did not converge, or if states outside the region matter that were left out (see above).
         """
 
+    def rows(
+        self, probabilities: Float[Array, "states actions outcomes"], visited: Int[Array, " visited"]
+    ) -> Float[Array, "visited actions outcomes"]:
+        """The probabilities of some states."""
+        return probabilities[visited]
+
     def tolerance_for(self, dtype: jnp.dtype) -> float | Float[Array, ""]:
         """The tolerance, or the default one for numbers of that kind."""
         if self.tolerance is not None:
