@@ -22,7 +22,7 @@ from sidestep.tabular.solvers.compiled import compiled
 from sidestep.tabular.solvers.given import Given, positions, sizes
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.solvers.numbering import numbered, numbering_for
-from sidestep.tabular.solvers.order import order_by_distance
+from sidestep.tabular.solvers.order import _ascending, order_by_distance
 from sidestep.tabular.solvers.ordered import KERNELS, Ordered
 from sidestep.tabular.solvers.passing import weigh
 from sidestep.tabular.solvers.process import lowest
@@ -92,6 +92,19 @@ def test_states_out_of_reach_come_last():
     world = Grid(np.array([[-1, -1, 1, -1, -1]]))
     model = ObstacleGrid(world, 0.0)
     assert order_of(model, reach(world, 4, discount=1.0, step_cost=1.0)).tolist() == [4, 3, 2, 0, 1]
+
+
+def test_the_order_ascends_to_seven_digits_and_ties_keep_their_numbers():
+    random = np.random.default_rng(0)
+    distances = np.exp(random.uniform(-80, 80, 5_000))
+    distances[::7], distances[5::17], distances[3::13] = 0, distances[4], np.inf
+    order = _ascending(distances)
+    assert sorted(order.tolist()) == list(range(len(distances)))
+    ascending = distances[order]
+    assert (ascending[1:] >= ascending[:-1] * (1 - 1e-6)).all()
+    tied = ascending[1:] == ascending[:-1]
+    assert tied.sum() > 1_000
+    assert (np.diff(order)[tied] > 0).all()
 
 
 def test_no_end_no_order():

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sidestep.tabular.solvers.compiled import compiled
+from sidestep.tabular.solvers.host import shared_out
 
 
 class Given(NamedTuple):
@@ -64,8 +65,9 @@ def look_up(
 
 def sizes(given: Given) -> tuple[int, int, int]:
     """The number of actions, of outcomes, and the most outcomes of an action that leave the state (at least 1)."""
-    _, actions, outcomes = given.successors.shape
-    return actions, outcomes, int(_most_that_leave(given.successors))
+    states, actions, outcomes = given.successors.shape
+    most = shared_out(lambda begin, end: _most_that_leave(given.successors[begin:end]), states)
+    return actions, outcomes, max(most)
 
 
 def positions(order: Int[np.ndarray, " states"]) -> Int[np.ndarray, " states"] | None:

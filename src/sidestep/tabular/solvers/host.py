@@ -5,13 +5,16 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from functools import cache
-from typing import Any
+from functools import cache, partial
+from itertools import pairwise
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
+
+_Result = TypeVar("_Result")
 
 
 def on_the_host(solve: Callable[..., None], given: tuple, shapes: Any) -> Any:
@@ -92,14 +95,22 @@ _WORTH_SHARING = 2**14
 """How many states a core should have to do with, for sharing them out to pay."""
 
 
-def shared_out(work: Callable[[int, int], Any], count: int) -> list[Any]:
+def shared_out(work: Callable[[int, int], _Result], count: int) -> list[_Result]:
     """What `work(begin, end)` returns for ranges that cover 0…count; side by side if this is the only task."""
-    only_task = getattr(_here, "stop", None) is None
-    parts = max(1, min(cores(), count // _WORTH_SHARING)) if only_task else 1
+    parts = max(1, min(cores(), count // _WORTH_SHARING)) if _only_task() else 1
     ends = [count * part // parts for part in range(parts + 1)]
-    if parts == 1:
-        return [work(0, count)]
-    return list(_threads().map(work, ends[:-1], ends[1:]))
+    return at_once([partial(work, begin, end) for begin, end in pairwise(ends)])
+
+
+def at_once(works: Sequence[Callable[[], _Result]]) -> list[_Result]:
+    """What some pieces of work return; side by side if this is the only task."""
+    if len(works) == 1 or not _only_task():
+        return [work() for work in works]
+    return list(_threads().map(lambda work: work(), works))
+
+
+def _only_task() -> bool:
+    return getattr(_here, "stop", None) is None
 
 
 _WORTH_GIVING_BACK = 2**22

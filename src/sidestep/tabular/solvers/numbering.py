@@ -23,6 +23,7 @@ class Numbered(NamedTuple):
     - `reward`: R(s, a), with one row if it is the same in all states.
     - `fixed`: the terminal states.
     - `ending`: 1 − γ.
+    - `reach`: how many positions lie between a state and one that it leads to, at most.
     """
 
     successors: np.ndarray
@@ -31,6 +32,7 @@ class Numbered(NamedTuple):
     reward: np.ndarray
     fixed: np.ndarray
     ending: np.floating
+    reach: int
 
 
 class Numbering(NamedTuple):
@@ -55,10 +57,10 @@ def numbered(
         reward=np.ascontiguousarray(reward[order] if len(reward) > 1 else reward),
         fixed=np.empty(states, bool),
         ending=1 - given.discount,
+        reach=0,
     )
     arrays = (order, position, given.successors, given.probabilities, given.terminal, given.discount, world)
-    shared_out(lambda begin, end: run.number_states(begin, end, *arrays), states)
-    return world
+    return world._replace(reach=max(shared_out(lambda begin, end: run.number_states(begin, end, *arrays), states)))
 
 
 @cache
@@ -69,7 +71,8 @@ def numbering_for(actions: int, outcomes: int, width: int) -> Numbering:
     def number_states(
         begin, end, order, position, successors, probabilities, terminal, discount, world
     ):  # pragma: no cover
-        """Fills in `world` with the states taken in `order`, from one position up to another."""
+        """Fills in `world` with the states taken in `order`, from one position up to another; returns their reach."""
+        reach = 0
         for i in range(begin, end):
             state = order[i]
             world.fixed[i] = terminal[state]
@@ -81,6 +84,7 @@ def numbering_for(actions: int, outcomes: int, width: int) -> Numbering:
                     if after != state:
                         move = discount * probabilities[state, a, k]
                         world.successors[i, a, m] = position[after]
+                        reach = max(reach, abs(position[after] - i))
                         world.moves[i, a, m] = move
                         leaving += move
                         m += 1
@@ -88,6 +92,7 @@ def numbering_for(actions: int, outcomes: int, width: int) -> Numbering:
                     world.successors[i, a, padding] = i
                     world.moves[i, a, padding] = 0
                 world.patience[i, a] = 1 / leaving if leaving > 0 else 0.0
+        return reach
 
     @compiled()
     def favourites(begin, end, world, values, bottom, favourite):  # pragma: no cover

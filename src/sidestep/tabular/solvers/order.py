@@ -34,7 +34,20 @@ def order_by_distance(
     moves = csr_array((costs, begins, first), shape=(len(successors), len(successors)))
     ends = np.flatnonzero(terminal)
     distance = dijkstra(moves, indices=ends[0]) if len(ends) == 1 else dijkstra(moves, indices=ends, min_only=True)
-    return np.argsort(distance, kind="stable").astype(np.int32)
+    return _ascending(distance)
+
+
+def _ascending(distances: Float[np.ndarray, " states"]) -> Int[np.ndarray, " states"]:
+    """The states by their distance, to 7 digits; those that are as far as others in the order of their numbers.
+
+    In two rounds, by the lower and the upper halves of the numbers' bits, which ascend with them: NumPy sorts 16 bits
+    several times as fast as 64.
+    """
+    largest = np.finfo(np.float32).max
+    bits = np.minimum(distances, largest).astype(np.float32).view(np.uint32)
+    by_lower = np.argsort(bits.astype(np.uint16), kind="stable").astype(np.int32)
+    upper = (bits >> 16).astype(np.uint16)
+    return by_lower[np.argsort(upper[by_lower], kind="stable")]
 
 
 @compiled()

@@ -99,13 +99,16 @@ def _start_from(
     found: Found,
 ) -> Outcome:
     """Solves from values and an order that may serve; writes down the values and the order that did."""
-    begun = _begin(start, order, asked) if positions(order) is not None else None
+    position = positions(order)
+    begun = _begin(start, order, position, asked) if position is not None else None
     if begun is None or begun.astray > _OUT_OF_ORDER * len(order):
         given = asked.given
         best = order_by_distance(
             given.successors, given.probabilities, given.reward, given.terminal, float(given.discount)
         )
-        begun = _begin(start, best, asked)
+        position = positions(best)
+        assert position is not None
+        begun = _begin(start, best, position, asked)
     everyone = np.arange(len(order), dtype=np.int32)
     which = everyone if region.all() else everyone[region[begun.order]]
     rounds = Rounds(
@@ -131,11 +134,14 @@ class _Begun(NamedTuple):
     astray: int
 
 
-def _begin(start: Float[np.ndarray, " states"], order: Int[np.ndarray, " states"], asked: _Asked) -> _Begun:
+def _begin(
+    start: Float[np.ndarray, " states"],
+    order: Int[np.ndarray, " states"],
+    position: Int[np.ndarray, " states"],
+    asked: _Asked,
+) -> _Begun:
     given, bottom = asked.given, start.dtype.type(lowest(start.dtype))
     run = numbering_for(*sizes(given))
-    position = positions(order)
-    assert position is not None
     world = numbered(run, given, order, position)
     values, fixed = start[order], np.flatnonzero(world.fixed)
     values[fixed] = np.broadcast_to(given.final_reward, start.shape)[order[fixed]]

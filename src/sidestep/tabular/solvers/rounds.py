@@ -4,7 +4,8 @@
 round over every state comes first, so that the others have moved with them by and large.
 
 1. For the Boltzmann average and the log-sum-exp, up to 8 rounds sweep all of them at once, with everything farther
-   shifted. If changes grow from one round to the next, all is taken back to the first values, and this ends.
+   shifted. If changes grow from one round to the next, all is taken back to the first values, and this ends. Rounds go
+   in pairs, the second as far behind the first as it takes for neither to notice: on another core, if there is one.
 2. Then rounds go stretch by stretch, some 32 √states of them each: a stretch is swept until it is still, at most 30
    times, before the next one. Its states stay in the processor's cache, and those behind it have settled when it
    begins. For these two backups the states beyond the stretch are shifted, in the first 16 rounds (those of step 1
@@ -15,19 +16,23 @@ round over every state comes first, so that the others have moved with them by a
 The other backups are not shifted: on a real map (mellowmax, the depot) it saved nothing.
 """
 
+from functools import partial
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float, Int
 
 from sidestep.tabular.solvers.given import Outcome
 from sidestep.tabular.solvers.host import heed_interrupts, shared_out
 from sidestep.tabular.solvers.numbering import Numbered
+from sidestep.tabular.solvers.pairs import one_behind_the_other
 from sidestep.tabular.solvers.process import lowest
 from sidestep.tabular.solvers.sweeping import BOLTZMANN, LOG_SUM_EXP, Marks, Valuing, sweep_for
 
 _SHIFTED = (BOLTZMANN, LOG_SUM_EXP)
 """The backups whose sweeps shift farther values."""
-_AT_ONCE = 8
-"""How many rounds sweep all states at once, at most."""
+_PAIRS = 4
+"""How many pairs of rounds sweep all states at once, at most."""
 _GROWING = 2.0
 """By how much changes may grow from one of these rounds to the next."""
 _FEW = 0.01
@@ -40,6 +45,14 @@ _AGAIN = 30
 """How often a stretch is swept in a round, at most."""
 _STILL = 0.25
 """The share of the tolerance that counts as no change, so that what is left alone does not add up beyond it."""
+
+
+class _Sweep(NamedTuple):
+    """A sweep: its number, that of the first one of its round, and the marks that it reads and makes."""
+
+    number: int
+    first: int
+    marks: Marks
 
 
 class Rounds:
@@ -90,18 +103,37 @@ class Rounds:
     def _all_at_once(self) -> float:
         """Step 1; the largest change in the last round, infinite if all was taken back."""
         first_values, last = self.values.copy(), np.inf
-        for _ in range(_AT_ONCE):
+        for _ in range(_PAIRS):
             if self._given_up():
                 break
-            self._begin_round()
-            residual, at_work = self._sweep(self.which, shifted=0)
-            if not residual <= _GROWING * last:
+            (first, _), (residual, at_work) = self._two_rounds()
+            if not (first <= _GROWING * last and residual <= _GROWING * first):
                 self.values[:] = first_values
                 return np.inf
             last = residual
             if residual <= self.tolerance or at_work <= _FEW * len(self.which):
                 break
         return last
+
+    def _two_rounds(self) -> list[tuple[float, int]]:
+        """A pair of rounds of step 1; the largest change in each, and how many states were solved."""
+        self._begin_round()
+        leading = self._next_sweep()
+        # the second begins with the values that the first leaves, as soon as they are there
+        self.marks, filled = self.marks._replace(before=np.full_like(self.values, np.nan)), 0
+        self._count_round()
+        following = self._next_sweep()
+
+        def settled(end: int) -> None:
+            nonlocal filled
+            following.marks.before[filled:end] = self.values[filled:end]
+            filled = end
+
+        lead, follow = (partial(self._solve, self.values, sweep, shifted=0) for sweep in (leading, following))
+        results = one_behind_the_other(lead, follow, settled, self.stretches, self.world.reach)
+        found = [(float(np.max([change for change, _ in own])), sum(solved for _, solved in own)) for own in results]
+        self.solved += sum(solved for _, solved in found)
+        return found
 
     def _stretch_by_stretch(self) -> float:
         """A round of step 2; the largest change in the first sweeps over the stretches."""
@@ -128,18 +160,25 @@ class Rounds:
 
     def _begin_round(self) -> None:
         self.marks.before[:] = self.values
+        self._count_round()
+
+    def _count_round(self) -> None:
         self.first = self.number + 1
         self.rounds += 1
+
+    def _next_sweep(self) -> _Sweep:
+        self.number += 1
+        return _Sweep(self.number, self.first, self.marks)
 
     def _once_more(self) -> float:
         """Step 3, from the values as they are, so that all cores can share in it; the largest change."""
         self._begin_round()
-        self.number += 1
+        sweep = self._next_sweep()
         self.solved += len(self.which)
         into = self.values.copy()
 
         def solve(begin: int, end: int) -> float:
-            return self._solve(self.which[begin:end], into, shifted=len(into), everyone=True)[0]
+            return self._solve(into, sweep, self.which[begin:end], shifted=len(into), everyone=True)[0]
 
         residual = float(np.max(shared_out(solve, len(self.which))))
         self.values[:] = into
@@ -152,23 +191,25 @@ class Rounds:
     def _sweep(self, which: np.ndarray, shifted: int) -> tuple[float, int]:
         """One sweep; the largest change, and how many states were solved."""
         heed_interrupts()
-        self.number += 1
-        change, solved = self._solve(which, self.values, shifted, everyone=self.number == 1)
+        change, solved = self._solve(self.values, self._next_sweep(), which, shifted)
         self.solved += solved
         return change, solved
 
-    def _solve(self, which: np.ndarray, into: np.ndarray, shifted: int, everyone: bool = False) -> tuple[float, int]:
+    def _solve(
+        self, into: np.ndarray, sweep: _Sweep, which: np.ndarray, shifted: int, everyone: bool = False
+    ) -> tuple[float, int]:
+        """Solves states in a sweep, everyone in the very first; the largest change, and how many were solved."""
         return sweep_for(*self.world.moves.shape[1:])(
             which,
             self.valuing,
             self.world,
             self.values,
             into,
-            self.marks,
-            self.number,
-            self.first,
+            sweep.marks,
+            sweep.number,
+            sweep.first,
             shifted,
-            everyone,
+            everyone or sweep.number == 1,
             _STILL * self.tolerance,
             self.values.dtype.type(lowest(self.values.dtype)),
         )
