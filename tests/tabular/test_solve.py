@@ -386,6 +386,18 @@ def test_values_solve_the_bellman_equation(name, seed, cost, kind):
     assert residual(name, found, wanted, beta) < 1e-8
 
 
+def test_values_that_swing_come_to_rest():
+    """In this world of nearly closed cells, sweeps over all states at once swing for ever if they take full steps."""
+    random = np.random.default_rng(83498)
+    beta, grid, goal = 10 ** random.uniform(0.5, 3), Grid.unknown(3, 4), int(random.integers(12))
+    model = ObstacleGrid(grid, jnp.asarray(random.normal(0, 4, 12).clip(max=5)))
+    wanted = reach(grid, goal, discount=1.0, step_cost=1.0)
+    found, expected = (solve(model, wanted, people("Boltzmann", beta), solver=by) for by in (Jacobi(), Ordered()))
+    assert found.converged
+    assert found.sweeps > 1_000
+    np.testing.assert_allclose(found.values, expected.values, rtol=1e-6)
+
+
 @pytest.mark.parametrize("solver", [Jacobi(), Ordered()], ids=["Jacobi", "Ordered"])
 @each_backup
 def test_values_that_were_far_too_high_come_down(name, solver):
