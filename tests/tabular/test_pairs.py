@@ -55,8 +55,8 @@ def test_a_sweep_behind_another_finds_what_it_would_have_found_after_it(states, 
         begin = told[-2] if len(told) > 1 else 0
         seen[begin:end] = together[begin:end]
 
-    sweeps = [a_sweep(together, reach, number, []) for number in (1, 2)]
-    found = one_behind_the_other(*sweeps, settled, stretches, reach)
+    leading, following = (a_sweep(together, reach, number, []) for number in (1, 2))
+    found = one_behind_the_other(leading, following, settled, stretches, reach)
     np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(together, apart)
     # what is settled is what the first sweep leaves
@@ -65,8 +65,8 @@ def test_a_sweep_behind_another_finds_what_it_would_have_found_after_it(states, 
 
 def test_the_second_sweep_does_not_wait_for_the_end_of_the_first():
     values, heard, settled = np.zeros(100), [], []
-    sweeps = [a_sweep(values, 3, number, heard) for number in (1, 2)]
-    one_behind_the_other(*sweeps, settled.append, np.split(np.arange(100), 10), 3)
+    leading, following = (a_sweep(values, 3, number, heard) for number in (1, 2))
+    one_behind_the_other(leading, following, settled.append, np.split(np.arange(100), 10), 3)
     began, ended = heard.index((2, 9)), heard.index((1, 99))
     assert began < ended
     assert settled[0] == 0
