@@ -1,5 +1,8 @@
 """Two sweeps, one behind the other: they find what they would have found one after the other."""
 
+import threading
+import time
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,10 +12,17 @@ from hypothesis import strategies as st
 
 from sidestep.domains.offices import office
 from sidestep.tabular.backups import BACKUPS, Behavior
+from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.solve import solve
+from sidestep.tabular.solvers.given import Given, positions, sizes
+from sidestep.tabular.solvers.host import at_once, cores
+from sidestep.tabular.solvers.numbering import numbered, numbering_for
+from sidestep.tabular.solvers.order import order_by_distance
 from sidestep.tabular.solvers.ordered import Ordered
 from sidestep.tabular.solvers.pairs import one_behind_the_other
+from sidestep.tabular.solvers.rounds import Rounds
+from sidestep.tabular.solvers.sweeping import BOLTZMANN, LOG_SUM_EXP, Valuing
 from sidestep.tasks import reach, stack_tasks
 
 
@@ -74,12 +84,50 @@ def test_the_second_sweep_does_not_wait_for_the_end_of_the_first():
     assert [end for number, end in heard if number == 2] == list(range(9, 100, 10))
 
 
+@pytest.mark.parametrize("share", [1.0, 0.3])
+@pytest.mark.parametrize("kind", [BOLTZMANN, LOG_SUM_EXP])
+def test_real_sweeps_find_what_they_would_have_found_one_after_the_other(kind, share):
+    """With a reach that spans all states, the second sweep waits for the end of the first."""
+    world, values, favourite, which = numbered_office(share)
+    valuing = Valuing(kind, np.float64(5), np.float64(0))
+    found = []
+    for apart in (world.reach, 10**9):
+        rounds = Rounds(
+            world._replace(reach=apart), values.copy(), favourite.copy(), which, valuing, np.float64(1e-9), 500, 500
+        )
+        assert rounds.until_still().converged
+        found.append(rounds)
+    overlapping, waiting = found
+    stretches = overlapping.stretches
+    assert any(stretch[-1] + 2 * world.reach < stretches[-1][0] for stretch in stretches)
+    np.testing.assert_array_equal(overlapping.values, waiting.values)
+    for mine, expected in zip(overlapping.marks, waiting.marks, strict=True):
+        np.testing.assert_array_equal(mine, expected)
+
+
+def numbered_office(share):
+    """A half-learned office in order of distance, zeros for values, and the positions of a share of its states."""
+    random = np.random.default_rng(0)
+    plan = office(160, 160, 3)
+    logits = np.where(plan.known.ravel() > 0, 2.0, -2.0) + random.normal(size=plan.size)
+    model = ObstacleGrid(Grid.unknown(*plan.shape), jnp.asarray(logits))
+    successors, probabilities = np.asarray(model.graph.successors), np.asarray(model.probabilities())
+    reward, terminal = np.full((1, 1), -1.0), np.arange(plan.size) == 5_050
+    given = Given(successors, probabilities, reward, np.zeros(1), terminal, np.float64(0.999))
+    order = order_by_distance(successors, probabilities, reward, terminal, 0.999)
+    position = positions(order)
+    assert position is not None
+    world = numbered(numbering_for(*sizes(given)), given, order, position)
+    which = np.flatnonzero(random.random(plan.size) < share).astype(np.int32)
+    return world, np.where(terminal[order], 0.0, -1.0), np.arange(plan.size, dtype=np.int32), which
+
+
 @pytest.mark.parametrize("name", ["boltzmann", "logsumexp"])
 def test_a_task_is_solved_alike_alone_and_in_a_batch(name):
     """Alone its sweeps share the cores; in a batch they come one after another. Not a bit may differ."""
-    grid = office(200, 200, 3)
-    logits = np.where(grid.known.ravel() > 0, 2.0, -2.0) + np.random.default_rng(0).normal(size=grid.size)
-    model = ObstacleGrid(type(grid).unknown(*grid.shape), jnp.asarray(logits))
+    plan = office(200, 200, 3)
+    logits = np.where(plan.known.ravel() > 0, 2.0, -2.0) + np.random.default_rng(0).normal(size=plan.size)
+    model = ObstacleGrid(Grid.unknown(*plan.shape), jnp.asarray(logits))
     wanted = [reach(model.graph, goal, discount=0.999, step_cost=1.0) for goal in (20_100, 5_050)]
     people, solver = Behavior(BACKUPS[name](), 5.0), Ordered(tolerance=1e-9)
     batch = solve(model, stack_tasks(wanted), people, solver=solver)
@@ -88,3 +136,22 @@ def test_a_task_is_solved_alike_alone_and_in_a_batch(name):
         alone = solve(model, task, people, solver=solver)
         for one, several in zip(jax.tree.leaves(alone), jax.tree.leaves(batch), strict=True):
             np.testing.assert_array_equal(one, several[index])
+
+
+def test_what_fails_waits_for_what_is_still_at_work():
+    """It may be writing into memory that is taken back as soon as the failure is known."""
+    begun, ended = threading.Event(), []
+
+    def fails():
+        begun.wait(1)
+        raise ValueError("as it should")
+
+    def works():
+        begun.set()
+        time.sleep(0.2)
+        ended.append(True)
+
+    with pytest.raises(ValueError, match="as it should"):
+        at_once([fails, works])
+    if cores() > 1:
+        assert ended

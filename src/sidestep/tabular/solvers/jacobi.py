@@ -3,8 +3,10 @@
 At discount 1 sweeps start from values of −∞ and reach outwards from the terminal states as a shortest-path search does;
 until that is done, an outcome that leads to a state not reached yet counts as staying.
 
-Where the Boltzmann average makes neighbours take turns in being worth more, values swing for ever; so after the first
-thousand sweeps, states go only half of the way. That moves no fixed point, and swings die out.
+The Boltzmann average may make neighbours take turns in being worth more: values then swing for ever, and an adjoint
+ever farther. So where the largest change has not become smaller for hundreds of sweeps but changes turn about, a solve
+begins anew, and states go only half of the way from then on; or a quarter, and so on. That moves no fixed point. It
+does not help where going round leads away from the fixed point however short the steps; then a solve does not converge.
 """
 
 from collections.abc import Callable
@@ -31,8 +33,15 @@ from sidestep.tabular.solvers.process import (
     reachable,
 )
 
-_FULL_STEPS = 1_000
-"""After how many sweeps states go only half of the way; hardly any task takes so many."""
+_PATIENCE = 200
+"""How many sweeps a solve may take without its largest change becoming smaller, if changes turn about.
+
+Or as many as there are states, if these are more: news from one end of the world takes a sweep a state to the other.
+"""
+_PROGRESS = 0.999
+"""What share of the smallest so far a change may be to count as smaller."""
+_TURNS, _LARGE = 4, 0.1
+"""In how many of these sweeps a large change must turn about, from up to down or back; large beside the largest."""
 
 
 class Jacobi(Solver):
@@ -138,21 +147,57 @@ class Jacobi(Solver):
     ) -> Sweeps:
         """Sweeps until no change is large beside the sizes that `sweep` gives with its values."""
         tolerance = self.tolerance_for(start.dtype)
+        patience = max(_PATIENCE, len(start))
+        smallest_size = jnp.finfo(start.dtype).tiny / tolerance
 
-        def unfinished(state: Sweeps) -> Bool[Array, ""]:
-            return ~state.converged & (state.sweeps < self.max_sweeps) & ~jnp.isnan(state.residual)
+        def unfinished(pace: _Pace) -> Bool[Array, ""]:
+            found = pace.found
+            return ~found.converged & (found.sweeps < self.max_sweeps) & ~jnp.isnan(found.residual)
 
-        def step(state: Sweeps) -> Sweeps:
-            values, size = sweep(state.values)
-            change = jnp.abs(values - state.values) / jnp.maximum(size, jnp.finfo(values.dtype).tiny / tolerance)
-            residual = jnp.max(change)
-            # nobody goes half of the way to or from a state that has no value yet
-            halved = (state.sweeps >= _FULL_STEPS) & reachable(values) & reachable(state.values)
-            taken = jnp.where(halved, (values + state.values) / 2, values)
-            return Sweeps(taken, order, state.sweeps + 1, residual, residual <= tolerance)
+        def step(pace: _Pace) -> _Pace:
+            old = pace.found.values
+            values, size = sweep(old)
+            change = (values - old) / jnp.maximum(size, smallest_size)
+            residual = jnp.abs(change).max()
+            turned = jnp.any((change * pace.change < 0) & (jnp.abs(pace.change) > _LARGE * residual))
+            smaller = residual < _PROGRESS * pace.smallest
+            waited = jnp.where(smaller, 0, pace.waited + 1)
+            turns = jnp.where(smaller, 0, pace.turns + turned)
+            anew = (waited >= patience) & (turns >= _TURNS)
+            # nobody goes part of the way to or from a state that has no value yet
+            part = jnp.where(reachable(values) & reachable(old), pace.share, 1)
+            taken = jnp.where(part < 1, old + part * (values - old), values)
+            found = Sweeps(jnp.where(anew, start, taken), order, pace.found.sweeps + 1, residual, residual <= tolerance)
+            return _Pace(
+                found,
+                jnp.where(anew, 0, change),
+                jnp.where(anew, pace.share / 2, pace.share),
+                jnp.where(anew, jnp.inf, jnp.minimum(residual, pace.smallest)),
+                jnp.where(anew, 0, waited),
+                jnp.where(anew, 0, turns),
+            )
 
-        none = Sweeps(start, order, jnp.asarray(0), jnp.asarray(jnp.inf, start.dtype), jnp.asarray(False))
-        return jax.lax.while_loop(unfinished, step, none)
+        none, endless = jnp.asarray(0), jnp.asarray(jnp.inf, start.dtype)
+        found = Sweeps(start, order, none, endless, jnp.asarray(False))
+        begun = _Pace(found, jnp.zeros_like(start), jnp.ones_like(endless), endless, none, none)
+        return jax.lax.while_loop(unfinished, step, begun).found
+
+
+class _Pace(NamedTuple):
+    """How a solve gets on.
+
+    - `change`: that of each state's value in the last sweep, as in `residual`, with its sign.
+    - `share`: of the way to what its own equation says that a state goes.
+    - `smallest`: the smallest residual since the solve began anew.
+    - `waited`, `turns`: sweeps since then, and in how many of them a large change turned about.
+    """
+
+    found: Sweeps
+    change: Float[Array, " states"]
+    share: Float[Array, ""]
+    smallest: Float[Array, ""]
+    waited: Int[Array, ""]
+    turns: Int[Array, ""]
 
 
 class _Split(NamedTuple):

@@ -23,7 +23,7 @@ class Numbered(NamedTuple):
     - `reward`: R(s, a), with one row if it is the same in all states.
     - `fixed`: the terminal states.
     - `ending`: 1 − γ.
-    - `reach`: how many positions lie between a state and one that it leads to, at most.
+    - `reach`: the largest difference between the positions of a state and of one that it leads to.
     """
 
     successors: np.ndarray

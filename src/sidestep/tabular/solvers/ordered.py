@@ -103,6 +103,7 @@ class Ordered(Solver):
 
         The compiler would make all of them a second time to look these up.
         """
+        visited = jnp.where(visited < 0, visited + len(probabilities), visited)
         shape = jax.ShapeDtypeStruct((*visited.shape, *probabilities.shape[1:]), probabilities.dtype)
         return on_the_host(look_up, (probabilities, visited), shape)
 

@@ -1,8 +1,9 @@
 """Two sweeps over the same states at once, the second as far behind the first as it takes for neither to notice.
 
-A sweep at a state reads and changes nothing but what belongs to states within its *reach* (see `Numbered`): the state
-itself and those that it leads to. So two sweeps, one at the position i and the other at j > i + 2 reach, have nothing
-in common: what the one finds is what it would have found if the first had ended before the second began.
+A sweep at a state reads nothing but what belongs to states within its *reach* (see `Numbered`): the state itself and
+those that it leads to. Of these it changes the state and farther ones. So two sweeps, one at the position i and the
+other at j > i + 2 reach, have nothing in common, and what lies before j is as the one at j leaves it: the one at i
+finds what it would have found if the other had ended before.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,11 +15,11 @@ import numpy as np
 from sidestep.tabular.solvers.host import at_once, heed_interrupts
 
 _Result = TypeVar("_Result")
-_Sweep = Callable[[np.ndarray], _Result]
+_SweepOf = Callable[[np.ndarray], _Result]
 
 
 def one_behind_the_other(
-    leading: _Sweep, following: _Sweep, settled: Callable[[int], None], stretches: Sequence[np.ndarray], reach: int
+    leading: _SweepOf, following: _SweepOf, settled: Callable[[int], None], stretches: Sequence[np.ndarray], reach: int
 ) -> tuple[list[_Result], list[_Result]]:
     """What two sweeps return for each of the stretches, which they go through one by one.
 

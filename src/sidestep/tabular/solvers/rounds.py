@@ -6,6 +6,7 @@ round over every state comes first, so that the others have moved with them by a
 1. For the Boltzmann average and the log-sum-exp, up to 8 rounds sweep all of them at once, with everything farther
    shifted. If changes grow from one round to the next, all is taken back to the first values, and this ends. Rounds go
    in pairs, the second as far behind the first as it takes for neither to notice: on another core, if there is one.
+   What becomes of a pair is decided at its end.
 2. Then rounds go stretch by stretch, some 32 √states of them each: a stretch is swept until it is still, at most 30
    times, before the next one. Its states stay in the processor's cache, and those behind it have settled when it
    begins. For these two backups the states beyond the stretch are shifted, in the first 16 rounds (those of step 1
