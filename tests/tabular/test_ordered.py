@@ -27,7 +27,7 @@ from sidestep.tabular.solvers.ordered import KERNELS, Ordered
 from sidestep.tabular.solvers.passing import weigh
 from sidestep.tabular.solvers.process import lowest
 from sidestep.tabular.solvers.rounds import Rounds
-from sidestep.tabular.solvers.sweeping import Valuing, backed_up
+from sidestep.tabular.solvers.sweeping import Scratch, Valuing, backed_up
 from sidestep.tasks import reach, stack_tasks
 
 each_backup = pytest.mark.parametrize("name", BACKUPS)
@@ -137,7 +137,7 @@ def test_no_end_no_order():
 def back_up_all(valuing, q, leaving):
     values, divisors = np.empty(len(q), q.dtype), np.empty(len(q), q.dtype)
     for i in range(len(q)):
-        values[i], divisors[i] = backed_up(valuing, q[i], leaving[i])
+        values[i], divisors[i] = backed_up(valuing, Scratch(q[i], leaving[i], q[i]))
     return values, divisors
 
 

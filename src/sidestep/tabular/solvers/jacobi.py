@@ -4,7 +4,7 @@ At discount 1 sweeps start from values of −∞ and reach outwards from the ter
 until that is done, an outcome that leads to a state not reached yet counts as staying.
 
 The Boltzmann average may make neighbours take turns in being worth more: values then swing for ever, and an adjoint
-ever farther. So where the largest change has not become smaller for hundreds of sweeps but changes turn about, a solve
+ever farther. So where the largest change has not become smaller for a thousand sweeps but changes turn about, a solve
 begins anew, and states go only half of the way from then on; or a quarter, and so on. That moves no fixed point. It
 does not help where going round leads away from the fixed point however short the steps; then a solve does not converge.
 """
@@ -33,7 +33,7 @@ from sidestep.tabular.solvers.process import (
     reachable,
 )
 
-_PATIENCE = 200
+_PATIENCE = 1_000
 """How many sweeps a solve may take without its largest change becoming smaller, if changes turn about.
 
 Or as many as there are states, if these are more: news from one end of the world takes a sweep a state to the other.
@@ -163,16 +163,19 @@ class Jacobi(Solver):
             smaller = residual < _PROGRESS * pace.smallest
             waited = jnp.where(smaller, 0, pace.waited + 1)
             turns = jnp.where(smaller, 0, pace.turns + turned)
-            anew = (waited >= patience) & (turns >= _TURNS)
+            # numbers that have grown too large end in none
+            lost = jnp.isnan(residual) & jnp.isfinite(pace.smallest)
+            anew = lost | ((waited >= patience) & (turns >= _TURNS))
             # nobody goes part of the way to or from a state that has no value yet
             part = jnp.where(reachable(values) & reachable(old), pace.share, 1)
             taken = jnp.where(part < 1, old + part * (values - old), values)
-            found = Sweeps(jnp.where(anew, start, taken), order, pace.found.sweeps + 1, residual, residual <= tolerance)
+            left = jnp.where(lost, jnp.inf, residual)
+            found = Sweeps(jnp.where(anew, start, taken), order, pace.found.sweeps + 1, left, left <= tolerance)
             return _Pace(
                 found,
                 jnp.where(anew, 0, change),
                 jnp.where(anew, pace.share / 2, pace.share),
-                jnp.where(anew, jnp.inf, jnp.minimum(residual, pace.smallest)),
+                jnp.where(anew, jnp.inf, jnp.where(smaller, residual, pace.smallest)),
                 jnp.where(anew, 0, waited),
                 jnp.where(anew, 0, turns),
             )
@@ -188,7 +191,7 @@ class _Pace(NamedTuple):
 
     - `change`: that of each state's value in the last sweep, as in `residual`, with its sign.
     - `share`: of the way to what its own equation says that a state goes.
-    - `smallest`: the smallest residual since the solve began anew.
+    - `smallest`: the last residual that counted as smaller than those before, since the solve began anew.
     - `waited`, `turns`: sweeps since then, and in how many of them a large change turned about.
     """
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from sidestep.tabular.solvers.compiled import compiled, inlined
 from sidestep.tabular.solvers.given import Given
-from sidestep.tabular.solvers.sweeping import BOLTZMANN, HARD_MAX, MELLOWMAX, Valuing, backed_up
+from sidestep.tabular.solvers.sweeping import BOLTZMANN, HARD_MAX, MELLOWMAX, Scratch, Valuing, backed_up
 
 
 class Setting(NamedTuple):
@@ -212,7 +212,7 @@ def passing_for(actions: int, outcomes: int, width: int) -> Passing:
                 continue
             for a in range(actions):
                 advantage[a] = _action_value(setting, state, a, outcomes) - values[state]
-            gain, _ = backed_up(setting.valuing, advantage, leaving)
+            gain, _ = backed_up(setting.valuing, Scratch(leaving, leaving, advantage))
             cost += abs(adjoint[i] * gain)
         return cost
 

@@ -62,17 +62,29 @@ class Marks(NamedTuple):
     solved: np.ndarray
 
 
+class Scratch(NamedTuple):
+    """Room for what a state's actions are worth, for the chances that they leave it, and for their advantages.
+
+    numba does not count references to arrays that come in a tuple, and looks after those that come alone at every
+    state, with instructions that cores cannot share.
+    """
+
+    worths: np.ndarray
+    leaving: np.ndarray
+    advantage: np.ndarray
+
+
 @inlined(fastmath=_FAST)
-def backed_up(valuing, advantage, leaving):  # pragma: no cover
+def backed_up(valuing, scratch):  # pragma: no cover
     """B(A), and what the own equation is divided by: the larger of Σ w l and Σ π l (see `process`)."""
     kind, beta, tie = valuing.kind, valuing.beta, valuing.tie
-    best = advantage[0]
-    for a in range(1, len(advantage)):
-        best = max(best, advantage[a])
+    best = scratch.advantage[0]
+    for a in range(1, len(scratch.advantage)):
+        best = max(best, scratch.advantage[a])
     total = 0.0 * best
     below, left, both = total, total, total
-    for a in range(len(advantage)):
-        behind = advantage[a] - best
+    for a in range(len(scratch.advantage)):
+        behind = scratch.advantage[a] - best
         if kind == HARD_MAX:
             odds = 1.0 if behind >= -tie * abs(best) else 0.0
         else:
@@ -80,8 +92,8 @@ def backed_up(valuing, advantage, leaving):  # pragma: no cover
             odds = np.exp(exponent) if exponent > _SMALLEST_EXPONENT else 0.0
         total += odds
         below += odds * behind
-        left += odds * leaving[a]
-        both += odds * behind * leaving[a]
+        left += odds * scratch.leaving[a]
+        both += odds * behind * scratch.leaving[a]
     share = 1 / total
     policy_left = left * share
     if kind == HARD_MAX:
@@ -94,9 +106,9 @@ def backed_up(valuing, advantage, leaving):  # pragma: no cover
         return best + np.log(total) / beta, policy_left
     # log mean exp, without adding 1 to what may be far smaller
     gained = 0.0 * best
-    for a in range(len(advantage)):
-        gained += np.expm1(beta * (advantage[a] - best))
-    return best + np.log1p(gained / len(advantage)) / beta, policy_left
+    for a in range(len(scratch.advantage)):
+        gained += np.expm1(beta * (scratch.advantage[a] - best))
+    return best + np.log1p(gained / len(scratch.advantage)) / beta, policy_left
 
 
 @inlined()
@@ -119,7 +131,7 @@ def _shifted(j, before, moved, size):  # pragma: no cover
 
 
 @inlined(fastmath=_FAST)
-def _look_around(i, actions, width, world, values, marks, shifted, bottom, reached, worths):  # pragma: no cover
+def _look_around(i, actions, width, world, values, marks, shifted, bottom, reached, scratch):  # pragma: no cover
     """Fills in what actions are worth; returns the escape, the largest worth's size, and the state's favourite."""
     row = i if len(world.reward) > 1 else 0
     before = marks.before
@@ -137,7 +149,7 @@ def _look_around(i, actions, width, world, values, marks, shifted, bottom, reach
             worth += move * value
             if move > likeliest:
                 likeliest, toward = move, j
-        worths[a] = worth
+        scratch.worths[a] = worth
         size = max(size, abs(worth))
         tried = worth * world.patience[i, a] if world.patience[i, a] > 0 else bottom
         escape = max(escape, tried)
@@ -160,9 +172,7 @@ def _shift(i, actions, width, world, values, marks, shifted, reached):  # pragma
 
 
 @inlined(fastmath=_FAST)
-def _solved(
-    i, actions, width, world, valuing, guess, escape, reached, bottom, worths, leaving, advantage
-):  # pragma: no cover
+def _solved(i, actions, width, world, valuing, guess, escape, reached, bottom, scratch):  # pragma: no cover
     """The value by the state's own equation: one Newton step from a guess (see `process`).
 
     A guess far above the root of the log-sum-exp ends below it, perhaps far below, where actions that never leave
@@ -173,17 +183,19 @@ def _solved(
     if guess > reached:
         value = max(guess, escape) if above else min(guess, escape)
     for a in range(actions):
-        leaving[a] = world.ending
+        scratch.leaving[a] = world.ending
         for m in range(width):
-            leaving[a] += world.moves[i, a, m]
+            scratch.leaving[a] += world.moves[i, a, m]
+    # without a break, out of which numba would count references again (see `Scratch`)
+    again = True
     for _ in range(_NEWTON_STEPS):
-        for a in range(actions):
-            advantage[a] = worths[a] - leaving[a] * value
-        gain, divisor = backed_up(valuing, advantage, leaving)
-        step = gain / (divisor if divisor > 0 else 1.0)
-        value = max(value + step, escape) if above else max(min(value + step, escape), bottom)
-        if not (above and valuing.beta * step < -_FAR):
-            break
+        if again:
+            for a in range(actions):
+                scratch.advantage[a] = scratch.worths[a] - scratch.leaving[a] * value
+            gain, divisor = backed_up(valuing, scratch)
+            step = gain / (divisor if divisor > 0 else 1.0)
+            value = max(value + step, escape) if above else max(min(value + step, escape), bottom)
+            again = above and valuing.beta * step < -_FAR
     return value
 
 
@@ -202,8 +214,9 @@ def sweep_for(actions: int, width: int) -> Any:
         shifted; `first` is the first sweep of the present round over all states. Returns the largest relative change,
         NaN if any is, and how many states were solved.
         """
-        worths, leaving = np.empty(actions, values.dtype), np.empty(actions, values.dtype)
-        advantage = np.empty(actions, values.dtype)
+        scratch = Scratch(
+            np.empty(actions, values.dtype), np.empty(actions, values.dtype), np.empty(actions, values.dtype)
+        )
         changed, solved = marks.changed, marks.solved
         # below this lie values at discount 1 of states that cannot reach a terminal state
         reached = -np.sqrt(-bottom)
@@ -219,13 +232,11 @@ def sweep_for(actions: int, width: int) -> Any:
                 continue
             at_work += 1
             escape, size, marks.favourite[i] = _look_around(
-                i, actions, width, world, values, marks, shifted, bottom, reached, worths
+                i, actions, width, world, values, marks, shifted, bottom, reached, scratch
             )
             old, value = marks.before[i] if solved[i] < first else values[i], bottom
             if escape > reached:
-                value = _solved(
-                    i, actions, width, world, valuing, values[i], escape, reached, bottom, worths, leaving, advantage
-                )
+                value = _solved(i, actions, width, world, valuing, values[i], escape, reached, bottom, scratch)
             change, scale = abs(value - old), max(abs(value), size, smallest)
             if not (old > reached or value > reached):
                 change = 0.0 * bottom
@@ -253,30 +264,31 @@ def first_values_for(actions: int, width: int) -> Any:
         An action that does not lead to any counts as one that costs its price twice, there and back. Where nothing
         nearer is known the value is `bound`.
         """
-        worths, leaving = np.empty(actions, values.dtype), np.empty(actions, values.dtype)
-        advantage = np.empty(actions, values.dtype)
+        scratch = Scratch(
+            np.empty(actions, values.dtype), np.empty(actions, values.dtype), np.empty(actions, values.dtype)
+        )
         for i in range(len(values)):
             if world.fixed[i] or values[i] > bottom:
                 continue
             value, reached = bound, False
             for a in range(actions):
-                worths[a] = world.reward[i if len(world.reward) > 1 else 0, a]
-                leaving[a] = world.ending
+                scratch.worths[a] = world.reward[i if len(world.reward) > 1 else 0, a]
+                scratch.leaving[a] = world.ending
                 for m in range(width):
                     j = world.successors[i, a, m]
                     if j < i and values[j] > bottom:
-                        worths[a] += world.moves[i, a, m] * values[j]
-                        leaving[a] += world.moves[i, a, m]
-                if leaving[a] > world.ending:
-                    escape = worths[a] / leaving[a]
+                        scratch.worths[a] += world.moves[i, a, m] * values[j]
+                        scratch.leaving[a] += world.moves[i, a, m]
+                if scratch.leaving[a] > world.ending:
+                    escape = scratch.worths[a] / scratch.leaving[a]
                     value = max(value, escape) if reached else escape
                     reached = True
             if reached:
                 for a in range(actions):
-                    advantage[a] = worths[a] - leaving[a] * value
-                    if not leaving[a] > world.ending:
-                        advantage[a] += min(worths[a], 0.0)
-                gain, divisor = backed_up(valuing, advantage, leaving)
+                    scratch.advantage[a] = scratch.worths[a] - scratch.leaving[a] * value
+                    if not scratch.leaving[a] > world.ending:
+                        scratch.advantage[a] += min(scratch.worths[a], 0.0)
+                gain, divisor = backed_up(valuing, scratch)
                 value += gain / (divisor if divisor > 0 else 1.0)
             values[i] = value
 
