@@ -1,14 +1,11 @@
-"""Ordered sweeps: orders, starts, batches, limits, and the machine code beside the formulas that it repeats."""
-
-from functools import partial
+"""Solves by ordered sweeps: starts, batches, limits. What the sweeps are made of is in `test_sweeps`."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numba
 import numpy as np
 import pytest
-from numba.core import config as numba_settings
+from numbered_worlds import some_map
 from problems import BACKUPS, generic_task, obstacle_problem, random_problem, relative_error
 
 from sidestep.domains.offices import office
@@ -18,16 +15,9 @@ from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.solve import solve
 from sidestep.tabular.solvers.choice import solver_for
-from sidestep.tabular.solvers.compiled import compiled
-from sidestep.tabular.solvers.given import Given, positions, sizes
 from sidestep.tabular.solvers.jacobi import Jacobi
-from sidestep.tabular.solvers.numbering import numbered, numbering_for
-from sidestep.tabular.solvers.order import _ascending, order_by_distance
-from sidestep.tabular.solvers.ordered import KERNELS, Ordered
-from sidestep.tabular.solvers.passing import weigh
+from sidestep.tabular.solvers.ordered import Ordered
 from sidestep.tabular.solvers.process import lowest
-from sidestep.tabular.solvers.rounds import Rounds
-from sidestep.tabular.solvers.sweeping import Scratch, Valuing, backed_up
 from sidestep.tasks import reach, stack_tasks
 
 each_backup = pytest.mark.parametrize("name", BACKUPS)
@@ -52,151 +42,6 @@ def values_and_slopes(model, wanted, people, start=None, solver=SOLVER):
 
 def people(name, beta=5.0):
     return Behavior(BACKUPS[name], beta)
-
-
-def some_map(rows=20, columns=21, seed=0):
-    """A map of mostly free cells; 420 states."""
-    grid = Grid.unknown(rows, columns)
-    return ObstacleGrid(grid, jnp.asarray(np.random.default_rng(seed).normal(-1.5, 1.5, grid.size)))
-
-
-# Orders
-
-
-def order_of(model, wanted):
-    successors, probabilities = np.asarray(model.graph.successors), np.asarray(model.probabilities())
-    reward, terminal = np.asarray(wanted.reward), np.asarray(wanted.terminal)
-    return order_by_distance(successors, probabilities, reward, terminal, float(wanted.discount))
-
-
-def test_order_of_a_corridor_with_a_slow_cell():
-    """To enter cell 2 takes 10 tries, so from cells 0 to 6 it takes 12, 11, 1, 0, 1, 2 and 3 to get to cell 3."""
-    blocked = np.array([1e-9, 1e-9, 0.9, 1e-9, 1e-9, 1e-9, 1e-9])
-    model = ObstacleGrid(Grid.unknown(1, 7), jnp.asarray(np.log(blocked) - np.log1p(-blocked)))
-    order = order_of(model, reach(Grid.unknown(1, 7), 3, discount=1.0, step_cost=1.0)).tolist()
-    assert order[0] == 3
-    assert sorted(order[1:3]) == [2, 4]  # both at distance 1
-    assert order[3:] == [5, 6, 1, 0]
-
-
-def test_discount_makes_slow_cells_far():
-    """A goal that pays, and no step cost: what counts is how much the tries discount."""
-    model = ObstacleGrid(Grid.unknown(1, 5), jnp.asarray([0.0, 5.0, 0.0, -5.0, -5.0]))
-    order = order_of(model, reach(Grid.unknown(1, 5), 2, discount=0.9)).tolist()
-    assert order[0] == 2
-    assert order.index(4) < order.index(0)
-
-
-def test_states_out_of_reach_come_last():
-    """Nobody enters the wall in the middle, but who starts inside it gets out."""
-    world = Grid(np.array([[-1, -1, 1, -1, -1]]))
-    model = ObstacleGrid(world, 0.0)
-    assert order_of(model, reach(world, 4, discount=1.0, step_cost=1.0)).tolist() == [4, 3, 2, 0, 1]
-
-
-def test_states_ascend_and_ties_keep_their_numbers():
-    random = np.random.default_rng(0)
-    distances = np.exp(random.uniform(-700, 700, 5_000))
-    distances[::7], distances[5::17], distances[3::13] = 0, distances[4], np.inf
-    near = distances[11] * (1 + np.arange(200) * 2.0**-50)
-    distances[1::25] = random.permutation(near)
-    np.testing.assert_array_equal(_ascending(distances), np.argsort(distances, kind="stable"))
-
-
-def test_the_reach_is_how_far_apart_a_state_and_its_successors_stand():
-    model = some_map()
-    order = np.random.default_rng(0).permutation(420).astype(np.int32)
-    position = positions(order)
-    assert position is not None
-    successors = np.asarray(model.graph.successors)
-    terminal, probabilities = np.arange(420) == 5, np.asarray(model.probabilities())
-    given = Given(successors, probabilities, np.zeros((1, 1)), np.ones(1), terminal, np.float64(0.99))
-    found = numbered(numbering_for(*sizes(given)), given, order, position).reach
-    assert found == np.abs(position[successors] - position[:, None, None]).max()
-
-
-@pytest.mark.parametrize("solver", [SOLVER, Jacobi(tolerance=1e-11)], ids=["Ordered", "Jacobi"])
-def test_states_are_counted_from_either_end_and_there_are_no_others(solver):
-    model, wanted = some_map(), reach(Grid.unknown(20, 21), 5, discount=0.99)
-    visited = jnp.asarray([3, -1, -420, 419, 1_000])
-    found = solve(model, wanted, people("Boltzmann"), solver=solver, visited=visited)
-    every = solve(model, wanted, people("Boltzmann"), solver=solver)
-    np.testing.assert_array_equal(found.action_values, every.action_values[jnp.asarray([3, 419, 0, 419, 419])])
-
-
-def test_no_end_no_order():
-    problem = random_problem()
-    wanted = eqx.tree_at(lambda task: task.terminal, generic_task(problem, 0.9), jnp.zeros(7, dtype=bool))
-    assert order_of(problem.model, wanted).tolist() == list(range(7))
-
-
-# Machine code
-
-
-@numba.njit
-def back_up_all(valuing, q, leaving):
-    values, divisors = np.empty(len(q), q.dtype), np.empty(len(q), q.dtype)
-    for i in range(len(q)):
-        values[i], divisors[i] = backed_up(valuing, Scratch(q[i], leaving[i], q[i]))
-    return values, divisors
-
-
-@numba.njit
-def weigh_all(valuing, exact, q):
-    weights, policy, by_beta = np.empty_like(q), np.empty_like(q), np.empty(len(q), q.dtype)
-    for i in range(len(q)):
-        by_beta[i] = weigh(valuing, exact, q[i], weights[i], policy[i])
-    return weights, policy, by_beta
-
-
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@each_backup
-def test_machine_code_repeats_the_backups(name, dtype):
-    """Value, weights, policy and derivative by β; random, tied, and widely spread action values."""
-    rng = np.random.default_rng(0)
-    q = np.concatenate([rng.normal(size=(20, 4)), rng.normal(-500, 0.1, (20, 4)), rng.choice([-1.0, -2.0], (20, 4))])
-    q = np.concatenate([q, np.where(rng.random((20, 4)) < 0.5, -1e6, rng.normal(size=(20, 4)))]).astype(dtype)
-    leaving = rng.uniform(0.01, 1, q.shape).astype(dtype)
-    backup, beta = BACKUPS[name], dtype(3.0)
-    tie = max(getattr(backup, "tie", 0.0), 64 * float(np.finfo(dtype).eps))
-    valuing = Valuing(KERNELS[type(backup)], beta, dtype(tie))
-    within = 1e-12 if dtype == np.float64 else 3e-4
-    close = partial(np.testing.assert_allclose, rtol=within, atol=within)
-
-    arguments = jnp.asarray(q), jnp.asarray(beta)
-    value, by_beta = (np.asarray(each) for each in value_and_derivative(backup, *arguments))
-    exact, policy = np.asarray(backup.weights(*arguments)), np.asarray(backup.fixed_policy_weights(*arguments))
-    values, divisors = back_up_all(valuing, q, leaving)
-    close(values, value)
-    close(divisors, np.maximum((exact * leaving).sum(axis=1), (policy * leaving).sum(axis=1)))
-    for which, weights, derivative in ((True, exact, by_beta), (False, policy, 0 * by_beta)):
-        found = weigh_all(valuing, which, q)
-        for mine, theirs in zip(found, (weights, policy, derivative), strict=True):
-            close(mine, theirs)
-            assert mine.dtype == dtype
-    assert values.dtype == divisors.dtype == dtype
-
-
-def test_an_action_that_is_worth_all_but_minus_infinity():
-    """It is never taken, and has no part in the derivative by β."""
-    q = np.array([[-1.0, lowest(jnp.dtype(jnp.float64)), -2.0]])
-    for name in ("Boltzmann", "mellowmax"):
-        found = weigh_all(Valuing(KERNELS[type(BACKUPS[name])], np.float64(3), np.float64(0)), True, q)
-        assert np.isfinite(np.concatenate([each.ravel() for each in found])).all()
-        assert found[0][0, 1] == found[1][0, 1] == 0
-
-
-def value_and_derivative(backup, q, beta):
-    values = partial(backup.value, q)
-    return values(beta), jax.jacfwd(values)(beta)
-
-
-def test_machine_code_where_nothing_can_be_written(monkeypatch):
-    """numba finds no folder to keep its code in; the code is compiled all the same."""
-    monkeypatch.setattr(numba_settings, "CACHE_LOCATOR_CLASSES", "ZipCacheLocator")
-    with pytest.raises(RuntimeError, match="locator"):
-        numba.njit(cache=True)(lambda x: x + 1)
-    assert compiled()(lambda x: x + 1)(1) == 2
 
 
 # Starts
@@ -257,6 +102,18 @@ def test_a_start_that_another_solver_left():
     found = solve(model, wanted, behavior, solver=SOLVER, start=start)
     assert found.converged
     assert found.start.order.tolist()[0] == 5
+
+
+# Which states
+
+
+@pytest.mark.parametrize("solver", [SOLVER, Jacobi(tolerance=1e-11)], ids=["Ordered", "Jacobi"])
+def test_states_are_counted_from_either_end_and_there_are_no_others(solver):
+    model, wanted = some_map(), reach(Grid.unknown(20, 21), 5, discount=0.99)
+    visited = jnp.asarray([3, -1, -420, 419, 1_000])
+    found = solve(model, wanted, people("Boltzmann"), solver=solver, visited=visited)
+    every = solve(model, wanted, people("Boltzmann"), solver=solver)
+    np.testing.assert_array_equal(found.action_values, every.action_values[jnp.asarray([3, 419, 0, 419, 419])])
 
 
 # Batches
@@ -334,50 +191,6 @@ def test_what_is_no_number_is_never_a_solution(name, where):
     found, slope, _ = values_and_slopes(model, wanted, behavior)
     assert not found.converged
     assert jnp.isnan(slope).all()
-
-
-def test_the_last_sweep_leaves_nobody_out():
-    """States that seem to have nothing to do, because nobody said that values changed, are still looked at."""
-    rounds, solved = settled_rounds()
-    rounds.values[1:] *= 0.5
-    rounds.marks.changed[:], rounds.marks.solved[:] = 0, rounds.number
-    assert rounds.until_still().converged
-    np.testing.assert_allclose(rounds.values, solved, rtol=1e-8)
-
-
-def settled_rounds():
-    """Rounds that have come to rest, and the values that they were at."""
-    model = some_map()
-    found = solve(model, reach(model.graph, 5, discount=0.99), people("Boltzmann", 1.0), solver=SOLVER)
-    order = np.asarray(found.start.order)
-    position = positions(order)
-    assert position is not None
-    terminal, one = np.arange(420) == 5, np.float64(1)
-    successors, probabilities = np.asarray(model.graph.successors), np.asarray(model.probabilities())
-    given = Given(successors, probabilities, np.zeros((1, 1)), np.ones(1), terminal, np.float64(0.99))
-    world = numbered(numbering_for(*sizes(given)), given, order, position)
-    values = np.asarray(found.values)[order]
-    solved = values.copy()
-    valuing = Valuing(KERNELS[BoltzmannAverage], one, 0 * one)
-    everyone = np.arange(420, dtype=np.int32)
-    rounds = Rounds(world, values, everyone.copy(), everyone, valuing, np.float64(1e-11), 1000, 1000)
-    assert rounds.until_still().converged
-    return rounds, solved
-
-
-def test_after_the_last_sweep_all_that_saw_a_change_have_something_to_do():
-    """None of them saw what the others became, wherever they stand in the order."""
-    rounds, _ = settled_rounds()
-    rounds.values[1:] *= 0.5
-    rounds._once_more()
-    world, marks = rounds.world, rounds.marks
-    moved = marks.changed == rounds.number
-    near = moved | moved[world.successors].any(axis=(1, 2))
-    assert near.sum() > 0
-    before = rounds.values.copy()
-    rounds._sweep(np.flatnonzero(near).astype(np.int32), shifted=len(before))
-    assert (marks.solved[near & ~world.fixed] == rounds.number).all()
-    assert (rounds.values != before)[near & ~world.fixed].mean() > 0.9
 
 
 class Sharper(BoltzmannAverage):

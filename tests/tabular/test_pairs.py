@@ -9,16 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numbered_worlds import numbered_world, order_of
 
 from sidestep.domains.offices import office
 from sidestep.tabular.backups import BACKUPS, Behavior
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.solve import solve
-from sidestep.tabular.solvers.given import Given, positions, sizes
 from sidestep.tabular.solvers.host import at_once, cores
-from sidestep.tabular.solvers.numbering import numbered, numbering_for
-from sidestep.tabular.solvers.order import order_by_distance
 from sidestep.tabular.solvers.ordered import Ordered
 from sidestep.tabular.solvers.pairs import one_behind_the_other
 from sidestep.tabular.solvers.rounds import Rounds
@@ -105,29 +103,27 @@ def test_real_sweeps_find_what_they_would_have_found_one_after_the_other(kind, s
         np.testing.assert_array_equal(mine, expected)
 
 
-def numbered_office(share):
-    """A half-learned office in order of distance, zeros for values, and the positions of a share of its states."""
-    random = np.random.default_rng(0)
-    plan = office(160, 160, 3)
+def half_learned(plan, random):
+    """A model that has half learned where an office's walls are."""
     logits = np.where(plan.known.ravel() > 0, 2.0, -2.0) + random.normal(size=plan.size)
-    model = ObstacleGrid(Grid.unknown(*plan.shape), jnp.asarray(logits))
-    successors, probabilities = np.asarray(model.graph.successors), np.asarray(model.probabilities())
-    reward, terminal = np.full((1, 1), -1.0), np.arange(plan.size) == 5_050
-    given = Given(successors, probabilities, reward, np.zeros(1), terminal, np.float64(0.999))
-    order = order_by_distance(successors, probabilities, reward, terminal, 0.999)
-    position = positions(order)
-    assert position is not None
-    world = numbered(numbering_for(*sizes(given)), given, order, position)
+    return ObstacleGrid(Grid.unknown(*plan.shape), jnp.asarray(logits))
+
+
+def numbered_office(share):
+    """A half-learned office in order of distance, first values, and the positions of a share of its states."""
+    random, plan = np.random.default_rng(0), office(160, 160, 3)
+    model = half_learned(plan, random)
+    wanted = reach(model.graph, 5_050, discount=0.999, step_cost=1.0)
+    order = order_of(model, wanted)
     which = np.flatnonzero(random.random(plan.size) < share).astype(np.int32)
-    return world, np.where(terminal[order], 0.0, -1.0), np.arange(plan.size, dtype=np.int32), which
+    values = np.where(order == 5_050, 0.0, -1.0)
+    return numbered_world(model, wanted, order), values, np.arange(plan.size, dtype=np.int32), which
 
 
 @pytest.mark.parametrize("name", ["boltzmann", "logsumexp"])
 def test_a_task_is_solved_alike_alone_and_in_a_batch(name):
     """Alone its sweeps share the cores; in a batch they come one after another. Not a bit may differ."""
-    plan = office(200, 200, 3)
-    logits = np.where(plan.known.ravel() > 0, 2.0, -2.0) + np.random.default_rng(0).normal(size=plan.size)
-    model = ObstacleGrid(Grid.unknown(*plan.shape), jnp.asarray(logits))
+    model = half_learned(office(200, 200, 3), np.random.default_rng(0))
     wanted = [reach(model.graph, goal, discount=0.999, step_cost=1.0) for goal in (20_100, 5_050)]
     people, solver = Behavior(BACKUPS[name](), 5.0), Ordered(tolerance=1e-9)
     batch = solve(model, stack_tasks(wanted), people, solver=solver)
