@@ -173,7 +173,7 @@ class Solver(eqx.Module):
     def rows(
         self, probabilities: Float[Array, "states actions outcomes"], visited: Int[Array, " visited"]
     ) -> Float[Array, "visited actions outcomes"]:
-        """The probabilities of some states."""
+        """The probabilities of some states; negative numbers count from the end, beyond it the last one is meant."""
         return probabilities[visited]
 
     def tolerance_for(self, dtype: jnp.dtype) -> float | Float[Array, ""]:
