@@ -104,6 +104,20 @@ def test_a_start_that_another_solver_left():
     assert found.start.order.tolist()[0] == 5
 
 
+def test_traces_of_an_earlier_adjoint_are_forgotten():
+    """Else states that do not matter any more would count as ones that do."""
+    model = some_map()
+    wanted, behavior = reach(model.graph, 5, discount=0.9, step_cost=1.0), people("hard max")
+    start = SOLVER.cold_start(420, jnp.dtype(jnp.float64))
+
+    def of_one_state(adjoint):
+        return solve(model, wanted, behavior, solver=SOLVER, start=start._replace(adjoint=adjoint)).values[8]
+
+    cold, traces = (jax.grad(of_one_state)(jnp.full(420, size)) for size in (0.0, 1e-30))
+    assert 0 < jnp.count_nonzero(cold) < 420
+    np.testing.assert_array_equal(traces, cold)
+
+
 # Which states
 
 

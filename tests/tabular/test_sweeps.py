@@ -19,7 +19,7 @@ from sidestep.tabular.solve import solve
 from sidestep.tabular.solvers.compiled import compiled
 from sidestep.tabular.solvers.order import _ascending
 from sidestep.tabular.solvers.ordered import KERNELS, Ordered
-from sidestep.tabular.solvers.passing import weigh
+from sidestep.tabular.solvers.passing import Weighing, weigh
 from sidestep.tabular.solvers.process import lowest
 from sidestep.tabular.solvers.rounds import Rounds
 from sidestep.tabular.solvers.sweeping import Scratch, Valuing, backed_up
@@ -94,7 +94,7 @@ def back_up_all(valuing, q, leaving):
 def weigh_all(valuing, exact, q):
     weights, policy, by_beta = np.empty_like(q), np.empty_like(q), np.empty(len(q), q.dtype)
     for i in range(len(q)):
-        by_beta[i] = weigh(valuing, exact, q[i], weights[i], policy[i])
+        by_beta[i] = weigh(valuing, exact, Weighing(q[i], weights[i], policy[i]))
     return weights, policy, by_beta
 
 

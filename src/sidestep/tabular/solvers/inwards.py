@@ -8,7 +8,7 @@ left out when the values were solved turn out to matter, there is no gradient (s
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sidestep.tabular.solvers.given import Found, Outcome, given_from, positions, sizes, write
+from sidestep.tabular.solvers.given import Found, Given, Outcome, given_from, positions, sizes, write
 from sidestep.tabular.solvers.host import heed_interrupts, shared_out
 from sidestep.tabular.solvers.passing import HostGradients, Passing, Setting, Shares, passing_for
 from sidestep.tabular.solvers.process import lowest
@@ -53,28 +53,28 @@ def pull_back(
         return
     given, valuing = given_from(process), Valuing(kind, number(beta), number(tie))
     reached = number(-((-lowest(values.dtype)) ** 0.5))
-    setting = Setting(given, valuing, exact, values, reached, order, position)
+    setting = Setting(valuing, exact, values, reached, order, position)
     known = np.where(np.isfinite(start), start, number(0))
     actions, outcomes, width = sizes(given)
-    shares = _no_shares(width, setting, known[order], cotangent[order])
+    shares = _no_shares(given, width, known[order], cotangent[order])
     run, whole = passing_for(actions, outcomes, width), region.all()
     sweeps = max_sweeps if whole else min(max_sweeps, _MOST_SWEEPS)
-    outcome = _pass_on_until_gone(run, setting, shares, number(total), number(tolerance), sweeps)
+    outcome = _pass_on_until_gone(run, given, setting, shares, number(total), number(tolerance), sweeps)
     if outcome.converged and not whole:
-        cost = _cost_of_leaving_out(run, setting, shares, region)
+        cost = _cost_of_leaving_out(run, given, setting, shares, region)
         outcome = outcome._replace(residual=cost, converged=bool(cost <= tolerance))
     if not outcome.converged:
         _fill(np.nan, found.values, *by)
         write(found, order, outcome)
         return
-    by_values = shares.adjoint, shares.weights, shares.beta
+    by_values = shares.adjoint, shares.rows, shares.weights, shares.beta
     del shares  # the gradient takes the memory that it held
     _fill(0.0, *by[1:])
 
     def assemble(begin: int, end: int) -> HostGradients:
         shared = [np.zeros_like(part) if len(np.atleast_1d(part)) == 1 else part for part in by[1:]]
         own = HostGradients(by.probabilities, *shared)
-        run.pull_back(begin, end, setting, *by_values, found.values, own)
+        run.pull_back(begin, end, given, setting, *by_values, found.values, own)
         return own
 
     for own in shared_out(assemble, len(order)):
@@ -89,45 +89,55 @@ def _fill(number: float, *arrays: np.ndarray) -> None:
         array[...] = number
 
 
-def _no_shares(width: int, setting: Setting, adjoint: np.ndarray, residual: np.ndarray) -> Shares:
+def _no_shares(given: Given, width: int, adjoint: np.ndarray, residual: np.ndarray) -> Shares:
     """Nothing filled in; what is not needed takes no memory until it is."""
-    states, actions, _ = setting.given.successors.shape
-    dtype = setting.values.dtype
+    states, actions, _ = given.successors.shape
+    dtype = adjoint.dtype
     return Shares(
-        known=np.zeros(states, bool),
+        rows=np.full(states, -1, np.int32),
+        adjoint=adjoint,
+        residual=residual,
         weights=np.empty((states, actions), dtype),
         beta=np.empty(states, dtype),
         successors=np.empty((states, actions, width), np.int32),
         shares=np.empty((states, actions, width), dtype),
         leaving=np.empty(states, dtype),
         divisor=np.empty(states, dtype),
-        adjoint=adjoint,
-        residual=residual,
     )
 
 
-def _cost_of_leaving_out(run: Passing, setting: Setting, shares: Shares, region: Bool[np.ndarray, " states"]) -> float:
+def _cost_of_leaving_out(
+    run: Passing, given: Given, setting: Setting, shares: Shares, region: Bool[np.ndarray, " states"]
+) -> float:
     """What states outside the region cost that were left as they were, as a share of Σ |λ V|."""
     reached = setting.values > setting.reached
     size = np.abs(shares.adjoint * np.where(reached, setting.values, 0)[setting.order]).sum()
-    cost = run.left_out(setting, shares.adjoint, region)
+    cost = run.left_out(given, setting, shares.adjoint, region)
     return float(cost / size) if size > 0 else float(np.inf if cost > 0 else cost)
 
 
 def _pass_on_until_gone(
-    run: Passing, setting: Setting, shares: Shares, total: np.floating, tolerance: np.floating, max_sweeps: int
+    run: Passing,
+    given: Given,
+    setting: Setting,
+    shares: Shares,
+    total: np.floating,
+    tolerance: np.floating,
+    max_sweeps: int,
 ) -> Outcome:
     """Sweeps until the residuals' sum is no more than the share `tolerance` of `total`."""
     states = len(shares.residual)
     finest = tolerance * total / states
     threshold = max(finest, _COARSEST * total)
+    needed = np.flatnonzero(np.abs(shares.adjoint) > finest)
+    filled = len(needed)
     if shares.adjoint.any():
-        shared_out(lambda begin, end: run.fill_in(begin, end, finest, setting, shares), states)
-        run.pass_on(finest, True, setting, shares)
+        shared_out(lambda begin, end: run.fill_in(begin, end, needed, given, setting, shares), filled)
+        run.pass_on(finest, True, filled, given, setting, shares)
     passed_on, left = 0, np.inf
     for _ in range(max_sweeps):
         heed_interrupts()
-        at_work, left_alone = run.pass_on(threshold, False, setting, shares)
+        at_work, left_alone, filled = run.pass_on(threshold, False, filled, given, setting, shares)
         passed_on += at_work
         if at_work == 0:
             left = float(left_alone / total)

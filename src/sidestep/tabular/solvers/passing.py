@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sidestep.tabular.solvers.compiled import compiled, inlined
-from sidestep.tabular.solvers.given import Given
 from sidestep.tabular.solvers.sweeping import BOLTZMANN, HARD_MAX, MELLOWMAX, Scratch, Valuing, backed_up
 
 
@@ -27,7 +26,6 @@ class Setting(NamedTuple):
     - `order`, `position`: which state comes when, and when a state comes.
     """
 
-    given: Given
     valuing: Valuing
     exact: bool
     values: np.ndarray
@@ -37,24 +35,37 @@ class Setting(NamedTuple):
 
 
 class Shares(NamedTuple):
-    """How the value of a state depends on those of others, and λ so far; states by position, filled in when needed.
+    """How the values of states depend on those of others, and λ so far.
 
-    - `known`: whether the state's entries have been filled in.
-    - `weights`: w(a), the gradient of the value by the action values; `beta`: its gradient by β.
-    - `successors`, `shares`: the states that it leads to, and the entries of W for them.
-    - `leaving`, `divisor`: Σ w l, and what the state's own adjoint equation is divided by.
+    By position:
+
+    - `rows`: which row of the entries is the state's; −1 as long as it has none.
     - `adjoint`, `residual`: λ, and g + Wᵀλ − λ.
+
+    Entries, a row for each state that turned out to be needed, so that they lie close together in memory:
+
+    - `weights`: w(a), the gradient of the value by the action values; `beta`: its gradient by β.
+    - `successors`, `shares`: the positions of the states that it leads to, and the entries of W for them.
+    - `leaving`, `divisor`: Σ w l, and what the state's own adjoint equation is divided by.
     """
 
-    known: np.ndarray
+    rows: np.ndarray
+    adjoint: np.ndarray
+    residual: np.ndarray
     weights: np.ndarray
     beta: np.ndarray
     successors: np.ndarray
     shares: np.ndarray
     leaving: np.ndarray
     divisor: np.ndarray
-    adjoint: np.ndarray
-    residual: np.ndarray
+
+
+class Weighing(NamedTuple):
+    """Room for a state's action values, the weights of the gradient by them, and the policy (see `Scratch`)."""
+
+    values: np.ndarray
+    weights: np.ndarray
+    policy: np.ndarray
 
 
 class HostGradients(NamedTuple):
@@ -77,39 +88,38 @@ class Passing(NamedTuple):
 
 
 @inlined()
-def weigh(valuing, exact, q, weights, policy):  # pragma: no cover
-    """Fills in the weights of the gradient and the policy at action values q; returns the gradient by β."""
-    kind, beta, tie = valuing.kind, valuing.beta, valuing.tie
-    best = q[0]
-    for a in range(1, len(q)):
-        best = max(best, q[a])
+def weigh(valuing, exact, weighing):  # pragma: no cover
+    """Fills in the weights of the gradient and the policy by action values; returns the gradient by β."""
+    kind, beta, tie, actions = valuing.kind, valuing.beta, valuing.tie, len(weighing.values)
+    best = weighing.values[0]
+    for a in range(1, actions):
+        best = max(best, weighing.values[a])
     total = 0.0 * best
-    for a in range(len(q)):
-        behind = q[a] - best
-        policy[a] = (behind >= -tie * abs(best)) * 1.0 if kind == HARD_MAX else np.exp(beta * behind)
-        total += policy[a]
+    for a in range(actions):
+        behind = weighing.values[a] - best
+        weighing.policy[a] = (behind >= -tie * abs(best)) * 1.0 if kind == HARD_MAX else np.exp(beta * behind)
+        total += weighing.policy[a]
     average = 0.0 * best
-    for a in range(len(q)):
-        policy[a] /= total
-        average += policy[a] * (q[a] - best)
+    for a in range(actions):
+        weighing.policy[a] /= total
+        average += weighing.policy[a] * (weighing.values[a] - best)
     variance = 0.0 * best
-    for a in range(len(q)):
-        behind = q[a] - best - average
+    for a in range(actions):
+        behind, taken = weighing.values[a] - best - average, weighing.policy[a]
         # in this order, because an action that is never taken may be worth all but −∞
-        variance += policy[a] * behind * behind
-        weights[a] = policy[a] * (1 + beta * behind) if kind == BOLTZMANN and exact else policy[a]
-    if not exact or kind == HARD_MAX:
-        return 0.0 * best
-    if kind == BOLTZMANN:
-        return variance
-    actions = len(q) if kind == MELLOWMAX else 1
-    return (average - np.log(total / actions) / beta) / beta
+        variance += taken * behind * behind
+        weighing.weights[a] = taken * (1 + beta * behind) if kind == BOLTZMANN and exact else taken
+    by_beta = 0.0 * best
+    if exact and kind == BOLTZMANN:
+        by_beta = variance
+    elif exact and kind != HARD_MAX:
+        by_beta = (average - np.log(total / (actions if kind == MELLOWMAX else 1)) / beta) / beta
+    return by_beta
 
 
 @inlined()
-def _expected(setting, state, a, outcomes):  # pragma: no cover
+def _expected(given, values, state, a, outcomes):  # pragma: no cover
     """The expected value after an action, summed as in `DecisionProcess.action_values`."""
-    given, values = setting.given, setting.values
     here = values[state]
     expected = here
     for k in range(outcomes):
@@ -120,44 +130,42 @@ def _expected(setting, state, a, outcomes):  # pragma: no cover
 
 
 @inlined()
-def _action_value(setting, state, a, outcomes):  # pragma: no cover
+def _action_value(given, values, state, a, outcomes):  # pragma: no cover
     """Q(s, a)."""
-    given = setting.given
     reward = given.reward[state if given.reward.shape[0] > 1 else 0, a if given.reward.shape[1] > 1 else 0]
-    return reward + given.discount * _expected(setting, state, a, outcomes)
+    return reward + given.discount * _expected(given, values, state, a, outcomes)
 
 
 @inlined()
-def _fill_in(i, actions, outcomes, setting, shares, q, policy):  # pragma: no cover
+def _fill_in(i, row, actions, outcomes, width, given, setting, shares, weighing):  # pragma: no cover
     """The entries of the state at position i. Of a state without values to speak of, nothing is passed on."""
-    given, state = setting.given, setting.order[i]
-    shares.known[i] = True
-    shares.leaving[i] = shares.divisor[i] = 1
-    shares.shares[i] = 0
-    shares.successors[i] = i
-    shares.weights[i] = 0
-    shares.beta[i] = 0
-    if given.terminal[state] or not setting.values[state] > setting.reached:
-        return
+    state = setting.order[i]
+    passes_on = setting.values[state] > setting.reached and not given.terminal[state]
     for a in range(actions):
-        q[a] = _action_value(setting, state, a, outcomes)
-    shares.beta[i] = weigh(setting.valuing, setting.exact, q, shares.weights[i], policy)
+        weighing.values[a] = _action_value(given, setting.values, state, a, outcomes) if passes_on else given.discount
+    by_beta = weigh(setting.valuing, setting.exact, weighing)
     leaving, policy_leaving = 0.0 * given.discount, 0.0 * given.discount
     for a in range(actions):
-        left, m = 1 - given.discount, 0
+        weight, left, m = weighing.weights[a] if passes_on else 0.0 * given.discount, 1 - given.discount, 0
+        shares.weights[row, a] = weight
         for k in range(outcomes):
             after = given.successors[state, a, k]
             if after != state:
                 move = given.discount * given.probabilities[state, a, k]
-                shares.successors[i, a, m] = setting.position[after]
-                shares.shares[i, a, m] = shares.weights[i, a] * move
+                shares.successors[row, a, m] = setting.position[after]
+                shares.shares[row, a, m] = weight * move
                 left += move
                 m += 1
-        leaving += shares.weights[i, a] * left
-        policy_leaving += policy[a] * left
+        for padding in range(m, width):
+            shares.successors[row, a, padding] = i
+            shares.shares[row, a, padding] = 0
+        leaving += weight * left
+        policy_leaving += weighing.policy[a] * left
     divisor = max(leaving, policy_leaving)
-    shares.leaving[i] = leaving
-    shares.divisor[i] = divisor if divisor > 0 else 1.0
+    shares.beta[row] = by_beta if passes_on else 0.0
+    shares.leaving[row] = leaving if passes_on else 1.0
+    shares.divisor[row] = divisor if passes_on and divisor > 0 else 1.0
+    shares.rows[i] = row
 
 
 @cache
@@ -165,20 +173,22 @@ def passing_for(actions: int, outcomes: int, width: int) -> Passing:
     """The machine code for that many; as constants they make it twice as fast."""
 
     @compiled()
-    def fill_in(begin, end, threshold, setting, shares):  # pragma: no cover
-        """Fills in the entries of states that are sure to be needed: those whose first λ is above a threshold."""
-        q, policy = np.empty(actions, setting.values.dtype), np.empty(actions, setting.values.dtype)
-        for i in range(begin, end):
-            if abs(shares.adjoint[i]) > threshold:
-                _fill_in(i, actions, outcomes, setting, shares, q, policy)
+    def fill_in(begin, end, which, given, setting, shares):  # pragma: no cover
+        """Fills in a range of rows with the entries of the states at the positions `which`."""
+        dtype = setting.values.dtype
+        weighing = Weighing(np.empty(actions, dtype), np.empty(actions, dtype), np.empty(actions, dtype))
+        for row in range(begin, end):
+            _fill_in(which[row], row, actions, outcomes, width, given, setting, shares, weighing)
 
     @compiled()
-    def pass_on(threshold, warm, setting, shares):  # pragma: no cover
+    def pass_on(threshold, warm, filled, given, setting, shares):  # pragma: no cover
         """Passes on the residuals above a threshold, the farthest state first; or (`warm`) what a first λ amounts to.
 
-        Returns how many states had something to pass on, and the sum of all residuals' sizes that were left alone.
+        Returns how many states had something to pass on, the sum of all residuals' sizes that were left alone, and how
+        many rows of entries are `filled` by now.
         """
-        q, policy = np.empty(actions, setting.values.dtype), np.empty(actions, setting.values.dtype)
+        dtype = setting.values.dtype
+        weighing = Weighing(np.empty(actions, dtype), np.empty(actions, dtype), np.empty(actions, dtype))
         at_work, left_alone = 0, 0.0 * threshold
         for i in range(len(shares.residual) - 1, -1, -1):
             missing = shares.adjoint[i] if warm else shares.residual[i]
@@ -188,45 +198,46 @@ def passing_for(actions: int, outcomes: int, width: int) -> Passing:
                 left_alone += abs(missing)
                 continue
             at_work += 1
-            if not shares.known[i]:
-                _fill_in(i, actions, outcomes, setting, shares, q, policy)
-            amount = missing
+            if shares.rows[i] < 0:
+                _fill_in(i, filled, actions, outcomes, width, given, setting, shares, weighing)
+                filled += 1
+            row, amount = shares.rows[i], missing
             if not warm:
-                amount = missing / shares.divisor[i]
+                amount = missing / shares.divisor[row]
                 shares.adjoint[i] += amount
-            shares.residual[i] -= amount * shares.leaving[i]
+            shares.residual[i] -= amount * shares.leaving[row]
             for a in range(actions):
                 for m in range(width):
-                    shares.residual[shares.successors[i, a, m]] += amount * shares.shares[i, a, m]
-        return at_work, left_alone
+                    shares.residual[shares.successors[row, a, m]] += amount * shares.shares[row, a, m]
+        return at_work, left_alone, filled
 
     @compiled()
-    def left_out(setting, adjoint, region):  # pragma: no cover
+    def left_out(given, setting, adjoint, region):  # pragma: no cover
         """Σ |λ (B(Q) − V)| over the states outside the region."""
-        given, values = setting.given, setting.values
-        advantage, leaving = np.empty(actions, values.dtype), np.ones(actions, values.dtype)
+        values = setting.values
+        advantage = np.empty(actions, values.dtype)
+        scratch = Scratch(advantage, np.ones(actions, values.dtype), advantage)
         cost = 0.0 * given.discount
         for i in range(len(adjoint)):
             state = setting.order[i]
             if region[state] or adjoint[i] == 0 or given.terminal[state] or not values[state] > setting.reached:
                 continue
             for a in range(actions):
-                advantage[a] = _action_value(setting, state, a, outcomes) - values[state]
-            gain, _ = backed_up(setting.valuing, Scratch(leaving, leaving, advantage))
+                scratch.advantage[a] = _action_value(given, values, state, a, outcomes) - values[state]
+            gain, _ = backed_up(setting.valuing, scratch)
             cost += abs(adjoint[i] * gain)
         return cost
 
     @compiled()
-    def pull_back(begin, end, setting, found, weights, beta, adjoint, by):  # pragma: no cover
+    def pull_back(begin, end, given, setting, found, rows, weights, beta, adjoint, by):  # pragma: no cover
         """Fills in the gradients `by` φ with λᵀ ∂F/∂φ, and λ with the states' own numbers, for a range of positions.
 
-        λ is what was `found`, `weights` and `beta` are as in `Shares`. Gradients by numbers that states share are added
-        to.
+        λ is what was `found`; `rows`, `weights` and `beta` are as in `Shares`. Gradients by numbers that states share
+        are added to.
         """
-        given, values = setting.given, setting.values
+        values = setting.values
         for i in range(begin, end):
-            weight = found[i]
-            state = setting.order[i]
+            weight, row, state = found[i], rows[i], setting.order[i]
             adjoint[state] = weight
             by.probabilities[state] = 0
             if weight == 0:
@@ -234,11 +245,11 @@ def passing_for(actions: int, outcomes: int, width: int) -> Passing:
             if given.terminal[state]:
                 by.final_reward[state if len(by.final_reward) > 1 else 0] += weight
                 continue
-            by.beta[()] += weight * beta[i]
+            by.beta[()] += weight * beta[row]
             for a in range(actions):
-                share = weight * weights[i, a]
+                share = weight * weights[row, a]
                 by.reward[state if by.reward.shape[0] > 1 else 0, a if by.reward.shape[1] > 1 else 0] += share
-                by.discount[()] += share * _expected(setting, state, a, outcomes)
+                by.discount[()] += share * _expected(given, values, state, a, outcomes)
                 for k in range(outcomes):
                     after = given.successors[state, a, k]
                     if after != state:
