@@ -78,14 +78,14 @@ def test_any_start_gives_the_same(name):
 
 
 @each_backup
-@pytest.mark.parametrize("warm", [False, True])
-def test_the_adjoint_solves_its_equation(name, warm):
-    """λ = g + Wᵀλ, with W dense and its weights by differentiating the backup."""
+@pytest.mark.parametrize("first", ["none", "all", "few"])
+def test_the_adjoint_solves_its_equation(name, first):
+    """λ = g + Wᵀλ, with W dense and its weights by differentiating the backup; whatever λ it starts from."""
     problem = obstacle_problem(4)
     wanted = generic_task(problem, 0.95)
-    start = None
-    if warm:
-        start = SOLVER.cold_start(12, jnp.dtype(jnp.float64))._replace(adjoint=jnp.linspace(-1.0, 1.0, 12))
+    everywhere = jnp.linspace(-1.0, 1.0, 12)
+    adjoints = {"none": jnp.zeros(12), "all": everywhere, "few": jnp.zeros(12).at[jnp.asarray([3, 8])].set(2.0)}
+    start = SOLVER.cold_start(12, jnp.dtype(jnp.float64))._replace(adjoint=adjoints[first])
     found, _, adjoint = values_and_slopes(problem.model, wanted, people(name), start)
     weights = np.asarray(jax.vmap(jax.grad(BACKUPS[name].value), (0, None))(found.action_values, jnp.asarray(5.0)))
     transitions = np.asarray(problem.dense(problem.model.parameters))

@@ -134,6 +134,25 @@ def test_a_task_is_solved_alike_alone_and_in_a_batch(name):
             np.testing.assert_array_equal(one, several[index])
 
 
+@pytest.mark.parametrize("name", ["boltzmann", "logsumexp"])
+def test_a_gradient_is_found_alike_alone_and_in_a_batch(name):
+    """From an earlier adjoint: alone, what it takes of the states is worked out on all cores."""
+    model = half_learned(office(200, 200, 3), np.random.default_rng(0))
+    wanted = [reach(model.graph, goal, discount=0.999, step_cost=1.0) for goal in (20_100, 5_050)]
+    people, solver = Behavior(BACKUPS[name](), 5.0), Ordered(tolerance=1e-7)
+    before = solver.cold_start(40_000, jnp.dtype(jnp.float64))._replace(adjoint=jnp.ones(40_000))
+
+    def total(parameters, task):
+        found = solve(model.with_parameters(parameters), task, people, solver=solver, start=before)
+        return jnp.sum(jnp.cos(jnp.arange(40_000)) * found.values)
+
+    slope = jax.grad(total)
+    batch = jax.vmap(slope, (None, 0))(model.parameters, stack_tasks(wanted))
+    assert jnp.isfinite(batch).all()
+    for index, task in enumerate(wanted):
+        np.testing.assert_array_equal(batch[index], slope(model.parameters, task))
+
+
 def test_what_fails_waits_for_what_is_still_at_work():
     """It may be writing into memory that is taken back as soon as the failure is known."""
     begun, ended = threading.Event(), []

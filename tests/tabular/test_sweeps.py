@@ -58,18 +58,11 @@ def test_states_out_of_reach_come_last():
 
 def test_states_ascend_and_ties_keep_their_numbers():
     random = np.random.default_rng(0)
-    distances = np.exp(random.uniform(-80, 80, 5_000))
+    distances = np.exp(random.uniform(-700, 700, 5_000))
     distances[::7], distances[5::17], distances[3::13] = 0, distances[4], np.inf
-    distances[1::25] = random.permutation(distances[11] * (1 + np.arange(200) * 1e-6))
-    ascending = distances[_ascending(distances)]
-    finite = ascending[np.isfinite(ascending)]
-    assert (finite[1:] >= finite[:-1] * (1 - 1e-7)).all()
-    assert np.isinf(ascending[len(finite) :]).all()
-
-    tied = np.full(300, distances[4])
-    tied[::2] *= 1 - 1e-12
-    tied[7], tied[8], tied[9] = 1e300, 1e-300, np.inf
-    assert _ascending(tied).tolist() == [8, *range(7), *range(10, 300), 7, 9]
+    near = distances[11] * (1 + np.arange(200) * 2.0**-50)
+    distances[1::25] = random.permutation(near)
+    np.testing.assert_array_equal(_ascending(distances), np.argsort(distances, kind="stable"))
 
 
 def test_the_reach_is_how_far_apart_a_state_and_its_successors_stand():

@@ -67,7 +67,7 @@ def pull_back(
         _fill(np.nan, found.values, *by)
         write(found, order, outcome)
         return
-    by_values = shares.adjoint, shares.rows, shares.weights, shares.beta
+    by_values = shares.adjoint, shares.row, shares.weights, shares.beta
     del shares  # the gradient takes the memory that it held
     _fill(0.0, *by[1:])
 
@@ -94,7 +94,7 @@ def _no_shares(given: Given, width: int, adjoint: np.ndarray, residual: np.ndarr
     states, actions, _ = given.successors.shape
     dtype = adjoint.dtype
     return Shares(
-        rows=np.full(states, -1, np.int32),
+        row=np.full(states, -1, np.int32),
         adjoint=adjoint,
         residual=residual,
         weights=np.empty((states, actions), dtype),
@@ -129,12 +129,8 @@ def _pass_on_until_gone(
     states = len(shares.residual)
     finest = tolerance * total / states
     threshold = max(finest, _COARSEST * total)
-    needed = np.flatnonzero(np.abs(shares.adjoint) > finest)
-    filled = len(needed)
-    if shares.adjoint.any():
-        shared_out(lambda begin, end: run.fill_in(begin, end, needed, given, setting, shares), filled)
-        run.pass_on(finest, True, filled, given, setting, shares)
     passed_on, left = 0, np.inf
+    filled = _take_over(run, given, setting, shares, finest) if shares.adjoint.any() else 0
     for _ in range(max_sweeps):
         heed_interrupts()
         at_work, left_alone, filled = run.pass_on(threshold, False, filled, given, setting, shares)
@@ -145,3 +141,11 @@ def _pass_on_until_gone(
             break
         threshold = max(finest, _FINER * threshold)
     return Outcome(-(-passed_on // states), left, bool(left <= tolerance))
+
+
+def _take_over(run: Passing, given: Given, setting: Setting, shares: Shares, finest: np.floating) -> int:
+    """Passes on what a first λ amounts to, its rows filled in on all cores; returns how many these are."""
+    needed = np.flatnonzero(np.abs(shares.adjoint) > finest)
+    shared_out(lambda begin, end: run.fill_in(begin, end, needed, given, setting, shares), len(needed))
+    _, _, filled = run.pass_on(finest, True, len(needed), given, setting, shares)
+    return filled

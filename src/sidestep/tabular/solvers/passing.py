@@ -39,17 +39,17 @@ class Shares(NamedTuple):
 
     By position:
 
-    - `rows`: which row of the entries is the state's; −1 as long as it has none.
+    - `row`: which of the rows below is the state's; −1 as long as it has none.
     - `adjoint`, `residual`: λ, and g + Wᵀλ − λ.
 
-    Entries, a row for each state that turned out to be needed, so that they lie close together in memory:
+    Rows, one for each state that turned out to be needed, so that they lie close together in memory:
 
     - `weights`: w(a), the gradient of the value by the action values; `beta`: its gradient by β.
     - `successors`, `shares`: the positions of the states that it leads to, and the entries of W for them.
     - `leaving`, `divisor`: Σ w l, and what the state's own adjoint equation is divided by.
     """
 
-    rows: np.ndarray
+    row: np.ndarray
     adjoint: np.ndarray
     residual: np.ndarray
     weights: np.ndarray
@@ -61,9 +61,12 @@ class Shares(NamedTuple):
 
 
 class Weighing(NamedTuple):
-    """Room for a state's action values, the weights of the gradient by them, and the policy (see `Scratch`)."""
+    """Room for a state's action values, the weights of the gradient by them, and the policy.
 
-    values: np.ndarray
+    In a tuple, and filled by functions that return nowhere but at their end, for the reason that `Scratch` tells.
+    """
+
+    action_values: np.ndarray
     weights: np.ndarray
     policy: np.ndarray
 
@@ -90,22 +93,22 @@ class Passing(NamedTuple):
 @inlined()
 def weigh(valuing, exact, weighing):  # pragma: no cover
     """Fills in the weights of the gradient and the policy by action values; returns the gradient by β."""
-    kind, beta, tie, actions = valuing.kind, valuing.beta, valuing.tie, len(weighing.values)
-    best = weighing.values[0]
+    kind, beta, tie, actions = valuing.kind, valuing.beta, valuing.tie, len(weighing.action_values)
+    best = weighing.action_values[0]
     for a in range(1, actions):
-        best = max(best, weighing.values[a])
+        best = max(best, weighing.action_values[a])
     total = 0.0 * best
     for a in range(actions):
-        behind = weighing.values[a] - best
+        behind = weighing.action_values[a] - best
         weighing.policy[a] = (behind >= -tie * abs(best)) * 1.0 if kind == HARD_MAX else np.exp(beta * behind)
         total += weighing.policy[a]
     average = 0.0 * best
     for a in range(actions):
         weighing.policy[a] /= total
-        average += weighing.policy[a] * (weighing.values[a] - best)
+        average += weighing.policy[a] * (weighing.action_values[a] - best)
     variance = 0.0 * best
     for a in range(actions):
-        behind, taken = weighing.values[a] - best - average, weighing.policy[a]
+        behind, taken = weighing.action_values[a] - best - average, weighing.policy[a]
         # in this order, because an action that is never taken may be worth all but −∞
         variance += taken * behind * behind
         weighing.weights[a] = taken * (1 + beta * behind) if kind == BOLTZMANN and exact else taken
@@ -138,15 +141,16 @@ def _action_value(given, values, state, a, outcomes):  # pragma: no cover
 
 @inlined()
 def _fill_in(i, row, actions, outcomes, width, given, setting, shares, weighing):  # pragma: no cover
-    """The entries of the state at position i. Of a state without values to speak of, nothing is passed on."""
+    """Fills in the row of the state at position i. Of a state without values to speak of, the shares are 0."""
     state = setting.order[i]
     passes_on = setting.values[state] > setting.reached and not given.terminal[state]
     for a in range(actions):
-        weighing.values[a] = _action_value(given, setting.values, state, a, outcomes) if passes_on else given.discount
+        worth = _action_value(given, setting.values, state, a, outcomes) if passes_on else 0.0
+        weighing.action_values[a] = worth
     by_beta = weigh(setting.valuing, setting.exact, weighing)
     leaving, policy_leaving = 0.0 * given.discount, 0.0 * given.discount
     for a in range(actions):
-        weight, left, m = weighing.weights[a] if passes_on else 0.0 * given.discount, 1 - given.discount, 0
+        weight, left, m = weighing.weights[a] if passes_on else 0.0, 1 - given.discount, 0
         shares.weights[row, a] = weight
         for k in range(outcomes):
             after = given.successors[state, a, k]
@@ -165,7 +169,7 @@ def _fill_in(i, row, actions, outcomes, width, given, setting, shares, weighing)
     shares.beta[row] = by_beta if passes_on else 0.0
     shares.leaving[row] = leaving if passes_on else 1.0
     shares.divisor[row] = divisor if passes_on and divisor > 0 else 1.0
-    shares.rows[i] = row
+    shares.row[i] = row
 
 
 @cache
@@ -174,7 +178,7 @@ def passing_for(actions: int, outcomes: int, width: int) -> Passing:
 
     @compiled()
     def fill_in(begin, end, which, given, setting, shares):  # pragma: no cover
-        """Fills in a range of rows with the entries of the states at the positions `which`."""
+        """Fills in a range of rows, for the states at the positions `which`."""
         dtype = setting.values.dtype
         weighing = Weighing(np.empty(actions, dtype), np.empty(actions, dtype), np.empty(actions, dtype))
         for row in range(begin, end):
@@ -185,7 +189,7 @@ def passing_for(actions: int, outcomes: int, width: int) -> Passing:
         """Passes on the residuals above a threshold, the farthest state first; or (`warm`) what a first λ amounts to.
 
         Returns how many states had something to pass on, the sum of all residuals' sizes that were left alone, and how
-        many rows of entries are `filled` by now.
+        many rows are `filled` by now.
         """
         dtype = setting.values.dtype
         weighing = Weighing(np.empty(actions, dtype), np.empty(actions, dtype), np.empty(actions, dtype))
@@ -198,10 +202,10 @@ def passing_for(actions: int, outcomes: int, width: int) -> Passing:
                 left_alone += abs(missing)
                 continue
             at_work += 1
-            if shares.rows[i] < 0:
+            if shares.row[i] < 0:
                 _fill_in(i, filled, actions, outcomes, width, given, setting, shares, weighing)
                 filled += 1
-            row, amount = shares.rows[i], missing
+            row, amount = shares.row[i], missing
             if not warm:
                 amount = missing / shares.divisor[row]
                 shares.adjoint[i] += amount
@@ -229,15 +233,15 @@ def passing_for(actions: int, outcomes: int, width: int) -> Passing:
         return cost
 
     @compiled()
-    def pull_back(begin, end, given, setting, found, rows, weights, beta, adjoint, by):  # pragma: no cover
+    def pull_back(begin, end, given, setting, found, row, weights, beta, adjoint, by):  # pragma: no cover
         """Fills in the gradients `by` φ with λᵀ ∂F/∂φ, and λ with the states' own numbers, for a range of positions.
 
-        λ is what was `found`; `rows`, `weights` and `beta` are as in `Shares`. Gradients by numbers that states share
+        λ is what was `found`; `row`, `weights` and `beta` are as in `Shares`. Gradients by numbers that states share
         are added to.
         """
         values = setting.values
         for i in range(begin, end):
-            weight, row, state = found[i], rows[i], setting.order[i]
+            weight, own, state = found[i], row[i], setting.order[i]
             adjoint[state] = weight
             by.probabilities[state] = 0
             if weight == 0:
@@ -245,9 +249,9 @@ def passing_for(actions: int, outcomes: int, width: int) -> Passing:
             if given.terminal[state]:
                 by.final_reward[state if len(by.final_reward) > 1 else 0] += weight
                 continue
-            by.beta[()] += weight * beta[row]
+            by.beta[()] += weight * beta[own]
             for a in range(actions):
-                share = weight * weights[row, a]
+                share = weight * weights[own, a]
                 by.reward[state if by.reward.shape[0] > 1 else 0, a if by.reward.shape[1] > 1 else 0] += share
                 by.discount[()] += share * _expected(given, values, state, a, outcomes)
                 for k in range(outcomes):
