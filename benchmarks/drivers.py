@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.optimize import minimize
 
-from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError, NotConverged
 from sidestep.inference.fit import Fit, fit
-from sidestep.inference.optimisers import LBFGS, Optimiser, Resilient
+from sidestep.inference.optimizers import LBFGS, Optimizer, Rprop
 from sidestep.inference.priors import Normal
 from sidestep.io.roads import Roads, demonstrations_of_trips, read_roads, read_trips
 from sidestep.tabular.backups import BACKUPS, Behavior
+from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import action_log_likelihood
 from sidestep.tabular.models import TiedModel, closed, road_network
 from two_way import FEATURES, TwoWay, turn_features, two_way
@@ -44,7 +44,7 @@ class Settings:
     - `backup`: a name in `BACKUPS`. `tastes`: whether drivers mind turns, or lengths and the number of links only.
     - `prior_mean`, `prior_variance`: of the logit of each link that was not driven.
     - `iterations`, `tolerance`: those of `LBFGS`.
-    - `many`: from so many turns on, the climb is that of large maps: from above, by `Resilient` (see `_climb`).
+    - `many`: from so many turns on, the climb is that of large maps: from above, by `Rprop` (see `_climb`).
     """
 
     backup: str = "boltzmann"
@@ -113,7 +113,7 @@ def learn_tastes(town: Town, demos: Demonstrations, people: Behavior, turns: boo
     return jnp.asarray(minimize(loss_and_slope, start, jac=True, method="L-BFGS-B", bounds=minded).x)
 
 
-class Learned(NamedTuple):
+class ModelResult(NamedTuple):
     """What was learned from trips: a model, the weights of `FEATURES` in what drivers pay, and how they behave."""
 
     found: Fit[TiedModel]
@@ -131,7 +131,7 @@ class Learned(NamedTuple):
         return float(action_log_likelihood(self.found.model, demos, self.people)) / len(demos)
 
 
-def learn(town: Town, trips: Sequence[Trip], settings: Settings) -> Learned:
+def learn(town: Town, trips: Sequence[Trip], settings: Settings) -> ModelResult:
     """What is learned from trips; raises `InputError` for a backup that is none."""
     if settings.backup not in BACKUPS:
         raise InputError(f"expected one of {', '.join(BACKUPS)}, found {settings.backup!r}", field="backup")
@@ -141,15 +141,15 @@ def learn(town: Town, trips: Sequence[Trip], settings: Settings) -> Learned:
     driven = jnp.asarray(town.uses(trips) > 0)
     means = jnp.where(driven, OPEN, settings.prior_mean)
     prior = Normal(means, jnp.where(driven, SURELY, settings.prior_variance))
-    optimiser, begin = _climb(settings, means, driven, len(demos))
+    optimizer, begin = _climb(settings, means, driven, len(demos))
     model = town.model.with_parameters(begin)
-    found = fit(model, town.paying(demos, weights), people, prior=prior, optimiser=optimiser)
-    return Learned(found, weights, people)
+    found = fit(model, town.paying(demos, weights), people, prior=prior, optimizer=optimizer)
+    return ModelResult(found, weights, people)
 
 
 def _climb(
     settings: Settings, means: Float[Array, " links"], driven: Bool[Array, " links"], turns: int
-) -> tuple[Optimiser, Float[Array, " links"]]:
+) -> tuple[Optimizer, Float[Array, " links"]]:
     """The optimiser, and the logits that it begins with.
 
     Many trips make cliffs: links that thousands of drivers would take if they were a little more open. L-BFGS crawls
@@ -157,5 +157,5 @@ def _climb(
     """
     if turns < settings.many:
         return LBFGS(iterations=settings.iterations, tolerance=settings.tolerance), means
-    optimiser = Resilient(iterations=settings.iterations, tolerance=A_TURN * turns)
-    return optimiser, jnp.where(driven, means, CLOSED)
+    optimizer = Rprop(iterations=settings.iterations, tolerance=A_TURN * turns)
+    return optimizer, jnp.where(driven, means, CLOSED)

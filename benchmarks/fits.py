@@ -21,16 +21,16 @@ from typing import Any
 import numpy as np
 
 from measuring import argument_parser, main, note, number, peak_bytes, print_table, write_records
-from sidestep.commands.simulate import Walkers, walk
-from sidestep.demonstrations import Demonstrations, gather
-from sidestep.domains.offices import office
-from sidestep.inference.climb import Progress
+from sidestep.cli.simulate import Walkers, walk
+from sidestep.evaluation.metrics import relevant_obstacles, score_map, visit_ranking
+from sidestep.inference.maximize import Progress
 from sidestep.io.maps import read_map
-from sidestep.scoring import relevant_obstacles, score_map, visit_ranking
-from sidestep.settings import Settings, fit_map
+from sidestep.maps.config import Settings, fit_map
+from sidestep.tabular.demonstrations import Demonstrations, gather
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid
-from sidestep.tasks import reach
+from sidestep.tabular.tasks import reach
+from sidestep.worlds.offices import office
 
 MAPS = Path(__file__).parents[2] / "shared" / "data" / "maps"
 
@@ -76,10 +76,10 @@ def measure(name: str, truth: Grid, arguments: argparse.Namespace) -> dict[str, 
     started = time.perf_counter()
     found = fit_map(ObstacleGrid(given, settings.prior_mean), demonstrations, settings, report)
     seconds = time.perf_counter() - started
-    visited = demonstrations.visited()
+    visited = demonstrations.visited_state_goals()
     unknown, relevant = given.known == Cell.UNKNOWN, relevant_obstacles(truth, visited[:, 0], visited[:, 1])
     scores = score_map(np.asarray(found.model.blocked), truth, unknown, relevant)
-    by_visits = score_map(visit_ranking(visited[:, 0], truth), truth, unknown, relevant)
+    visit_counts = score_map(visit_ranking(visited[:, 0], truth), truth, unknown, relevant)
     return {
         "name": name,
         "backup": arguments.backup,
@@ -98,7 +98,7 @@ def measure(name: str, truth: Grid, arguments: argparse.Namespace) -> dict[str, 
         "largest_gradient": found.final.gradient,
         "objective": found.final.objective,
         "average_precision_relevant": scores.average_precision_relevant,
-        "by_visits": by_visits.average_precision_relevant,
+        "by_visits": visit_counts.average_precision_relevant,
     }
 
 

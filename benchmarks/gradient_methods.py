@@ -17,8 +17,8 @@ from sidestep.tabular.backups import BACKUPS, Behavior
 from sidestep.tabular.likelihood import choices_of
 from sidestep.tabular.models import TabularModel, TransitionModel
 from sidestep.tabular.solve import solve
-from sidestep.tabular.solvers.ordered import Ordered
-from sidestep.tabular.solvers.process import DecisionProcess, action_values, at_fixed_policy
+from sidestep.tabular.solvers.base import DecisionProcess, action_values, at_fixed_policy
+from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from worlds import World
 
 MOST_SWEEPS = 5_000
@@ -35,7 +35,9 @@ def problem_of(world: World, model: str, backup: str, arguments: argparse.Namesp
     demos = world.demonstrations(arguments.discount, cost)
     people = Behavior(BACKUPS[backup](), arguments.beta)
     made = world.model if model == "cells" else table_of(world.model)
-    return Problem(made, demos, choices_of(demos), people, Ordered(tolerance=arguments.tolerance), arguments.gradient)
+    return Problem(
+        made, demos, choices_of(demos), people, GaussSeidel(tolerance=arguments.tolerance), arguments.gradient
+    )
 
 
 def table_of(model: TransitionModel) -> TabularModel:
@@ -51,7 +53,7 @@ def process_of(problem: Problem, parameters: Parameters) -> DecisionProcess:
     task = jax.tree.map(lambda leaf: leaf[0], problem.demonstrations.tasks)
     probabilities = model.probabilities()
     return DecisionProcess(
-        model.graph.successors, probabilities, task.reward, task.final_reward, task.terminal, task.discount
+        model.graph.successors, probabilities, task.reward, task.terminal_reward, task.terminal, task.discount
     )
 
 
@@ -116,8 +118,8 @@ def dense(problem: Problem, parameters: Parameters) -> Found:
     by_parameters, by_values = jax.grad(partial(chosen, problem), argnums=(0, 1))(parameters, solved)
     jacobian = jax.jacobian(partial(one_backup, problem, parameters))(solved)
     multipliers = jnp.linalg.solve((jnp.eye(len(solved)) - jacobian).T, by_values)
-    pull_back = jax.vjp(lambda x: one_backup(problem, x, solved), parameters)[1]
-    return by_parameters + pull_back(multipliers)[0], sweeps
+    vjp = jax.vjp(lambda x: one_backup(problem, x, solved), parameters)[1]
+    return by_parameters + vjp(multipliers)[0], sweeps
 
 
 def by_optimistix(problem: Problem, parameters: Parameters) -> Found:

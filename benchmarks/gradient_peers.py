@@ -62,7 +62,7 @@ from gradient_methods import MOST_SWEEPS, ONLY_VALUES, OTHERS, Found, method_fun
 from scaling import Problem, stepped, take
 from sidestep.errors import NotConverged
 from sidestep.tabular.backups import BACKUPS
-from sidestep.tabular.solvers.ordered import Ordered
+from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from worlds import World, expected_costs, half_learned_office, load
 
 EXACT = (1e-12, 1e-11, 1e-10)
@@ -143,7 +143,7 @@ def difference(found: Array, expected: Array) -> float | None:
 def exact_gradient(problem: Problem) -> Array:
     """The gradient by `sidestep ordered` at a tolerance as small as is reached; raises `NotConverged` if none is."""
     for tolerance in EXACT:
-        solver = Ordered(tolerance=tolerance, max_sweeps=1_000)
+        solver = GaussSeidel(tolerance=tolerance, max_sweeps=1_000)
         strict = eqx.tree_at(lambda p: p.solver, problem, solver)
         cold = problem.cold_start()
         found = take(strict, problem.model.parameters, cold, cold.region)

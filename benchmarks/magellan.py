@@ -30,14 +30,14 @@ from matplotlib.figure import Figure
 from measuring import argument_parser, complain, main, note, number, print_table, write_records
 from real_people import SCORES, Maze, draws
 from settings import add_set_option, changed, described
-from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError
-from sidestep.io.demonstrations import demonstrations
+from sidestep.evaluation.metrics import relevant_obstacles, score_map, visit_ranking
+from sidestep.io.demonstrations import demonstrations_from_walks
 from sidestep.io.maps import read_map
 from sidestep.io.walks import Walks, read_walks
+from sidestep.maps.config import Settings, fit_map
 from sidestep.plotting.maps import Panel, figure_learned, save
-from sidestep.scoring import relevant_obstacles, score_map, visit_ranking
-from sidestep.settings import Settings, fit_map
+from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Cell
 from sidestep.tabular.models import ObstacleGrid
 
@@ -69,7 +69,7 @@ def read_town(folder: Path, settings: Settings) -> Maze:
 
 def score(town: Maze, drives: Walks, settings: Settings) -> dict[str, Any]:
     """The record of some drives: the scores of each of `METHODS`, how the fit went, and P(blocked)."""
-    demos = demonstrations(drives, town.blank, discount=settings.discount, step_cost=settings.step_cost)
+    demos = demonstrations_from_walks(drives, town.blank, discount=settings.discount, step_cost=settings.step_cost)
     model = ObstacleGrid(town.blank, settings.prior_mean)
     started = time.perf_counter()
     found = fit_map(model, demos, settings)
@@ -80,7 +80,7 @@ def score(town: Maze, drives: Walks, settings: Settings) -> dict[str, Any]:
         "visits": visit_ranking(np.concatenate(demos.paths()), town.blank),
         "transitions": np.asarray(without.model.blocked, dtype=np.float64),
     }
-    visited = demos.visited()
+    visited = demos.visited_state_goals()
     relevant = relevant_obstacles(town.truth, visited[:, 0], visited[:, 1])
     everywhere = np.ones(town.truth.shape, dtype=bool)
     scores = {name: asdict(score_map(ranks, town.truth, everywhere, relevant)) for name, ranks in rankings.items()}

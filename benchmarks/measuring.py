@@ -23,8 +23,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from sidestep._files import write_json
 from sidestep.errors import SidestepError
-from sidestep.io.files import write_json
 
 SHORTEST = 0.01
 """Seconds that a measurement takes at least; shorter calls are repeated, and their mean counts."""

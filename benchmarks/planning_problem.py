@@ -16,10 +16,10 @@ from sidestep.tabular.backups import Behavior, LogSumExp
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.planning import plan
 from sidestep.tabular.solve import solve
+from sidestep.tabular.solvers.base import Solver
+from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
-from sidestep.tabular.solvers.ordered import Ordered
-from sidestep.tabular.solvers.process import Solver
-from sidestep.tasks import Task
+from sidestep.tabular.tasks import Task
 from worlds import World
 
 
@@ -77,7 +77,7 @@ def soft_values(
 def own_call(problem: Problem, name: str, soft: bool, tolerance: float, horizon: int) -> Callable[[], np.ndarray]:
     """This project's call by its name; raises `NotConverged` if it fails."""
     model, task = problem.model, problem.task
-    solvers = {"sidestep ordered": Ordered(tolerance=tolerance), "sidestep jacobi": Jacobi(tolerance=tolerance)}
+    solvers = {"sidestep ordered": GaussSeidel(tolerance=tolerance), "sidestep jacobi": Jacobi(tolerance=tolerance)}
     solver = solvers.get(name)
     if not soft:
         return lambda: np.asarray(jax.block_until_ready(plan(model, task, solver=solver)).solution.values)

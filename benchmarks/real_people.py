@@ -27,15 +27,15 @@ from rich.table import Table
 
 import measuring
 from settings import add_set_option, changed, described
-from sidestep.commands.behavior import choose_behavior
+from sidestep._files import write_json
 from sidestep.errors import InputError
-from sidestep.io.demonstrations import demonstrations
-from sidestep.io.files import write_json
+from sidestep.evaluation.metrics import relevant_obstacles, score_map, visit_ranking
+from sidestep.io.demonstrations import demonstrations_from_walks
 from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map
 from sidestep.io.walks import Walks, read_walks
-from sidestep.scoring import relevant_obstacles, score_map, visit_ranking
-from sidestep.settings import Settings, fit_map
+from sidestep.maps.config import Settings, fit_map
+from sidestep.maps.selection import choose_behavior
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
 
@@ -88,10 +88,10 @@ def score(maze: Maze, walks: Walks, settings: Settings, auto: bool) -> dict[str,
     started = time.perf_counter()
     if auto:
         settings = choose_behavior(maze.blank, grid_walks(walks, maze.blank), settings).settings
-    demos = demonstrations(walks, maze.blank, discount=settings.discount, step_cost=settings.step_cost)
+    demos = demonstrations_from_walks(walks, maze.blank, discount=settings.discount, step_cost=settings.step_cost)
     found = fit_map(ObstacleGrid(maze.blank, settings.prior_mean), demos, settings)
     seconds = time.perf_counter() - started
-    visited = demos.visited()
+    visited = demos.visited_state_goals()
     relevant = relevant_obstacles(maze.truth, visited[:, 0], visited[:, 1])
     rankings = {
         "learned": np.asarray(found.model.blocked, dtype=np.float64),

@@ -9,7 +9,7 @@ are to reach 24 others. `tartarus` are the mazes of `real_people.py`, whose peop
 reach twelve other cells. Of the walks N are learned from, but at most four fifths. Others, at most a hundred, tell how
 probable the actions are that each method expects (nats a move).
 
-Robots set out from every free cell and plan by what each method has learned (`sidestep.robots`; who knows nothing but
+Robots set out from every free cell and plan by what each method has learned (`sidestep.robots.robot`; who knows nothing but
 costs pursues these). `legal` is the share of planned paths that bump into nothing, `regret` by how many cells robots go
 farther than they had to, bumps and ways around included, and `arriving` the share of those who ever arrive; the regret
 is a mean over the worlds in which all do, held-out nats over those in which values are found for all held-out goals.
@@ -31,26 +31,26 @@ from rich.table import Table
 import measuring
 from real_people import DATA, Maze, read_maze
 from settings import add_set_option, changed, described
-from sidestep.commands.behavior import choose_behavior
-from sidestep.commands.compare import METHODS
-from sidestep.commands.simulate import Walkers, walk
-from sidestep.domains.offices import office, places
+from sidestep._files import write_json
+from sidestep.baselines.interface import mean_log_likelihood
+from sidestep.cli.compare import METHODS
+from sidestep.cli.simulate import Walkers, walk
 from sidestep.errors import ImproperTask, InputError, NotConverged
-from sidestep.evaluation import evaluate
-from sidestep.io.demonstrations import demonstrations
-from sidestep.io.files import write_json
+from sidestep.evaluation.evaluate import evaluate
+from sidestep.io.demonstrations import demonstrations_from_walks
 from sidestep.io.gridding import grid_walks
 from sidestep.io.trajectories import walks_of_trajectories
 from sidestep.io.walks import Walks
-from sidestep.rivals.learned import nats_a_move
-from sidestep.settings import Settings
+from sidestep.maps.config import Settings
+from sidestep.maps.selection import choose_behavior
 from sidestep.tabular.grid import Cell, Grid
+from sidestep.worlds.offices import office, places
 
 ROWS, COLUMNS = 14, 24
 PLACES, NEW_PLACES, NEW_CELLS = 8, 24, 12
 HELD_OUT = 100
 FIRST = 200
-"""The first office: robots' costs of bumps (`sidestep.robots`) were chosen on offices of lower seeds."""
+"""The first office: robots' costs of bumps (`sidestep.robots.robot`) were chosen on offices of lower seeds."""
 OWN = ("sample", "seed", "unknown")
 SCORES = {
     "average_precision": "average\nprecision",
@@ -109,7 +109,7 @@ def score(problem: Problem, settings: Settings, auto: bool, methods: Sequence[st
     if auto:
         settings = choose_behavior(blank, grid_walks(problem.walks, blank), settings).settings
     own, others = (
-        demonstrations(walks, blank, discount=settings.discount, step_cost=settings.step_cost)
+        demonstrations_from_walks(walks, blank, discount=settings.discount, step_cost=settings.step_cost)
         for walks in (problem.walks, problem.others)
     )
     everywhere = np.ones(blank.shape, dtype=bool)
@@ -118,14 +118,21 @@ def score(problem: Problem, settings: Settings, auto: bool, methods: Sequence[st
         try:
             learned = METHODS[name](blank, own, settings)
             found = evaluate(
-                learned.planner, learned.ranking, problem.truth, everywhere, own.visited(), goals=problem.goals
+                learned.planner,
+                learned.ranking,
+                problem.truth,
+                everywhere,
+                own.visited_state_goals(),
+                goals=problem.goals,
             )
         except (ImproperTask, NotConverged) as error:
             Console(stderr=True).print(f"{problem.name}, {name}: {error}")
             continue
         if not learned.converged:
             Console(stderr=True).print(f"{problem.name}, {name}: did not converge")
-        scores[name] = {key: {**found, "heldout_log_likelihood": nats_a_move(learned, others)}[key] for key in SCORES}
+        scores[name] = {
+            key: {**found, "heldout_log_likelihood": mean_log_likelihood(learned, others)}[key] for key in SCORES
+        }
     return scores
 
 

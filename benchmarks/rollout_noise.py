@@ -26,7 +26,7 @@ from sidestep.continuous import (
     Pendulum,
     Planner,
     Policy,
-    Regulate,
+    QuadraticTask,
     finite_policy,
     gaussian_policy,
     plan,
@@ -77,7 +77,7 @@ def problem_of(name: str) -> Problem:
         growth = 0.9 if place == "stable" else 1.05
         turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
         dynamics = LinearGaussian(jnp.asarray(growth * turn), jnp.array([[0.0], [0.5]]), jnp.full(2, 0.1))
-        task = Regulate(jnp.zeros(2), jnp.eye(2), 0.1 * jnp.eye(1), discount)
+        task = QuadraticTask(jnp.zeros(2), jnp.eye(2), 0.1 * jnp.eye(1), discount)
         states = jnp.asarray(random.uniform(-1, 1, (_STARTS, 2)))
         examples = jax.vmap(task.features)(states)
         return Problem(dynamics, task, states, gaussian_policy(jax.random.key(1), 1, examples, spread=0.5, depth=0))

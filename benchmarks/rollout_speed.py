@@ -32,11 +32,11 @@ from sidestep.continuous import (
 )
 from sidestep.continuous.estimators import Estimator
 from sidestep.continuous.tasks import task_at
-from sidestep.demonstrations import Demonstrations, Trajectory
-from sidestep.domains.rooms import room, starts
 from sidestep.experiments import pendulum as swinging
 from sidestep.experiments import room as walking
 from sidestep.tabular.backups import Behavior, LogSumExp
+from sidestep.tabular.demonstrations import Demonstrations, Trajectory
+from sidestep.worlds.continuous_room import room, starts
 
 CASES = ("room, score", "pendulum, score", "pendulum, pathwise")
 _WALKERS, _WIDTH = 25, 48

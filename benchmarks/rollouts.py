@@ -25,7 +25,7 @@ hardly optimises, so its times say nothing.
 
 Records (`--json`): for speed `part`, `name`, `estimator`, `roll_outs` (a batch), `horizon`, `steps_per_second`,
 `update_seconds`, `roll_outs_seconds`, `model_seconds`, `policy_seconds`, `critic_seconds`; for noise `part`, `name`,
-`problem`, `horizon`, `deviation`, `relative`, `gradient`, `roll_outs_needed`, `seconds`, `apart`.
+`problem`, `horizon`, `deviation`, `relative`, `gradient`, `roll_outs_needed`, `seconds`, `split_by_person`.
 """
 
 import argparse
@@ -73,13 +73,13 @@ def records_of(name: str, horizon: int, noise: dict[str, Noise]) -> list[Record]
             "gradient": float(np.sqrt(best.square)) if known else None,
             "roll_outs_needed": 100 * own.deviation**2 / best.square if known else None,
             "seconds": own.seconds,
-            "apart": apart(own, best),
+            "apart": split_by_person(own, best),
         }
         for estimator, own in noise.items()
     ]
 
 
-def apart(one: Noise, other: Noise) -> float:
+def split_by_person(one: Noise, other: Noise) -> float:
     """How far two means differ, in standard errors, at most over parameters; 0 of a mean and itself."""
     error = np.sqrt(one.error**2 + other.error**2)
     return float(np.max(np.abs(one.mean - other.mean) / np.where(error > 0, error, 1.0)))

@@ -10,7 +10,7 @@ value and gradient of the walkers' action log-likelihood with respect to all cel
 - **cold**: starting from nothing;
 - **warm**: after a step of an optimiser, starting from what the solve before it left (values, order, adjoint). The step
   is along the gradient, its largest component `--step` long; with `--step-by-sign` every component is that long;
-- **region**: the same, but that only the states are solved that mattered to the solve before (`Ordered` alone leaves
+- **region**: the same, but that only the states are solved that mattered to the solve before (`GaussSeidel` alone leaves
   the others out), as a fit of a large map does where it tries a step that changes little;
 - **Dijkstra**: `scipy.sparse.csgraph.dijkstra` from the goal over the expected cost of every move, the matrix given.
 
@@ -51,19 +51,19 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.sparse.csgraph import dijkstra
 
 import measuring
-from sidestep.demonstrations import Demonstrations
 from sidestep.errors import NotConverged
 from sidestep.tabular.backups import BACKUPS, Behavior, Gradient
+from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import Choices, choice_log_likelihood, choices_of
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import Solution
+from sidestep.tabular.solvers.base import Solver, WarmStart
+from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
-from sidestep.tabular.solvers.ordered import Ordered
-from sidestep.tabular.solvers.process import Solver, Start
-from sidestep.tasks import Task
+from sidestep.tabular.tasks import Task
 from worlds import World, expected_costs, half_learned_office, load
 
-SOLVERS = {"ordered": Ordered, "jacobi": Jacobi}
+SOLVERS = {"ordered": GaussSeidel, "jacobi": Jacobi}
 FROM_CELLS = 128**2
 """From how many cells on the exponent is fitted: below, what a call costs whatever the map shows."""
 
@@ -78,7 +78,7 @@ class Problem(eqx.Module):
     solver: Solver
     gradient: Gradient = eqx.field(static=True, default="exact")
 
-    def cold_start(self) -> Start:
+    def cold_start(self) -> WarmStart:
         """The start when nothing is known of any task."""
         start = self.solver.cold_start(self.model.graph.states, jnp.zeros(0).dtype)
         tasks = len(self.demonstrations.tasks.terminal)
@@ -90,7 +90,7 @@ class Step(NamedTuple):
 
     value: Float[Array, ""]
     gradient: Float[Array, "..."]
-    start: Start
+    start: WarmStart
     sweeps: Int[Array, " tasks"]
     converged: Bool[Array, ""]
 
@@ -107,7 +107,9 @@ def problem_of(world: World, name: str, backup: str, arguments: argparse.Namespa
 
 
 @eqx.filter_jit
-def take(problem: Problem, parameters: Float[Array, "..."], start: Start, region: Bool[Array, "tasks states"]) -> Step:
+def take(
+    problem: Problem, parameters: Float[Array, "..."], start: WarmStart, region: Bool[Array, "tasks states"]
+) -> Step:
     """The action log-likelihood and its gradient, from a start; the new start holds the new adjoint.
 
     Only the states of the region need be solved.
@@ -116,7 +118,7 @@ def take(problem: Problem, parameters: Float[Array, "..."], start: Start, region
     def objective(parameters: Array, adjoint: Array) -> tuple[Array, tuple]:
         model, begun = problem.model.with_parameters(parameters), start._replace(adjoint=adjoint)
 
-        def one(task: Task, choices: Choices, begun: Start, region: Array) -> tuple[Array, Solution]:
+        def one(task: Task, choices: Choices, begun: WarmStart, region: Array) -> tuple[Array, Solution]:
             how = {"gradient": problem.gradient, "solver": problem.solver, "region": region}
             return choice_log_likelihood(model, task, choices, problem.behavior, begun, **how)
 

@@ -37,17 +37,17 @@ def figure(roads: Roads, closed: Bool[np.ndarray, " links"], records: Sequence[M
     - `closed`: which links are.
     - `records`: those of `shanghai.score`; of each number of trips, the first one counts.
     """
-    firsts = list({record["trips"]: record for record in reversed(records)}.values())[::-1]
+    first_moves = list({record["trips"]: record for record in reversed(records)}.values())[::-1]
     picture = Figure(figsize=(10.4, 7.4), layout="constrained")
-    grid = picture.add_gridspec(len(firsts), 2, width_ratios=[5.6, 4.6])
+    grid = picture.add_gridspec(len(first_moves), 2, width_ratios=[5.6, 4.6])
     town = picture.add_subplot(grid[:, 0])
     label = "rank by P(closed) among unused links (1: most surely closed)"
-    picture.colorbar(draw_town(town, roads, closed, firsts[0]), ax=town, shrink=0.5, pad=0.01, label=label)
-    for row, record in enumerate(firsts):
+    picture.colorbar(draw_town(town, roads, closed, first_moves[0]), ax=town, shrink=0.5, pad=0.01, label=label)
+    for row, record in enumerate(first_moves):
         axes = picture.add_subplot(grid[row, 1])
         draw_precision(axes, closed, record)
-        axes.set_xlabel("recall of closed links" if record is firsts[-1] else "")
-        if record is firsts[0]:
+        axes.set_xlabel("recall of closed links" if record is first_moves[-1] else "")
+        if record is first_moves[0]:
             axes.legend(fontsize="small", frameon=False, loc="lower left", bbox_to_anchor=(0.0, 0.2))
     return picture
 

@@ -12,12 +12,12 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from sidestep.demonstrations import Demonstrations, Trajectory, gather
-from sidestep.domains.offices import connected_cells, office
-from sidestep.scoring import walkable_graph
+from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
+from sidestep.tabular.graph import walkable_graph
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid
-from sidestep.tasks import Task, reach
+from sidestep.tabular.tasks import Task, reach
+from sidestep.worlds.offices import connected_cells, office
 
 SURE, NOISE = 3.9, 0.3
 

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 import sidestep as ss
-from sidestep.domains.flats import three_rooms
+from sidestep.worlds.rooms import three_rooms
 
 jax.config.update("jax_enable_x64", True)
 

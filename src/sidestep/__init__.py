@@ -3,24 +3,24 @@
 The names here are the public ones; `docs/mathematics.md` explains what they compute.
 """
 
-from sidestep.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.errors import ImproperTask, InputError, NotConverged, SidestepError
-from sidestep.evaluation import Reward, evaluate, plan_paths
-from sidestep.inference.calibration import effective_share, scores
-from sidestep.inference.climb import Progress
+from sidestep.evaluation.evaluate import evaluate, plan_paths
+from sidestep.inference.calibration import effective_sample_ratio, scores
 from sidestep.inference.fit import Fit, fit
 from sidestep.inference.goals import GoalFit, fit_goals, goal_posterior
+from sidestep.inference.maximize import Progress
 from sidestep.inference.objective import tasks_mesh
-from sidestep.inference.optimisers import LBFGS, Ascent, Resilient
-from sidestep.inference.priors import Lines, Normal, Prior, Smooth, Stood, sensed
-from sidestep.io.demonstrations import demonstrations
+from sidestep.inference.optimizers import LBFGS, Adam, Rprop
+from sidestep.inference.priors import FreeCellEvidence, GaussianMRF, Normal, Prior, WallPrior, sensor_prior
+from sidestep.io.demonstrations import demonstrations_from_walks
 from sidestep.io.gymnasium import collect, from_gymnasium, slip_of, slippery
 from sidestep.io.maps import read_map, write_map
 from sidestep.io.minari.demonstrations import read_demonstrations, write_demonstrations
 from sidestep.io.sensors import read_sensor_map, read_sensor_variance
 from sidestep.io.walks import Walks, read_walks, write_walks
-from sidestep.simulation import simulate
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax, LogSumExp, Mellowmax
+from sidestep.tabular.behavior_model import BehaviorModel, behavior_model
+from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.graph import Graph, graph, grid_graph
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.likelihood import LogLikelihood, log_likelihood
@@ -37,22 +37,26 @@ from sidestep.tabular.models import (
     true_model,
     walled_grid,
 )
-from sidestep.tabular.people import People, people
 from sidestep.tabular.planning import Plan, RollOuts, plan, roll_out
+from sidestep.tabular.simulation import simulate
 from sidestep.tabular.solve import Solution, check_proper, solve
+from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
-from sidestep.tabular.solvers.ordered import Ordered
-from sidestep.tasks import Task, reach, stack_tasks, task
+from sidestep.tabular.tasks import Reward, Task, reach, stack_tasks, task
 
 __all__ = [
     "LBFGS",
-    "Ascent",
+    "Adam",
     "Behavior",
+    "BehaviorModel",
     "BoltzmannAverage",
     "Cell",
     "Demonstrations",
     "FeaturedGrid",
     "Fit",
+    "FreeCellEvidence",
+    "GaussSeidel",
+    "GaussianMRF",
     "GoalFit",
     "Graph",
     "Grid",
@@ -60,38 +64,35 @@ __all__ = [
     "ImproperTask",
     "InputError",
     "Jacobi",
-    "Lines",
     "LogLikelihood",
     "LogSumExp",
     "Mellowmax",
     "Normal",
     "NotConverged",
     "ObstacleGrid",
-    "Ordered",
-    "People",
     "Plan",
     "Prior",
     "Progress",
-    "Resilient",
     "Reward",
     "RollOuts",
+    "Rprop",
     "SidestepError",
     "SlipperyGrid",
-    "Smooth",
     "Solution",
-    "Stood",
     "TabularModel",
     "Task",
     "TiedModel",
     "Trajectory",
     "TransitionModel",
     "Walks",
+    "WallPrior",
+    "behavior_model",
     "borders",
     "check_proper",
     "closed",
     "collect",
-    "demonstrations",
-    "effective_share",
+    "demonstrations_from_walks",
+    "effective_sample_ratio",
     "evaluate",
     "fit",
     "fit_goals",
@@ -101,7 +102,6 @@ __all__ = [
     "graph",
     "grid_graph",
     "log_likelihood",
-    "people",
     "plan",
     "plan_paths",
     "reach",
@@ -113,7 +113,7 @@ __all__ = [
     "road_network",
     "roll_out",
     "scores",
-    "sensed",
+    "sensor_prior",
     "simulate",
     "slip_of",
     "slippery",

@@ -254,8 +254,8 @@ def test_the_town_is_laid_out_as_it_is(script, city):
     town, _ = city
     places = script("shanghai_picture").layout(town.roads)
     true = 100 * np.array(PLACES)
-    apart = [np.linalg.norm(each[:, None] - each, axis=-1) for each in (places, true)]
-    assert apart[0] == pytest.approx(apart[1], abs=1.0)
+    split_by_person = [np.linalg.norm(each[:, None] - each, axis=-1) for each in (places, true)]
+    assert split_by_person[0] == pytest.approx(split_by_person[1], abs=1.0)
     # no mirror image
     turn = np.linalg.lstsq(true - true.mean(axis=0), places - places.mean(axis=0), rcond=None)[0]
     assert np.linalg.det(turn) == pytest.approx(1.0, abs=0.05)

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from families import Drift, Gusts, LaplaceDrift, vector
 from scipy.optimize import minimize_scalar
 from scipy.stats import norm
 
+from helpers.families import Drift, Gusts, LaplaceDrift, vector
 from sidestep.continuous.demonstrations import gather
 from sidestep.continuous.dynamics import LinearGaussian
 from sidestep.continuous.fit import Schedule, fit
@@ -20,19 +20,19 @@ from sidestep.continuous.likelihood import FitProgress
 from sidestep.continuous.obstacles import ObstacleMotion, Walls
 from sidestep.continuous.planner import Planner
 from sidestep.continuous.policies import FinitePolicy, Scaled, finite_policy, gaussian_policy
-from sidestep.continuous.tasks import Regulate, reach, stack
-from sidestep.demonstrations import Trajectory
+from sidestep.continuous.tasks import QuadraticTask, reach, stack
 from sidestep.errors import InputError, NotConverged
 from sidestep.inference.checkpoints import Saver
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax, LogSumExp, Mellowmax
+from sidestep.tabular.demonstrations import Trajectory
 
 pytestmark = pytest.mark.usefixtures("unoptimised")
 
 # On a line people walk by −1, 0 or 1 and look two moves ahead, to stay near 0: R(s, a) = −s². Boltzmann-averaging
 # people then value Q(s, a) = −s² − γ E(s + a + θ + noise)², whatever they do next.
 WAYS, DISCOUNT, NOISE, TRUTH, MOVES = np.array([-1.0, 0.0, 1.0]), 0.9, 0.4, 0.6, 90
-NEAR = Regulate(jnp.zeros(1), jnp.eye(1), jnp.zeros((1, 1)), jnp.asarray(DISCOUNT))
+NEAR = QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.zeros((1, 1)), jnp.asarray(DISCOUNT))
 PEOPLE, PRIOR = Behavior(BoltzmannAverage(), 1.5), Normal(0.0, 100.0)
 POLICY = finite_policy(jax.random.key(1), vector(*WAYS)[:, None], jnp.linspace(-2, 2, 9)[:, None], width=4, depth=1)
 PLANNER = Planner(horizon=2, places=8, samples=2, learning_rate=0.03, critic_width=4)
@@ -110,7 +110,7 @@ def test_from_actions_alone_a_drift_is_learned():
 def test_from_vectors_that_people_chose_a_drift_is_learned():
     """People with R(s, a) = −s² − a² choose from a normal distribution, which Riccati's equation gives."""
     beta, discount, count = 4.0, 0.6, 300
-    task = Regulate(jnp.zeros(1), jnp.eye(1), jnp.eye(1), jnp.asarray(discount))
+    task = QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.eye(1), jnp.asarray(discount))
     curve = 1.0  # V(s) = −curve s² − 2 tilt s, whatever else
     for _ in range(100):
         curve = 1 + discount * curve / (1 + discount * curve)

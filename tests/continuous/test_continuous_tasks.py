@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.continuous.tasks import Hold, Reach, Regulate, check_tasks, reach, stack, table_tasks, task_at
+from sidestep.continuous.tasks import Hold, QuadraticTask, Reach, check_tasks, reach, stack, table_tasks, task_at
 from sidestep.errors import InputError
-from sidestep.tasks import stack_tasks, task
+from sidestep.tabular.tasks import stack_tasks, task
 
 
 def vector(*numbers):
@@ -18,7 +18,7 @@ def hold(goal, discount=0.9):
     return Hold(goal=jnp.asarray(goal, float), discount=jnp.asarray(discount))
 
 
-REGULATE = Regulate(vector(1, -1), jnp.asarray([[2.0, 0.5], [0.5, 1.0]]), jnp.asarray([[0.3]]), jnp.asarray(0.9))
+REGULATE = QuadraticTask(vector(1, -1), jnp.asarray([[2.0, 0.5], [0.5, 1.0]]), jnp.asarray([[0.3]]), jnp.asarray(0.9))
 TABLES = [
     task(np.array([[-1.0, -2.0], [-3.0, -4.0], [0.0, 0.0]]), 0.9, np.array([False, False, True])),
     task(np.array([5.0, 0.0, 0.0]), 0.8, np.array([True, False, False])),
@@ -32,7 +32,7 @@ TABLES = [
 def test_either_the_goal_pays_or_steps_cost(step_cost, pays, costs):
     goal = reach((1.0, 2.0), 0.5, discount=0.95, step_cost=step_cost)
     assert float(goal.reward(vector(0, 0), vector(1, 1))) == -costs
-    assert float(goal.final_reward(vector(1, 2))) == pays
+    assert float(goal.terminal_reward(vector(1, 2))) == pays
     assert float(goal.discount) == 0.95
 
 
@@ -61,7 +61,7 @@ def test_away_from_the_goal_costs_are_quadratic():
 @pytest.mark.parametrize("endless", [REGULATE, hold(0.0)])
 def test_some_tasks_never_end(endless):
     assert not bool(endless.terminal(vector(1, -1)))
-    assert float(endless.final_reward(vector(1, -1))) == 0
+    assert float(endless.terminal_reward(vector(1, -1))) == 0
     assert endless.smooth
     assert not Reach.smooth
 
@@ -93,7 +93,7 @@ def test_tables_say_the_same_as_functions():
         for state in range(3):
             found = [float(one.reward(jnp.asarray(state), jnp.asarray(action))) for action in range(2)]
             np.testing.assert_array_equal(found, np.broadcast_to(table.reward, (3, 2))[state])
-            assert float(one.final_reward(jnp.asarray(state))) == np.broadcast_to(table.final_reward, 3)[state]
+            assert float(one.terminal_reward(jnp.asarray(state))) == np.broadcast_to(table.terminal_reward, 3)[state]
             assert bool(one.terminal(jnp.asarray(state))) == bool(table.terminal[state])
             features = np.zeros(6)
             features[3 * index + state] = 1

@@ -9,7 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from families import (
+from jax.flatten_util import ravel_pytree
+from scipy import stats
+
+from helpers.families import (
     EVERY,
     GAUSSIAN,
     HIGH,
@@ -25,9 +28,6 @@ from families import (
     radial,
     vector,
 )
-from jax.flatten_util import ravel_pytree
-from scipy import stats
-
 from sidestep.continuous.dynamics import LinearGaussian
 from sidestep.continuous.obstacles import ObstacleMotion, RadialField, Walls, network_field, radial_field
 from sidestep.continuous.physical import Pendulum, PointMass

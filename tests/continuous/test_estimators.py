@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from small_worlds import (
+
+from helpers.small_worlds import (
     ACTIONS,
     GAIN,
     OFFSET,
@@ -26,8 +27,7 @@ from small_worlds import (
     table,
     with_logits,
 )
-
-from sidestep.continuous.critics import Critic
+from sidestep.continuous.critic import Critic
 from sidestep.continuous.dynamics import LinearGaussian
 from sidestep.continuous.estimators import check_estimator, surprised, value_gradient
 from sidestep.continuous.policies import FinitePolicy, Scaled

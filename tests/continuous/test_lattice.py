@@ -175,7 +175,7 @@ def test_action_values_between_points():
 def test_tasks_on_points():
     table = tabular_task(reach((0.0,), 0.5, discount=0.9), LINE, BOTH_WAYS)
     np.testing.assert_array_equal(table.terminal, np.arange(10) == 0)
-    np.testing.assert_array_equal(table.final_reward, np.ones(10))
+    np.testing.assert_array_equal(table.terminal_reward, np.ones(10))
     np.testing.assert_array_equal(table.reward, np.zeros((10, 2)))
 
 

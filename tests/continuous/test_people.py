@@ -13,9 +13,9 @@ from sidestep.continuous.obstacles import ObstacleMotion, Walls
 from sidestep.continuous.physical import Pendulum
 from sidestep.continuous.simulation import simulate
 from sidestep.continuous.tasks import Hold, reach, stack
-from sidestep.demonstrations import Trajectory
 from sidestep.errors import ImproperTask, InputError, NotConverged
 from sidestep.tabular.backups import Behavior, LogSumExp
+from sidestep.tabular.demonstrations import Trajectory
 from sidestep.tabular.solve import solve
 from sidestep.tabular.solvers.jacobi import Jacobi
 
@@ -34,9 +34,9 @@ STARTS = [RANDOM.uniform([0.2, 0.2], [1.8, 3.0], (COUNT, 2)), RANDOM.uniform([4.
 SHARP, SOFT = Behavior(LogSumExp(), 40.0), Behavior(LogSumExp(), 2.0)
 
 
-def people(believed, behavior, tasks=1, starts=STARTS):
+def people(mark_visited_free, behavior, tasks=1, starts=STARTS):
     """Walks to the first goals. Always as many and as long, so that this is compiled but once."""
-    return simulate(KEY, ROOM, believed, GOALS[:tasks], starts[:tasks], WAYS, behavior, SQUARES, 30)
+    return simulate(KEY, ROOM, mark_visited_free, GOALS[:tasks], starts[:tasks], WAYS, behavior, SQUARES, 30)
 
 
 def aims(walks):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sidestep.continuous.critics import critic
+from sidestep.continuous.critic import critic
 from sidestep.continuous.policies import FinitePolicy, finite_policy, gaussian_policy, table_policy
 from sidestep.errors import InputError
 

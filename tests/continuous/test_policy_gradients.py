@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 from scipy.linalg import solve_discrete_are
-from small_worlds import (
+
+from helpers.small_worlds import (
     ACTIONS,
     PLACES,
     STATES,
@@ -23,7 +24,6 @@ from small_worlds import (
     table,
     with_logits,
 )
-
 from sidestep.continuous.planner import Planner, Planning, PlanProgress, check_planner, dealt
 from sidestep.continuous.planning import Plan, plan
 from sidestep.continuous.policies import gaussian_policy, table_policy

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_worlds import ACTIONS, ENDS, PLACES, WHICH, entropies, exact_values, policy_table, table
 
+from helpers.small_worlds import ACTIONS, ENDS, PLACES, WHICH, entropies, exact_values, policy_table, table
 from sidestep.continuous.rollouts import RollOut, returns, roll_out, roll_outs, said, to_come
 from sidestep.continuous.tasks import task_at
 from sidestep.tabular.backups import Behavior, LogSumExp
@@ -76,7 +76,7 @@ def test_every_action_pays_until_the_end_pays_once(rolled):
         ends.add(end)
         leaving, acting = each.states[:-1], np.arange(HORIZON) < end
         paid = np.append(np.where(acting, tasks.reward[own, leaving, each.choices], 0), 0)
-        paid[end : end + 1] = tasks.final_reward[own, 0]
+        paid[end : end + 1] = tasks.terminal_reward[own, 0]
         np.testing.assert_array_equal(each.acting, acting)
         np.testing.assert_array_equal(each.rewards, paid)
         # the log-sum-exp counts every choice's own surprise, whose mean is the entropy

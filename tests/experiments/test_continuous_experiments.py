@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from sidestep.cli import main
+from sidestep.cli.app import main
 from sidestep.continuous.fit import Schedule
 from sidestep.continuous.planner import Planner
-from sidestep.demonstrations import Trajectory
-from sidestep.domains.rooms import without
 from sidestep.experiments import pendulum, room
+from sidestep.tabular.demonstrations import Trajectory
+from sidestep.worlds.continuous_room import without
 
 pytestmark = pytest.mark.usefixtures("unoptimised")
 PLANNER = Planner(horizon=3, places=4, samples=2, critic_width=4)

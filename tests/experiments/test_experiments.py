@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sidestep.domains.grids import WORLDS, block
 from sidestep.experiments import demo, reproduce
 from sidestep.experiments.reproduce import VARIANTS
-from sidestep.inference.optimisers import LBFGS, Ascent
-from sidestep.runs import read_learned_map
-from sidestep.scoring import walkable_graph
+from sidestep.inference.optimizers import LBFGS, Adam
+from sidestep.maps.learned_map import read_learned_map
+from sidestep.tabular.graph import walkable_graph
+from sidestep.worlds.grids import WORLDS, block
 
 SCORES = {
     "auc", "average_precision", "auc_relevant", "mean_obstacle", "mean_free", "max_probability", "legal_share",
@@ -38,8 +38,8 @@ def test_the_four_ways_of_learning():
         "actions_only": (("actions",), "fixed_policy"),
         "transitions_only": (("transitions",), "exact"),
     }
-    kinds = {"fixed_policy": Ascent, "exact": LBFGS}
-    assert all(isinstance(variant.optimiser, kinds[variant.gradient]) for variant in VARIANTS.values())
+    kinds = {"fixed_policy": Adam, "exact": LBFGS}
+    assert all(isinstance(variant.optimizer, kinds[variant.gradient]) for variant in VARIANTS.values())
 
 
 def test_the_experiments_write_figures_and_numbers(reproduced):

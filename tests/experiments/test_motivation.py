@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from sidestep.cli import main
+from sidestep.baselines.interface import ModelResult, reward_of
+from sidestep.baselines.maxent_irl import CostlyReward
+from sidestep.cli.app import main
 from sidestep.experiments import motivation
 from sidestep.experiments.motivation import COLUMNS, FORMS, Form, at_stakes, tried, true_world
-from sidestep.rivals.costs import CostlyReward
-from sidestep.rivals.learned import Learned, reward_of
-from sidestep.robots import robot
+from sidestep.robots.robot import risk_averse_robot
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
 
@@ -20,11 +20,11 @@ GOAL = 8 * COLUMNS + 12
 """The lower right corner, beyond the wall and below the mud."""
 
 
-def with_costs(form: Form, cost: float) -> Learned:
+def with_state_costs(form: Form, cost: float) -> ModelResult:
     """Who takes nothing to be in the way, and every cell to cost the same."""
     reward = CostlyReward(form.settings.discount, form.settings.step_cost, np.full(BLANK.size, cost))
     free = ObstacleGrid(BLANK.passable())
-    return Learned(free, reward, form.settings.behavior(), np.zeros(BLANK.shape), robot(free, []), True)
+    return ModelResult(free, reward, form.settings.behavior(), np.zeros(BLANK.shape), risk_averse_robot(free, []), True)
 
 
 def steps_to_the_goal(starts):
@@ -33,18 +33,18 @@ def steps_to_the_goal(starts):
 
 
 def test_stakes_multiply_what_the_task_pays_and_not_what_cells_cost():
-    task = at_stakes(with_costs(FORMS["steps"], 0.25), FORMS["steps"], GOAL, 3.0)
+    task = at_stakes(with_state_costs(FORMS["steps"], 0.25), FORMS["steps"], GOAL, 3.0)
     np.testing.assert_allclose(task.reward, -3.25)
-    np.testing.assert_allclose(np.broadcast_to(task.final_reward, BLANK.size)[GOAL], 3 * 40)
-    task = at_stakes(with_costs(FORMS["goal"], 0.25), FORMS["goal"], GOAL, 3.0)
+    np.testing.assert_allclose(np.broadcast_to(task.terminal_reward, BLANK.size)[GOAL], 3 * 40)
+    task = at_stakes(with_state_costs(FORMS["goal"], 0.25), FORMS["goal"], GOAL, 3.0)
     np.testing.assert_allclose(task.reward, -0.25)
-    np.testing.assert_allclose(np.broadcast_to(task.final_reward, BLANK.size)[GOAL], 3)
+    np.testing.assert_allclose(np.broadcast_to(task.terminal_reward, BLANK.size)[GOAL], 3)
 
 
 @pytest.mark.parametrize("stakes", [0.1, 1.0])
 def test_a_robot_stays_put_where_its_way_costs_more_than_the_goal_pays(stakes):
     """With a cost c of every cell a way of d moves is worth kγ^d − c(1 − γ^d)/(1 − γ)."""
-    trial = tried(with_costs(FORMS["goal"], 0.05), FORMS["goal"], GOAL, stakes)
+    trial = tried(with_state_costs(FORMS["goal"], 0.05), FORMS["goal"], GOAL, stakes)
     decay = 0.95 ** steps_to_the_goal(trial.starts)
     away = stakes * decay <= 0.05 * (1 - decay) / 0.05
     assert 0 < away.sum() < len(away)
@@ -52,7 +52,7 @@ def test_a_robot_stays_put_where_its_way_costs_more_than_the_goal_pays(stakes):
 
 
 def test_a_robot_that_fears_nothing_walks_into_the_wall():
-    trial = tried(with_costs(FORMS["steps"], 0.0), FORMS["steps"], 2 * COLUMNS + 12, 1.0)
+    trial = tried(with_state_costs(FORMS["steps"], 0.0), FORMS["steps"], 2 * COLUMNS + 12, 1.0)
     wall, column = COLUMNS // 2, trial.starts % COLUMNS
     assert (trial.outcomes[column < wall] == "bumps").all()
     assert (trial.outcomes[column > wall] == "arrives").all()
@@ -60,8 +60,13 @@ def test_a_robot_that_fears_nothing_walks_into_the_wall():
 
 def test_mud_takes_five_times_as_long_and_who_knows_it_goes_the_best_way():
     form, world = FORMS["steps"], true_world()
-    known = Learned(
-        world, reward_of(form.settings), form.settings.behavior(), np.asarray(world.blocked), robot(world, []), True
+    known = ModelResult(
+        world,
+        reward_of(form.settings),
+        form.settings.behavior(),
+        np.asarray(world.blocked),
+        risk_averse_robot(world, []),
+        True,
     )
     in_mud = 3 * COLUMNS + 9
     trial = tried(known, form, in_mud, 10.0)

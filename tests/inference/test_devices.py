@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from spread import GOALS, WAYS, measured
 
-PROGRAM = Path(__file__).with_name("spread.py")
+from helpers.spread import GOALS, WAYS, measured
+
+PROGRAM = Path(__file__).parents[1] / "helpers" / "spread.py"
 LIMIT = 240
 """After how many seconds children that have not ended are given up; on idle cores they take a tenth of that."""
 SPREAD = {"4 devices": (1, 4), "2 processes with 2 devices each": (2, 2)}

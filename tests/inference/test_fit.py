@@ -8,25 +8,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from walled import BLANK, GOALS, PATHS, REPEATS, WALL, follow, objective, walks
 
-from sidestep.demonstrations import Trajectory, gather
+from helpers.walled import BLANK, GOALS, PATHS, REPEATS, WALL, follow, objective, walks
 from sidestep.errors import ImproperTask, InputError, NotConverged
 from sidestep.inference.fit import Fit, fit
-from sidestep.inference.optimisers import LBFGS, Ascent
+from sidestep.inference.optimizers import LBFGS, Adam
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax, LogSumExp, Mellowmax
+from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import ObstacleGrid, TabularModel
 from sidestep.tabular.solve import solve
 from sidestep.tabular.solvers.jacobi import Jacobi
-from sidestep.tasks import reach
+from sidestep.tabular.tasks import reach
 
 PAYING, COSTLY = (0.95, None), (1.0, 1.0)
 """Rewards: discount and step cost."""
-ASCENT = Ascent(iterations=500)
+ASCENT = Adam(iterations=500)
 
 # name: (reward, backup, β, settings of the likelihood, settings of the fit)
 CASES = {
@@ -163,7 +163,7 @@ def test_one_cell_and_its_transitions_alone_are_a_bernoulli_trial(failures, prio
         Behavior(BoltzmannAverage()),
         prior=prior,
         terms=("transitions",),
-        optimiser=LBFGS(tolerance=1e-10),
+        optimizer=LBFGS(tolerance=1e-10),
     )
     mean, variance = np.broadcast_to(prior.mean, 3), np.broadcast_to(prior.variance, 3)
 
@@ -244,7 +244,7 @@ def test_solves_that_stop_early_are_never_used():
     enough = int(eqx.filter_jit(solve)(MODEL, demonstrations.tasks, people).sweeps.max())
     with pytest.raises(NotConverged, match="stopped converging at iteration"):
         # steps so long that starting from the last values does not help
-        fit(MODEL, demonstrations, people, solver=Jacobi(max_sweeps=enough), optimiser=Ascent(learning_rate=3.0))
+        fit(MODEL, demonstrations, people, solver=Jacobi(max_sweeps=enough), optimizer=Adam(learning_rate=3.0))
 
 
 def test_lbfgs_never_ends_where_solves_stop_early():

@@ -4,17 +4,17 @@ import jax
 import numpy as np
 import pytest
 
-from sidestep.demonstrations import Trajectory, gather
 from sidestep.errors import InputError
 from sidestep.inference.fit import fit
 from sidestep.inference.goals import fit_goals, goal_posterior, weighted
-from sidestep.simulation import simulate
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
+from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import ObstacleGrid, true_model
 from sidestep.tabular.planning import plan
-from sidestep.tasks import reach
+from sidestep.tabular.simulation import simulate
+from sidestep.tabular.tasks import reach
 
 PEOPLE = Behavior(BoltzmannAverage(), 30.0)
 WALL = np.zeros((6, 7), dtype=int)

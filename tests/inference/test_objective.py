@@ -4,26 +4,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from spread import BENT, GOALS, at, demonstrations
-from walled import BLANK
 
-from sidestep.demonstrations import Trajectory, gather
-from sidestep.inference import batches
-from sidestep.inference.batches import planned
+from helpers.spread import BENT, GOALS, at, demonstrations
+from helpers.walled import BLANK
+from sidestep.inference import batching
+from sidestep.inference.batching import planned
 from sidestep.inference.objective import MEMORY, Objective, Problem, _of_actions
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
+from sidestep.tabular.behavior_model import behavior_model
+from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.graph import grid_graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import ALL_TERMS, log_likelihood
 from sidestep.tabular.models import ObstacleGrid, TabularModel
-from sidestep.tabular.people import people
-from sidestep.tabular.solvers.host import cores
+from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
-from sidestep.tabular.solvers.ordered import Ordered
-from sidestep.tasks import reach
+from sidestep.tabular.solvers.native import cores
+from sidestep.tabular.tasks import reach
 
-SOLVERS = {"jacobi": Jacobi(), "ordered": Ordered()}
+SOLVERS = {"jacobi": Jacobi(), "ordered": GaussSeidel()}
 PEOPLE = Behavior(BoltzmannAverage(), 10.0)
 MODEL = ObstacleGrid(BLANK, -2.0)
 PRIOR = Normal(-1.0, 3.0)
@@ -34,7 +34,7 @@ ONE_TASK = STATES * 4 * 2 * 8.0
 
 
 def problem_of(solver=SOLVERS["jacobi"], terms=ALL_TERMS, shown=None, model=MODEL):
-    return Problem(model, people(PEOPLE), shown or demonstrations(), PRIOR, terms, None, "exact", solver)
+    return Problem(model, behavior_model(PEOPLE), shown or demonstrations(), PRIOR, terms, None, "exact", solver)
 
 
 def directly(problem, parameters):
@@ -122,8 +122,8 @@ def test_where_solves_start_makes_no_difference(name):
 @pytest.fixture
 def a_task_a_batch(monkeypatch):
     """An objective with a batch for each of its five tasks, whose parts are taken over, and one with all in one."""
-    monkeypatch.setattr(batches, "LARGE", 1)
-    monkeypatch.setattr(batches, "cores", lambda: 1)
+    monkeypatch.setattr(batching, "LARGE", 1)
+    monkeypatch.setattr(batching, "cores", lambda: 1)
     problem = problem_of(SOLVERS["ordered"])
     objective, whole = Objective(problem, MEMORY, takes_over=True), Objective(problem, MEMORY)
     assert (len(objective.batches), objective.planned.takes_over, len(whole.batches)) == (5, True, 1)
@@ -224,7 +224,7 @@ def test_values_that_fail_are_not_solved_again(a_task_a_batch, evaluated):
     """They would do no better. And where nothing is known of a part, all states are solved."""
     objective, _ = a_task_a_batch
     found, starts = objective.evaluate(at(POINT), objective.cold_starts())
-    hasty = Objective(problem_of(Ordered(max_sweeps=1)), MEMORY, takes_over=True)
+    hasty = Objective(problem_of(GaussSeidel(max_sweeps=1)), MEMORY, takes_over=True)
     evaluated.clear()
     again, _ = hasty.evaluate(at(POINT + BENT), starts, known=found.parts, little=np.inf)
     assert np.isnan(again.objective)
@@ -237,12 +237,12 @@ def test_values_that_fail_are_not_solved_again(a_task_a_batch, evaluated):
 def test_long_solves_to_take_over_come_in_batches_of_no_more_tasks_than_cores():
     large, small = (ObstacleGrid(Grid.unknown(100, columns), 0.0) for columns in (100, 99))
     tasks = 2 * cores()
-    assert planned(large, Ordered(), tasks, MEMORY, 1, takes_over=True) == (cores(), True, True)
+    assert planned(large, GaussSeidel(), tasks, MEMORY, 1, takes_over=True) == (cores(), True, True)
     for model, solver, devices, asked in (
-        (small, Ordered(), 1, True),
+        (small, GaussSeidel(), 1, True),
         (large, Jacobi(), 1, True),
-        (large, Ordered(), 2, True),
-        (large, Ordered(), 1, False),
+        (large, GaussSeidel(), 2, True),
+        (large, GaussSeidel(), 1, False),
     ):
         assert planned(model, solver, tasks, MEMORY, devices, takes_over=asked) == (tasks, True, False)
 
@@ -251,7 +251,9 @@ def test_where_memory_is_short_parts_go_before_starts():
     """In a table, where every outcome has a parameter, they are larger than starts."""
     graph = grid_graph(Grid.unknown(100, 100))
     model = TabularModel(graph, jnp.zeros(graph.successors.shape))
-    kept = [planned(model, Ordered(), 100, memory, 1, takes_over=True)[1:] for memory in (2.0**32, 2.0**27, 2.0**22)]
+    kept = [
+        planned(model, GaussSeidel(), 100, memory, 1, takes_over=True)[1:] for memory in (2.0**32, 2.0**27, 2.0**22)
+    ]
     assert kept == [(True, True), (True, False), (False, False)]
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sidestep.errors import InputError
-from sidestep.inference.priors import NEAREST, Lines, Normal, Smooth, Stood, sensed
+from sidestep.inference.priors import NEAREST, FreeCellEvidence, GaussianMRF, Normal, WallPrior, sensor_prior
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import borders
 
@@ -45,7 +45,7 @@ EACH = Normal(0.5, 8.0)
 def test_smooth_parameters_are_like_their_neighbours():
     """A square of four cells, whose pairs are its sides: (1, 2), (0, 4), (1, 0) and (2, 4)."""
     theta = jnp.asarray([1.0, 2.0, 0.0, 4.0])
-    prior = Smooth(EACH, borders(Grid.unknown(2, 2)), 0.3)
+    prior = GaussianMRF(EACH, borders(Grid.unknown(2, 2)), 0.3)
     differences = 1 + 16 + 1 + 4
     assert float(prior.log_density(theta)) == pytest.approx(float(EACH.log_density(theta)) - 0.3 * differences)
 
@@ -66,14 +66,14 @@ def test_walls_are_lines(drawing, expected):
     signs = np.array([list(row) for row in drawing.split()])
     theta = jnp.asarray(np.where(signs == "#", 30.0, -30.0).ravel())
     for known in (np.full((3, 3), -1), np.where(signs == "#", 1, -1), np.where(signs == "#", 1, 0)):
-        lines = Lines(EACH, known, 2.0).log_density(theta) - EACH.log_density(theta)
+        lines = WallPrior(EACH, known, 2.0).log_density(theta) - EACH.log_density(theta)
         assert float(lines) == pytest.approx(2 * expected, abs=1e-6)
 
 
 def test_a_gap_in_a_wall_is_more_probably_wall():
     known = np.array([[0, 1, 0], [0, -1, 0], [0, 1, 0]])
     theta = jnp.full(9, 0.5)
-    slope = jax.grad(Lines(EACH, known, 3.0).log_density)(theta).reshape(3, 3)
+    slope = jax.grad(WallPrior(EACH, known, 3.0).log_density)(theta).reshape(3, 3)
     chance = 1 / (1 + np.exp(-0.5))
     np.testing.assert_allclose(slope[1, 1], 3 * chance * (1 - chance), rtol=1e-9)
     assert (np.delete(np.asarray(slope).ravel(), 4) == 0).all()
@@ -81,7 +81,7 @@ def test_a_gap_in_a_wall_is_more_probably_wall():
 
 def test_who_stands_somewhere_counts_as_much_as_a_move_into_the_cell():
     theta = jnp.asarray([3.0, 0.5, 7.0, -1.0])
-    prior = Stood(EACH, jnp.asarray([0.0, 2.0, 0.0, 0.5]))
+    prior = FreeCellEvidence(EACH, jnp.asarray([0.0, 2.0, 0.0, 0.5]))
     free = 1 / (1 + np.exp(np.asarray(theta)))
     expected = 2 * np.log(free[1]) + 0.5 * np.log(free[3])
     assert float(prior.log_density(theta) - EACH.log_density(theta)) == pytest.approx(expected, rel=1e-12)
@@ -90,26 +90,26 @@ def test_who_stands_somewhere_counts_as_much_as_a_move_into_the_cell():
 @pytest.mark.parametrize("strength", [-1.0, np.nan, np.inf])
 def test_strengths_that_are_none_are_refused(strength):
     with pytest.raises(InputError, match="strength"):
-        Smooth(EACH, borders(Grid.unknown(2, 2)), strength)
+        GaussianMRF(EACH, borders(Grid.unknown(2, 2)), strength)
     with pytest.raises(InputError, match="strength"):
-        Lines(EACH, np.full((2, 2), -1), strength)
+        WallPrior(EACH, np.full((2, 2), -1), strength)
 
 
 NAN, INF = np.nan, np.inf
 
 
 def test_what_a_sensor_saw_is_the_mean_and_the_rest_stays_as_it_was():
-    prior = sensed(np.array([[0.5, 0.9], [NAN, 0.2]]), np.array([[2.0, 0.5], [1.0, INF]]), Normal(-1.0, 7.0))
+    prior = sensor_prior(np.array([[0.5, 0.9], [NAN, 0.2]]), np.array([[2.0, 0.5], [1.0, INF]]), Normal(-1.0, 7.0))
     np.testing.assert_allclose(prior.mean, [0, np.log(9), -1, -1], atol=1e-12)
     np.testing.assert_allclose(prior.variance, [2, 0.5, 7, 7])
-    each = sensed(np.array([[NAN, 0.5]]), 3.0, Normal(jnp.array([4.0, 5.0]), jnp.array([6.0, 7.0])))
+    each = sensor_prior(np.array([[NAN, 0.5]]), 3.0, Normal(jnp.array([4.0, 5.0]), jnp.array([6.0, 7.0])))
     np.testing.assert_allclose([each.mean, each.variance], [[4, 0], [6, 3]], atol=1e-12)
-    nothing = sensed(np.array([[0.5, 0.9]]), np.array([[NAN, NAN]]), Normal(-1.0, 7.0))
+    nothing = sensor_prior(np.array([[0.5, 0.9]]), np.array([[NAN, NAN]]), Normal(-1.0, 7.0))
     np.testing.assert_allclose([nothing.mean, nothing.variance], [[-1, -1], [7, 7]])
 
 
 def test_no_sensor_is_so_sure_that_nobody_could_change_its_mind():
-    prior = sensed(np.array([[0.0, 1.0]]), 1.0, Normal())
+    prior = sensor_prior(np.array([[0.0, 1.0]]), 1.0, Normal())
     np.testing.assert_allclose(jax.nn.sigmoid(prior.mean), [NEAREST, 1 - NEAREST], rtol=1e-9)
 
 
@@ -125,4 +125,4 @@ def test_no_sensor_is_so_sure_that_nobody_could_change_its_mind():
 )
 def test_sensors_that_cannot_be(probability, variance, match):
     with pytest.raises(InputError, match=match):
-        sensed(np.array([[0.5, probability]]), np.array([[1.0, variance]]), Normal())
+        sensor_prior(np.array([[0.5, probability]]), np.array([[1.0, variance]]), Normal())

@@ -4,26 +4,26 @@ from functools import partial
 
 import numpy as np
 import pytest
-from walled import BLANK, walks
 
+from helpers.walled import BLANK, walks
 from sidestep.errors import InputError
-from sidestep.inference import batches
+from sidestep.inference import batching
 from sidestep.inference.checkpoints import Saver
 from sidestep.inference.fit import fit
-from sidestep.inference.optimisers import LBFGS, Ascent, Resilient
+from sidestep.inference.optimizers import LBFGS, Adam, Rprop
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.models import ObstacleGrid
-from sidestep.tabular.solvers.ordered import Ordered
+from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 
-OPTIMISERS = {"L-BFGS": LBFGS(), "ascent": Ascent(iterations=40), "resilient": Resilient(tolerance=1e-4)}
+OPTIMISERS = {"L-BFGS": LBFGS(), "ascent": Adam(iterations=40), "resilient": Rprop(tolerance=1e-4)}
 PEOPLE = Behavior(BoltzmannAverage(), 10.0)
 DEMONSTRATIONS = walks()
 
 
 def fit_with(name, report=None, **settings):
     model = ObstacleGrid(BLANK, -2.0)
-    return fit(model, DEMONSTRATIONS, PEOPLE, optimiser=OPTIMISERS[name], report=report, **settings)
+    return fit(model, DEMONSTRATIONS, PEOPLE, optimizer=OPTIMISERS[name], report=report, **settings)
 
 
 @pytest.fixture(autouse=True)
@@ -41,15 +41,15 @@ def interrupted_at(iteration):
 
 def a_batch_for_each_task(monkeypatch):
     """As on large maps, where trials take over what other batches added."""
-    monkeypatch.setattr(batches, "LARGE", 1)
-    monkeypatch.setattr(batches, "cores", lambda: 1)
+    monkeypatch.setattr(batching, "LARGE", 1)
+    monkeypatch.setattr(batching, "cores", lambda: 1)
 
 
 @pytest.mark.parametrize(("name", "large"), [*((name, False) for name in OPTIMISERS), ("resilient", True)])
 def test_resumed_to_the_last_bit(tmp_path, monkeypatch, name, large):
     if large:
         a_batch_for_each_task(monkeypatch)
-    fitted = partial(fit_with, name, solver=Ordered() if large else None)
+    fitted = partial(fit_with, name, solver=GaussSeidel() if large else None)
     expected = fitted()
     checkpoint = tmp_path / "fit.checkpoint"
     for iteration in (3, 3, 9):

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
+from sidestep._files import read_whole, write_array, write_json, write_whole, write_whole_folder
 from sidestep.errors import InputError
-from sidestep.io.files import read_whole, write_array, write_json, write_whole, write_whole_folder
 
 
 def test_a_file_is_written_into_a_new_folder(tmp_path):

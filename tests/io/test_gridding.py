@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
-from drawn import NAN, SIZE, grid_of, walk_along
 
+from helpers.drawn import NAN, SIZE, grid_of, walk_along
 from sidestep.errors import InputError
 from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map

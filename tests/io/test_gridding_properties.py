@@ -3,10 +3,10 @@
 from itertools import pairwise
 
 import numpy as np
-from drawn import SIZE, walk_along
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from helpers.drawn import SIZE, walk_along
 from sidestep.errors import InputError
 from sidestep.io.gridding import grid_walks
 from sidestep.tabular.grid import Cell, Grid
@@ -77,9 +77,11 @@ def test_positions_on_borders_and_corners_keep_the_rules(line, obstacles, connec
 @given(st.lists(lines(anywhere | centre), min_size=2, max_size=3), connectivities)
 def test_walks_do_not_influence_each_other(many, connectivity):
     together = grid_walks(walk_along(*many), Grid.unknown(SIZE, SIZE, connectivity=connectivity))
-    apart = [moves_along(line, connectivity) for line in many]
+    split_by_person = [moves_along(line, connectivity) for line in many]
     for field in ("states", "actions", "next_states", "goals"):
-        np.testing.assert_array_equal(getattr(together, field), np.concatenate([getattr(one, field) for one in apart]))
+        np.testing.assert_array_equal(
+            getattr(together, field), np.concatenate([getattr(one, field) for one in split_by_person])
+        )
 
 
 @given(lines(anywhere | centre), connectivities)

@@ -4,12 +4,12 @@ import gymnasium
 import numpy as np
 import pytest
 
-from sidestep.demonstrations import gather
 from sidestep.errors import InputError
 from sidestep.inference.fit import fit
 from sidestep.inference.priors import Normal
 from sidestep.io.gymnasium import collect, from_gymnasium, slip_of, slippery
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
+from sidestep.tabular.demonstrations import gather
 from sidestep.tabular.planning import plan
 
 DISCOUNT = 0.97
@@ -58,7 +58,7 @@ def test_an_end_is_paid_beyond_what_an_action_costs():
     }
     task = from_gymnasium(Table(table), 0.5).task
     np.testing.assert_allclose(task.reward[0], [-1.0, -2.5])
-    np.testing.assert_allclose(task.final_reward[1], 5.0 / 0.5)
+    np.testing.assert_allclose(task.terminal_reward[1], 5.0 / 0.5)
     assert task.terminal.tolist() == [False, True]
     table[0][1] = [(0.5, 0, -1.0, False), (0.5, 1, 6.0, True)]
     with pytest.raises(InputError, match=r"state 1 pays 7 beyond one action and 5 beyond another"):

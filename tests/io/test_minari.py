@@ -18,19 +18,19 @@ from gymnasium.spaces import Box, Discrete
 from hypothesis import given
 from hypothesis import strategies as st
 from minari.namespace import list_local_namespaces
-from stored import buffer, fresh, store
 
-from sidestep.demonstrations import Trajectory, gather
+from helpers.stored import buffer, fresh, store
 from sidestep.errors import InputError
 from sidestep.inference.fit import fit
 from sidestep.inference.priors import Normal
 from sidestep.io.gymnasium import collect, from_gymnasium, slippery
 from sidestep.io.minari.demonstrations import read_demonstrations, write_demonstrations
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
+from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.planning import plan
-from sidestep.tasks import Task, reach, stack_tasks
+from sidestep.tabular.tasks import Task, reach, stack_tasks
 
 pytestmark = pytest.mark.usefixtures("datasets", "unoptimised")
 
@@ -85,7 +85,7 @@ def test_returns_are_what_tasks_pay(size):
     for episode, path in zip(minari.load_dataset(dataset), demonstrations.paths(), strict=True):
         own = np.flatnonzero(trajectory == episode.id)
         task = int(demonstrations.task[own[0]])
-        discount, reward, final = float(tasks.discount[task]), tasks.reward[task], tasks.final_reward[task]
+        discount, reward, final = float(tasks.discount[task]), tasks.reward[task], tasks.terminal_reward[task]
         expected = 0.0
         for t, (state, action) in enumerate(zip(path, np.asarray(demonstrations.actions)[own], strict=False)):
             expected += discount**t * reward[min(state, len(reward) - 1), min(action, reward.shape[1] - 1)]
@@ -370,7 +370,7 @@ def set_in_task(**values):
         (set_in_task(reward=[[0.0, 1.0]]), r", task 1, field 'reward': .*\(6, 4\), found shape \(1, 2\)"),
         (set_in_task(reward=[[float("nan")]]), ", task 1, field 'reward': expected finite numbers"),
         (set_in_task(reward=[[0], [0, 1]]), ", task 1, field 'reward': expected a table of numbers"),
-        (set_in_task(final_reward=[[1.0]]), r", task 1, field 'final_reward': .*\(6,\), found shape \(1, 1\)"),
+        (set_in_task(terminal_reward=[[1.0]]), r", task 1, field 'final_reward': .*\(6,\), found shape \(1, 1\)"),
     ],
 )
 def test_tasks_that_were_spoiled_are_refused(datasets, edit, message):
@@ -395,7 +395,7 @@ def test_a_dataset_that_is_there_stays_as_it_is():
     with pytest.raises(InputError, match=f"{dataset}: is there already: expected a name that is free"):
         write_demonstrations(dataset, towards(5), GRID)
     found = read_demonstrations(dataset, GRID)
-    assert found.visited()[:, 1].tolist() == [2, 2, 2]
+    assert found.visited_state_goals()[:, 1].tolist() == [2, 2, 2]
 
 
 def test_demonstrations_of_another_world_are_refused():

@@ -8,11 +8,11 @@ import minari
 import numpy as np
 import pyarrow as pa
 import pytest
-from drawn import walk_along, walk_tables
 from gymnasium.spaces import Box, Dict, Discrete
 from hypothesis import given
-from stored import buffer, fresh, store
 
+from helpers.drawn import walk_along, walk_tables
+from helpers.stored import buffer, fresh, store
 from sidestep.errors import InputError
 from sidestep.io.walks import read_walks, walks_of_table, write_walks
 

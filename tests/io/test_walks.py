@@ -4,10 +4,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
-from drawn import walk_tables
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers.drawn import walk_tables
 from sidestep.errors import InputError
 from sidestep.io.walks import read_walks, walks_of_table, write_walks
 

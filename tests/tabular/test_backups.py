@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from problems import BACKUPS
 
+from helpers.problems import BACKUPS
 from sidestep.errors import InputError
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax
 

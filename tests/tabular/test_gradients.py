@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from problems import (
+
+from helpers.problems import (
     BACKUPS,
     DISCOUNTS,
     FAMILIES,
@@ -23,14 +24,13 @@ from problems import (
     plain_values,
     relative_error,
 )
-
-from sidestep.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.backups import Behavior
+from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.solve import solve
-from sidestep.tasks import Task, reach, stack_tasks
+from sidestep.tabular.tasks import Task, reach, stack_tasks
 
 BETA = 4.0
 HORIZONS = (None, 6)
@@ -49,7 +49,7 @@ def varied(graph: str, discount: float) -> dict:
     problem = PROBLEMS[graph]
     task = generic_task(problem, discount)
     inputs = {"parameters": problem.model.parameters, "beta": jnp.asarray(BETA)}
-    return inputs | {"reward": task.reward, "final": task.final_reward, "discount": task.discount}
+    return inputs | {"reward": task.reward, "final": task.terminal_reward, "discount": task.discount}
 
 
 def functional(values, q):
@@ -201,7 +201,7 @@ def forward(dense, kind, parameters, task: Task, start, sweeps):
         values, d_values = carried
         q = task.reward + task.discount * transitions @ values
         d_values = jnp.einsum("sa,sap->sp", policy_held_fixed(kind, q, BETA), d_q_of(values, d_values))
-        values = jnp.where(task.terminal, task.final_reward, plain_backup(kind, q, BETA))
+        values = jnp.where(task.terminal, task.terminal_reward, plain_backup(kind, q, BETA))
         return values, jnp.where(task.terminal[:, None], 0, d_values)
 
     values, _ = plain_values(kind, transitions, task, BETA, start)

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.demonstrations import Trajectory, gather
 from sidestep.tabular.backups import Behavior, HardMax
+from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import (
@@ -18,7 +18,7 @@ from sidestep.tabular.likelihood import (
 )
 from sidestep.tabular.models import ObstacleGrid, TabularModel
 from sidestep.tabular.solve import solve
-from sidestep.tasks import reach
+from sidestep.tabular.tasks import reach
 
 # In a corridor of three cells, each blocked with p = 1/4, at γ = 1/2, a walker at 0 tries left, right, right;
 # the first two fail; then right again. With g = γ(1−p)/(1−γp) = 3/7: V = g², g, 1.
@@ -84,11 +84,13 @@ def test_each_trajectory_is_judged_by_its_own_task():
     right = Trajectory(np.array([1, 2]), np.array([3]), 1)
     left = Trajectory(np.array([1, 0]), np.array([2]), 0)
     wrong_way = Trajectory(np.array([1, 2]), np.array([3]), 0)
-    apart = [float(log_likelihood(model, gather([each], tasks), people).total) for each in (left, right, wrong_way)]
-    assert apart[0] == pytest.approx(apart[1], rel=1e-12)
-    assert apart[2] < apart[1]
+    split_by_person = [
+        float(log_likelihood(model, gather([each], tasks), people).total) for each in (left, right, wrong_way)
+    ]
+    assert split_by_person[0] == pytest.approx(split_by_person[1], rel=1e-12)
+    assert split_by_person[2] < split_by_person[1]
     together = log_likelihood(model, gather([left, wrong_way, right], tasks), people)
-    assert float(together.total) == pytest.approx(sum(apart), rel=1e-12)
+    assert float(together.total) == pytest.approx(sum(split_by_person), rel=1e-12)
 
 
 def test_transitions_that_cannot_happen_have_likelihood_0():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from problems import STEPS, dense_obstacles, dense_tabular, random_problem
 
+from helpers.problems import STEPS, dense_obstacles, dense_tabular, random_problem
 from sidestep.errors import InputError
 from sidestep.tabular.graph import graph, grid_graph
 from sidestep.tabular.grid import Cell, Grid

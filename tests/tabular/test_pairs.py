@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numbered_worlds import numbered_world, order_of
 
-from sidestep.domains.offices import office
+from helpers.numbered_worlds import numbered_world, order_of
 from sidestep.tabular.backups import BACKUPS, Behavior
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.solve import solve
-from sidestep.tabular.solvers.host import at_once, cores
-from sidestep.tabular.solvers.ordered import Ordered
+from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
+from sidestep.tabular.solvers.native import at_once, cores
 from sidestep.tabular.solvers.pairs import one_behind_the_other
 from sidestep.tabular.solvers.rounds import Rounds
-from sidestep.tabular.solvers.sweeping import BOLTZMANN, LOG_SUM_EXP, Valuing
-from sidestep.tasks import reach, stack_tasks
+from sidestep.tabular.solvers.value_kernels import BOLTZMANN, LOG_SUM_EXP, Valuing
+from sidestep.tabular.tasks import reach, stack_tasks
+from sidestep.worlds.offices import office
 
 
 def a_sweep(values, reach, number, heard):
@@ -50,8 +50,8 @@ def test_a_sweep_behind_another_finds_what_it_would_have_found_after_it(states, 
     stretches = np.split(which, range(size, len(which), size))
     first = np.random.default_rng(0).normal(size=states)
 
-    apart, told = first.copy(), []
-    expected = [[a_sweep(apart, reach, number, [])(stretch) for stretch in stretches] for number in (1, 2)]
+    split_by_person, told = first.copy(), []
+    expected = [[a_sweep(split_by_person, reach, number, [])(stretch) for stretch in stretches] for number in (1, 2)]
 
     together, seen = first.copy(), np.full(states, np.nan)
     between = first.copy()
@@ -66,7 +66,7 @@ def test_a_sweep_behind_another_finds_what_it_would_have_found_after_it(states, 
     leading, following = (a_sweep(together, reach, number, []) for number in (1, 2))
     found = one_behind_the_other(leading, following, settled, stretches, reach)
     np.testing.assert_array_equal(found, expected)
-    np.testing.assert_array_equal(together, apart)
+    np.testing.assert_array_equal(together, split_by_person)
     # what is settled is what the first sweep leaves
     np.testing.assert_array_equal(seen[: which[-1] + reach + 1], between[: which[-1] + reach + 1])
 
@@ -89,9 +89,16 @@ def test_real_sweeps_find_what_they_would_have_found_one_after_the_other(kind, s
     world, values, favourite, which = numbered_office(share)
     valuing = Valuing(kind, np.float64(5), np.float64(0))
     found = []
-    for apart in (world.reach, 10**9):
+    for split_by_person in (world.reach, 10**9):
         rounds = Rounds(
-            world._replace(reach=apart), values.copy(), favourite.copy(), which, valuing, np.float64(1e-9), 500, 500
+            world._replace(reach=split_by_person),
+            values.copy(),
+            favourite.copy(),
+            which,
+            valuing,
+            np.float64(1e-9),
+            500,
+            500,
         )
         assert rounds.until_still().converged
         found.append(rounds)
@@ -125,7 +132,7 @@ def test_a_task_is_solved_alike_alone_and_in_a_batch(name):
     """Alone its sweeps share the cores; in a batch they come one after another. Not a bit may differ."""
     model = half_learned(office(200, 200, 3), np.random.default_rng(0))
     wanted = [reach(model.graph, goal, discount=0.999, step_cost=1.0) for goal in (20_100, 5_050)]
-    people, solver = Behavior(BACKUPS[name](), 5.0), Ordered(tolerance=1e-9)
+    people, solver = Behavior(BACKUPS[name](), 5.0), GaussSeidel(tolerance=1e-9)
     batch = solve(model, stack_tasks(wanted), people, solver=solver)
     assert batch.converged.all()
     for index, task in enumerate(wanted):
@@ -139,7 +146,7 @@ def test_a_gradient_is_found_alike_alone_and_in_a_batch(name):
     """From an earlier adjoint: alone, what it takes of the states is worked out on all cores."""
     model = half_learned(office(200, 200, 3), np.random.default_rng(0))
     wanted = [reach(model.graph, goal, discount=0.999, step_cost=1.0) for goal in (20_100, 5_050)]
-    people, solver = Behavior(BACKUPS[name](), 5.0), Ordered(tolerance=1e-7)
+    people, solver = Behavior(BACKUPS[name](), 5.0), GaussSeidel(tolerance=1e-7)
     before = solver.cold_start(40_000, jnp.dtype(jnp.float64))._replace(adjoint=jnp.ones(40_000))
 
     def total(parameters, task):

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from problems import BACKUPS, random_problem, solve_jit
 
-from sidestep.demonstrations import Demonstrations, Trajectory, gather
+from helpers.problems import BACKUPS, random_problem, solve_jit
 from sidestep.tabular.backups import Behavior
+from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import ObstacleGrid, TabularModel
-from sidestep.tasks import Task, reach
+from sidestep.tabular.tasks import Task, reach
 
 ROWS, COLUMNS = 3, 4
 

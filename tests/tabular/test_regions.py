@@ -5,20 +5,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from problems import BACKUPS, generic_task, obstacle_problem, relative_error
 
-from sidestep.domains.offices import office
+from helpers.problems import BACKUPS, generic_task, obstacle_problem, relative_error
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.solve import solve
-from sidestep.tabular.solvers import inwards
+from sidestep.tabular.solvers import adjoint as inwards
+from sidestep.tabular.solvers.base import DecisionProcess, Solver, WarmStart
+from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
-from sidestep.tabular.solvers.ordered import Ordered
-from sidestep.tabular.solvers.process import DecisionProcess, Solver, Start
-from sidestep.tasks import reach, stack_tasks
+from sidestep.tabular.tasks import reach, stack_tasks
+from sidestep.worlds.offices import office
 
 each_backup = pytest.mark.parametrize("name", BACKUPS)
-SOLVER = Ordered(tolerance=1e-9)
+SOLVER = GaussSeidel(tolerance=1e-9)
 TRUTH = office(50, 50, 1)
 FREE = np.flatnonzero(TRUTH.known.reshape(-1) == 0)
 GOAL = int(FREE[0])
@@ -118,11 +118,11 @@ def test_what_leaving_a_state_out_costs(name):
     problem, backup, beta = obstacle_problem(4), BACKUPS[name], jnp.asarray(5.0)
     wanted, weights = generic_task(problem, 0.9), jnp.cos(jnp.arange(12))
     left, moved = int(np.flatnonzero(~np.asarray(wanted.terminal))[3]), 1e-4
-    right = solve(problem.model, wanted, Behavior(backup, beta), solver=Ordered(tolerance=1e-12)).values
+    right = solve(problem.model, wanted, Behavior(backup, beta), solver=GaussSeidel(tolerance=1e-12)).values
 
     def backed_up(values):
         expected = jnp.einsum("sat,t->sa", problem.dense(problem.model.parameters), values)
-        return jnp.where(wanted.terminal, wanted.final_reward, backup.value(wanted.reward + 0.9 * expected, beta))
+        return jnp.where(wanted.terminal, wanted.terminal_reward, backup.value(wanted.reward + 0.9 * expected, beta))
 
     values = right.at[left].add(moved)
     for _ in range(500):
@@ -135,16 +135,16 @@ def test_what_leaving_a_state_out_costs(name):
         problem.model.graph.successors,
         problem.model.probabilities(),
         wanted.reward,
-        wanted.final_reward,
+        wanted.terminal_reward,
         wanted.terminal,
         wanted.discount,
     )
     share = float(jnp.abs(cost) / jnp.abs(adjoint * values).sum())
-    start = Start(values, jnp.zeros(12), jnp.arange(12, dtype=jnp.int32))
+    start = WarmStart(values, jnp.zeros(12), jnp.arange(12, dtype=jnp.int32))
     for tolerance, others, converged in ((1.01, left, True), (0.99, left, False), (0.99, (left + 1) % 12, True)):
         region = jnp.arange(12) != others
-        solver = Ordered(tolerance=tolerance * share)
-        by, found = solver.pull_back(process, backup, beta, "exact", values, weights, start, region)
+        solver = GaussSeidel(tolerance=tolerance * share)
+        by, found = solver.vjp(process, backup, beta, "exact", values, weights, start, region)
         assert bool(found.converged) == converged
         assert all(bool(jnp.isfinite(part).all()) == converged for part in (*by, found.values))
 
@@ -171,7 +171,7 @@ def test_tasks_of_a_batch_have_regions_of_their_own(gradient, dtype):
         [reach(grid, int(FREE[0]), discount=1.0, step_cost=1.0), reach(grid, int(FREE[-1]), discount=0.9)]
     )
     visited = jnp.asarray([FREE[1:6], FREE[-7:-2]])
-    solver = Ordered()
+    solver = GaussSeidel()
 
     def total(adjoint, tasks, visited, start, region):
         begin = start._replace(adjoint=adjoint)

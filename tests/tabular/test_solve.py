@@ -10,21 +10,21 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from problems import BACKUPS, plain_backup, random_problem, solve_jit
 from scipy.optimize import brentq
 
-from sidestep.demonstrations import Trajectory, gather
+from helpers.problems import BACKUPS, plain_backup, random_problem, solve_jit
 from sidestep.errors import ImproperTask, InputError
 from sidestep.tabular.backups import Behavior
+from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import ObstacleGrid, TabularModel, true_model
 from sidestep.tabular.solve import check_proper, solve
+from sidestep.tabular.solvers.base import neg_inf
+from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
-from sidestep.tabular.solvers.ordered import Ordered
-from sidestep.tabular.solvers.process import lowest
-from sidestep.tasks import Task, reach, stack_tasks, task, with_costs
+from sidestep.tabular.tasks import Task, reach, stack_tasks, task, with_state_costs
 
 each_backup = pytest.mark.parametrize("name", BACKUPS)
 
@@ -292,7 +292,7 @@ def test_an_adjoint_that_did_not_converge_gives_nan():
 
 @each_backup
 def test_enclosed_cells_at_discount_1(name):
-    """Two cells behind known walls are worth about `lowest`; the others and the gradient do not notice."""
+    """Two cells behind known walls are worth about `neg_inf`; the others and the gradient do not notice."""
     known = np.full((4, 5), Cell.UNKNOWN, dtype=np.int64)
     known[:3, 2] = known[2, :3] = Cell.OCCUPIED
     grid = Grid(known, connectivity=8)
@@ -300,7 +300,7 @@ def test_enclosed_cells_at_discount_1(name):
     wanted = reach(grid, 19, discount=1.0, step_cost=1.0)
     theta = jnp.zeros(grid.size)
     values, slope = value_and_gradient(ObstacleGrid(grid), theta, wanted, people(name))
-    assert (values[enclosed] <= 0.9 * lowest(jnp.dtype(jnp.float64))).all()
+    assert (values[enclosed] <= 0.9 * neg_inf(jnp.dtype(jnp.float64))).all()
     others = np.setdiff1d(np.arange(grid.size), [*enclosed, *walls])
     assert (values[others] > -100).all()
     assert np.isfinite(slope).all()
@@ -400,7 +400,7 @@ def test_values_that_swing_come_to_rest(dtype, close):
         return found.values.sum(), found
 
     (_, found), slope = jax.value_and_grad(total, has_aux=True)(logits, Jacobi())
-    (_, expected), slope_expected = jax.value_and_grad(total, has_aux=True)(logits, Ordered())
+    (_, expected), slope_expected = jax.value_and_grad(total, has_aux=True)(logits, GaussSeidel())
     assert found.converged
     assert found.sweeps > 400
     np.testing.assert_allclose(found.values, expected.values, rtol=close)
@@ -416,13 +416,15 @@ def test_a_long_way_takes_no_more_sweeps_than_steps(name):
     assert found.sweeps < 1_700
 
 
-@pytest.mark.parametrize("solver", [Jacobi(), Ordered()], ids=["Jacobi", "Ordered"])
+@pytest.mark.parametrize("solver", [Jacobi(), GaussSeidel()], ids=["Jacobi", "GaussSeidel"])
 @each_backup
 def test_values_that_were_far_too_high_come_down(name, solver):
     """Where places come to cost four times as much: of the log-sum-exp, neighbours took turns in being too high."""
     grid = Grid.unknown(5, 5)
     model, costs = true_model(grid.passable()), jnp.asarray(np.random.default_rng(17).uniform(0, 1, 25))
-    cheap, dear = (with_costs(reach(grid, 0), share * costs, model.graph.successors[..., 0]) for share in (0.2, 0.8))
+    cheap, dear = (
+        with_state_costs(reach(grid, 0), share * costs, model.graph.successors[..., 0]) for share in (0.2, 0.8)
+    )
     before = solve(model, cheap, people(name, 7.0), solver=solver)
     warm = solve(model, dear, people(name, 7.0), solver=solver, start=before.start)
     cold = solve(model, dear, people(name, 7.0), solver=solver)

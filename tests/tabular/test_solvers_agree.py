@@ -8,19 +8,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from problems import BACKUPS, DISCOUNTS, PROBLEMS, generic_task, plain_backup
 
-from sidestep.domains.offices import office
+from helpers.problems import BACKUPS, DISCOUNTS, PROBLEMS, generic_task, plain_backup
 from sidestep.tabular.backups import Behavior, Gradient
 from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, TabularModel
 from sidestep.tabular.solve import solve
+from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
-from sidestep.tabular.solvers.ordered import Ordered
-from sidestep.tasks import Task, reach, stack_tasks
+from sidestep.tabular.tasks import Task, reach, stack_tasks
+from sidestep.worlds.offices import office
 
-SOLVERS = (Jacobi(), Ordered())
+SOLVERS = (Jacobi(), GaussSeidel())
 each_backup = pytest.mark.parametrize("name", BACKUPS)
 
 
@@ -37,7 +37,7 @@ def solved(model, tasks, people, solver, gradient: Gradient = "exact"):
         return jnp.sum(weights * jnp.where(found.values > -1e100, found.values, 0)), found
 
     def one(task):
-        inputs = (model.parameters, task.reward, task.final_reward, task.discount, people.beta)
+        inputs = (model.parameters, task.reward, task.terminal_reward, task.discount, people.beta)
         slopes, found = jax.grad(total, has_aux=True)(inputs, task.terminal)
         return found, dict(zip(("parameters", "reward", "final", "discount", "beta"), slopes, strict=True))
 

@@ -9,21 +9,21 @@ import numba
 import numpy as np
 import pytest
 from numba.core import config as numba_settings
-from numbered_worlds import numbered_world, order_of, some_map
-from problems import BACKUPS, generic_task, random_problem
 
+from helpers.numbered_worlds import numbered_world, order_of, some_map
+from helpers.problems import BACKUPS, generic_task, random_problem
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.solve import solve
+from sidestep.tabular.solvers.adjoint_kernels import Weighing, weigh
+from sidestep.tabular.solvers.base import neg_inf
 from sidestep.tabular.solvers.compiled import compiled
-from sidestep.tabular.solvers.order import _ascending
-from sidestep.tabular.solvers.ordered import KERNELS, Ordered
-from sidestep.tabular.solvers.passing import Weighing, weigh
-from sidestep.tabular.solvers.process import lowest
+from sidestep.tabular.solvers.gauss_seidel import KERNELS, GaussSeidel
+from sidestep.tabular.solvers.ordering import _ascending
 from sidestep.tabular.solvers.rounds import Rounds
-from sidestep.tabular.solvers.sweeping import Scratch, Valuing, backed_up
-from sidestep.tasks import reach
+from sidestep.tabular.solvers.value_kernels import Scratch, Valuing, backed_up
+from sidestep.tabular.tasks import reach
 
 each_backup = pytest.mark.parametrize("name", BACKUPS)
 
@@ -128,7 +128,7 @@ def test_machine_code_repeats_the_backups(name, dtype):
 
 def test_an_action_that_is_worth_all_but_minus_infinity():
     """It is never taken, and has no part in the derivative by β."""
-    q = np.array([[-1.0, lowest(jnp.dtype(jnp.float64)), -2.0]])
+    q = np.array([[-1.0, neg_inf(jnp.dtype(jnp.float64)), -2.0]])
     for name in ("Boltzmann", "mellowmax"):
         found = weigh_all(Valuing(KERNELS[type(BACKUPS[name])], np.float64(3), np.float64(0)), True, q)
         assert np.isfinite(np.concatenate([each.ravel() for each in found])).all()
@@ -164,7 +164,7 @@ def settled_rounds():
     """Rounds that have come to rest, and the values that they were at."""
     model, one = some_map(), np.float64(1)
     wanted = reach(model.graph, 5, discount=0.99)
-    found = solve(model, wanted, Behavior(BoltzmannAverage(), 1.0), solver=Ordered(tolerance=1e-11))
+    found = solve(model, wanted, Behavior(BoltzmannAverage(), 1.0), solver=GaussSeidel(tolerance=1e-11))
     order = np.asarray(found.start.order)
     world = numbered_world(model, wanted, order)
     values = np.asarray(found.values)[order]

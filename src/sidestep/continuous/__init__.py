@@ -3,7 +3,7 @@
 The paper's section "Continuous State Spaces" (eqs. 11 and 12). The names here are the public ones.
 """
 
-from sidestep.continuous.critics import Critic, critic
+from sidestep.continuous.critic import Critic, critic
 from sidestep.continuous.demonstrations import gather
 from sidestep.continuous.dynamics import Dynamics, GaussianDynamics, LinearGaussian, Outcomes, TableDynamics
 from sidestep.continuous.estimators import score_surrogate, value_gradient
@@ -25,7 +25,7 @@ from sidestep.continuous.planning import Plan, plan
 from sidestep.continuous.policies import FinitePolicy, GaussianPolicy, Policy, finite_policy, gaussian_policy
 from sidestep.continuous.rollouts import RollOut, returns, roll_out, roll_outs, said, to_come
 from sidestep.continuous.simulation import simulate
-from sidestep.continuous.tasks import ContinuousTask, Hold, Reach, Regulate, TableTask, reach, stack
+from sidestep.continuous.tasks import ContinuousTask, Hold, QuadraticTask, Reach, TableTask, reach, stack
 
 __all__ = [
     "ContinuousFit",
@@ -50,9 +50,9 @@ __all__ = [
     "Planning",
     "PointMass",
     "Policy",
+    "QuadraticTask",
     "RadialField",
     "Reach",
-    "Regulate",
     "RollOut",
     "Schedule",
     "TableDynamics",

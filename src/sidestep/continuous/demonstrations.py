@@ -7,8 +7,8 @@ import numpy as np
 
 from sidestep.continuous.policies import FinitePolicy, GaussianPolicy, Policy
 from sidestep.continuous.tasks import ContinuousTask, check_tasks, ended_at, stack
-from sidestep.demonstrations import Demonstrations, Trajectory
 from sidestep.errors import InputError
+from sidestep.tabular.demonstrations import Demonstrations, Trajectory
 
 
 def gather(trajectories: Sequence[Trajectory], tasks: Sequence[ContinuousTask]) -> Demonstrations:

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree, Shaped
 
-from sidestep.continuous.critics import Critic
+from sidestep.continuous.critic import Critic
 from sidestep.continuous.dynamics import Dynamics
 from sidestep.continuous.policies import Policy
 from sidestep.continuous.rollouts import RollOut, roll_outs, said, spread_over
@@ -71,7 +71,7 @@ def surprised(dynamics: Dynamics, policy: Policy, tasks: ContinuousTask, rolled:
     def surprise(task: ContinuousTask, state: Array, choice: Array, following: Array, left: Array) -> Array:
         def value(state: Array) -> Array:
             going_on = jnp.where(left > 0.5 / rolled.acting.shape[-1], critic(task.features(state), left), 0.0)
-            return jnp.where(task.terminal(state), task.final_reward(state), going_on)
+            return jnp.where(task.terminal(state), task.terminal_reward(state), going_on)
 
         return task.discount * dynamics.surprise(value, state, policy.action(choice), following)
 

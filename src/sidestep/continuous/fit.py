@@ -26,11 +26,11 @@ from sidestep.continuous.planner import Planner, Planning, SomePolicy
 from sidestep.continuous.planning import plan
 from sidestep.continuous.policies import Policy
 from sidestep.continuous.tasks import task_at
-from sidestep.demonstrations import Demonstrations
 from sidestep.errors import NotConverged, check_count, check_positive
 from sidestep.inference.checkpoints import Saver, fingerprint
 from sidestep.inference.priors import Normal, Prior
 from sidestep.tabular.backups import Behavior
+from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import ALL_TERMS, Term
 
 Family = TypeVar("Family", bound=Dynamics)

@@ -19,7 +19,7 @@ from sidestep.continuous.tasks import ContinuousTask
 from sidestep.errors import InputError
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.models import TabularModel
-from sidestep.tasks import Task
+from sidestep.tabular.tasks import Task
 
 Vector = Float[Array, " dimensions"]
 
@@ -102,7 +102,7 @@ def tabular_task(task: ContinuousTask, lattice: Lattice, actions: Float[Array, "
     """A continuous task on the points of a lattice."""
     points = lattice.points()
     reward = jax.vmap(jax.vmap(task.reward, (None, 0)), (0, None))(points, actions)
-    return Task(reward, jax.vmap(task.final_reward)(points), jax.vmap(task.terminal)(points), task.discount)
+    return Task(reward, jax.vmap(task.terminal_reward)(points), jax.vmap(task.terminal)(points), task.discount)
 
 
 def action_values(

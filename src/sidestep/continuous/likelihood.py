@@ -25,10 +25,10 @@ from sidestep.continuous.planning import check_places
 from sidestep.continuous.policies import FinitePolicy, Policy
 from sidestep.continuous.rollouts import said, spread_over
 from sidestep.continuous.tasks import ContinuousTask, check_tasks, task_at
-from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError
 from sidestep.inference.priors import Prior
 from sidestep.tabular.backups import Behavior, LogSumExp
+from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import ALL_TERMS, Term
 
 

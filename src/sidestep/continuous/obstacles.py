@@ -63,9 +63,9 @@ def radial_field(low: Place, high: Place, counts: tuple[int, ...], logit: float 
         raise InputError(f"expected {len(low)} numbers of at least 2, found {counts}", field="counts")
     axes = [np.linspace(*ends) for ends in zip(np.asarray(low), np.asarray(high), counts, strict=True)]
     centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(counts))
-    apart = max(float(axis[1] - axis[0]) for axis in axes)
+    split_by_person = max(float(axis[1] - axis[0]) for axis in axes)
     values = jnp.full(len(centres), logit, jnp.result_type(float))
-    return RadialField(values, jnp.asarray(centres), width=0.7 * apart)
+    return RadialField(values, jnp.asarray(centres), width=0.7 * split_by_person)
 
 
 class NetworkField(Field):

@@ -25,7 +25,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree, Shaped
 
-from sidestep.continuous.critics import Critic, critic
+from sidestep.continuous.critic import Critic, critic
 from sidestep.continuous.dynamics import Dynamics
 from sidestep.continuous.estimators import advantages, everywhere, shares_left, values_expected
 from sidestep.continuous.policies import FinitePolicy, Policy

@@ -85,7 +85,7 @@ def roll_out(
         terminal = task.terminal(state)
         acting = ~(over | terminal)
         action = policy.action(choice)
-        pays = jnp.where(acting, task.reward(state, action), jnp.where(over, 0.0, task.final_reward(state)))
+        pays = jnp.where(acting, task.reward(state, action), jnp.where(over, 0.0, task.terminal_reward(state)))
         seen = task.features(state)
         entropy = policy.entropy(seen)
         beyond_mean = temperature(behavior) * (policy.log_prob(seen, choice) + entropy)
@@ -100,7 +100,7 @@ def roll_out(
     last, passed = jax.lax.scan(move, (state, choice, jnp.zeros((), bool)), jax.random.split(key, horizon))
     states, choices, rewards, bonuses, acting = passed
     end, _, over = last
-    pays = jnp.where(task.terminal(end) & ~over, task.final_reward(end), 0.0).astype(rewards.dtype)
+    pays = jnp.where(task.terminal(end) & ~over, task.terminal_reward(end), 0.0).astype(rewards.dtype)
     bonuses = bonuses.astype(rewards.dtype)
     return RollOut(
         jnp.concatenate([states, end[None]]),

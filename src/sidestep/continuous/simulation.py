@@ -15,16 +15,16 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 from sidestep.continuous.dynamics import GaussianDynamics
 from sidestep.continuous.lattice import Lattice, action_values, tabular, tabular_task
 from sidestep.continuous.tasks import ContinuousTask
-from sidestep.demonstrations import Trajectory
 from sidestep.errors import InputError, NotConverged, check_count
 from sidestep.tabular.backups import Behavior
+from sidestep.tabular.demonstrations import Trajectory
 from sidestep.tabular.solve import check_proper, solve
 
 
 def simulate(
     key: PRNGKeyArray,
     real: GaussianDynamics,
-    believed: GaussianDynamics,
+    mark_visited_free: GaussianDynamics,
     tasks: Sequence[ContinuousTask],
     starts: Sequence[Float[np.ndarray, "walkers dimensions"]],
     actions: Float[Array, "actions inputs"],
@@ -32,7 +32,7 @@ def simulate(
     lattice: Lattice,
     moves: int,
 ) -> list[Trajectory]:
-    """Walks of people who believe in `believed` and move in `real`, at most so many `moves` long.
+    """Walks of people who believe in `mark_visited_free` and move in `real`, at most so many `moves` long.
 
     - `tasks`, `starts`: for each task, where its walkers start; those who start at the end of their task do not walk.
     - `behavior`: how they choose. `lattice`: where their values are found.
@@ -47,7 +47,7 @@ def simulate(
     width = real.example_action().shape
     if not np.isfinite(actions).all() or actions.shape[1:] != width:
         raise InputError(f"expected rows of finite numbers of shape {width}, found {actions.shape}", field="actions")
-    model = tabular(believed, lattice, actions)
+    model = tabular(mark_visited_free, lattice, actions)
     trajectories = []
     for index, (task, own) in enumerate(zip(tasks, starts, strict=True)):
         if not np.isfinite(own).all() or np.shape(own)[1:] != real.noise.shape:
@@ -58,7 +58,7 @@ def simulate(
         if not solution.converged:
             raise NotConverged(f"values did not converge for task {index}: a finer lattice or a smaller β may help")
         keys = jax.random.split(jax.random.fold_in(key, index), len(own))
-        world = _World(real, believed, task, behavior, lattice, solution.values, actions)
+        world = _World(real, mark_visited_free, task, behavior, lattice, solution.values, actions)
         states, choices, going = (np.asarray(part) for part in _walked(world, jnp.asarray(own), keys, moves))
         for walker in range(len(own)):
             taken = int(going[walker].sum())
@@ -71,7 +71,7 @@ class _World(eqx.Module):
     """What walkers believe, want and meet."""
 
     real: GaussianDynamics
-    believed: GaussianDynamics
+    mark_visited_free: GaussianDynamics
     task: ContinuousTask
     behavior: Behavior
     lattice: Lattice
@@ -87,7 +87,7 @@ def _walked(world: _World, starts: Array, keys: Key[Array, " walkers"], moves: i
         state, over = carry
         choosing, moving = jax.random.split(key)
         over = over | world.task.terminal(state)
-        q = action_values(world.believed, world.lattice, world.task, world.values, state, world.actions)
+        q = action_values(world.mark_visited_free, world.lattice, world.task, world.values, state, world.actions)
         choice = jax.random.categorical(choosing, world.behavior.log_policy(q))
         after = jnp.where(over, state, world.real.sample(moving, state, world.actions[choice]))
         return (after, over), (state, choice, ~over)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, Scalar, Shaped
 
 from sidestep.continuous.dynamics import Action, State
 from sidestep.errors import InputError
-from sidestep.tasks import Task, check_discount
+from sidestep.tabular.tasks import Task, check_discount
 
 _Task = TypeVar("_Task", bound="ContinuousTask")
 
@@ -42,7 +42,7 @@ class ContinuousTask(eqx.Module):
     def features(self, state: State) -> Float[Array, " features"]:
         """What a policy sees: the state and the goal as a vector."""
 
-    def final_reward(self, state: State) -> Float[Scalar, ""]:
+    def terminal_reward(self, state: State) -> Float[Scalar, ""]:
         """What a terminal state pays."""
         del state
         return jnp.zeros((), self.discount.dtype)
@@ -76,7 +76,7 @@ class Reach(ContinuousTask):
         """The state, the goal, and the way to it."""
         return jnp.concatenate([state, self.goal, self.goal - state[: len(self.goal)]])
 
-    def final_reward(self, state: State) -> Float[Scalar, ""]:
+    def terminal_reward(self, state: State) -> Float[Scalar, ""]:
         """The goal's reward."""
         del state
         return self.goal_reward
@@ -106,7 +106,7 @@ def reach(goal: Sequence[float], radius: float, *, discount: float = 0.95, step_
     return Reach(*numbers)
 
 
-class Regulate(ContinuousTask):
+class QuadraticTask(ContinuousTask):
     """The task of staying near a goal at a quadratic cost: R(s, a) = −(s − g)ᵀ C (s − g) − aᵀ D a; it never ends.
 
     - `goal`: g; `state_cost`, `action_cost`: C and D.
@@ -166,9 +166,9 @@ class TableTask(ContinuousTask):
         """R(s, a), from the table."""
         return self.task.reward[state, action]
 
-    def final_reward(self, state: State) -> Float[Scalar, ""]:
+    def terminal_reward(self, state: State) -> Float[Scalar, ""]:
         """What a terminal state pays, from the table."""
-        return self.task.final_reward[state]
+        return self.task.terminal_reward[state]
 
     def terminal(self, state: State) -> Bool[Scalar, ""]:
         """From the table."""
@@ -184,7 +184,7 @@ def table_tasks(tasks: Task, states: int, actions: int) -> TableTask:
     """Stacked tabular tasks as continuous ones, in a world of so many states and actions."""
     count = len(tasks.terminal)
     reward = jnp.broadcast_to(tasks.reward, (count, states, actions))
-    final = jnp.broadcast_to(tasks.final_reward, (count, states))
+    final = jnp.broadcast_to(tasks.terminal_reward, (count, states))
     table = Task(reward, final, tasks.terminal, tasks.discount)
     return TableTask(task=table, index=jnp.eye(count, dtype=reward.dtype), discount=tasks.discount)
 

@@ -11,18 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from sidestep.commands.simulate import Walkers, walk
-from sidestep.domains.offices import office, places
-from sidestep.evaluation import Reward, evaluate, plan_paths
-from sidestep.io.demonstrations import demonstrations
-from sidestep.io.files import write_json
+from sidestep._files import write_json
+from sidestep.cli.simulate import Walkers, walk
+from sidestep.evaluation.evaluate import evaluate, plan_paths
+from sidestep.io.demonstrations import demonstrations_from_walks
 from sidestep.io.maps import write_map
 from sidestep.io.trajectories import walks_of_trajectories
 from sidestep.io.walks import write_walks
+from sidestep.maps.config import Settings, fit_map
+from sidestep.maps.learned_map import LearnedMap, write_learned_map
 from sidestep.plotting.maps import Panel, figure_learned, save
-from sidestep.runs import LearnedMap, write_learned_map
-from sidestep.settings import Settings, fit_map
 from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.tasks import Reward
+from sidestep.worlds.offices import office, places
 
 ROWS, COLUMNS = 14, 24
 WALKERS = Walkers(walks=400, goals=12)
@@ -44,12 +45,12 @@ def demo(folder: Path, seed: int = 0, report: Callable[[str], None] = lambda _: 
     report("learning the map from their walks")
     blank = truth.forget()
     reward = Reward(SETTINGS.discount, SETTINGS.step_cost)
-    shown = demonstrations(walks, blank, discount=reward.discount, step_cost=reward.step_cost)
+    shown = demonstrations_from_walks(walks, blank, discount=reward.discount, step_cost=reward.step_cost)
     found = fit_map(ObstacleGrid(blank, SETTINGS.prior_mean), shown, SETTINGS)
     blocked = np.asarray(found.model.blocked)
 
     report("planning between all pairs of places")
-    learned = LearnedMap(blank, blocked, shown.visited(), reward)
+    learned = LearnedMap(blank, blocked, shown.visited_state_goals(), reward)
     scores = evaluate(learned.robot(), blocked, truth, np.ones(truth.shape, bool), learned.visited)
     elsewhere = places(truth, NEW_PLACES + len(goals), seed + 1)
     new = elsewhere[~np.isin(elsewhere, goals)][:NEW_PLACES]

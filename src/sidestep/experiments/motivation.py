@@ -1,8 +1,8 @@
 """The paper's section "Motivation": what one loses who explains detours by what places cost.
 
 People walk optimally, ties broken at random, in two rooms with a door between them and mud in the right one: a move
-into mud fails four times out of five. From the same walks a global cost function is learned (`by_costs`: no move fails,
-cells cost something), and a transition model (`by_behavior`: nothing costs anything, moves fail). Then the reward
+into mud fails four times out of five. From the same walks a global cost function is learned (`maxent_irl`: no move fails,
+cells cost something), and a transition model (`behavior_aware`: nothing costs anything, moves fail). Then the reward
 changes: the goal lies elsewhere, once in the mud, and what is at stake is larger or smaller. A robot plans with what
 was learned. It may also stay where it is for ever, which is worth nothing, and does so where no plan is worth more.
 
@@ -24,21 +24,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-from sidestep.demonstrations import Demonstrations, gather
-from sidestep.domains.flats import two_rooms
-from sidestep.evaluation import Reward
-from sidestep.io.files import write_json
+from sidestep._files import write_json
+from sidestep.baselines.interface import ModelResult, behavior_aware, reward_of
+from sidestep.baselines.maxent_irl import maxent_irl
+from sidestep.maps.config import Settings
 from sidestep.plotting.maps import save
 from sidestep.plotting.policies import Curves, PolicyPanel, figure_policies
-from sidestep.rivals.costs import by_costs
-from sidestep.rivals.learned import Learned, by_behavior, reward_of
-from sidestep.robots import robot
-from sidestep.settings import Settings
-from sidestep.simulation import simulate
+from sidestep.robots.robot import risk_averse_robot
+from sidestep.tabular.demonstrations import Demonstrations, gather
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.planning import plan
-from sidestep.tasks import Task
+from sidestep.tabular.simulation import simulate
+from sidestep.tabular.tasks import Reward, Task
+from sidestep.worlds.rooms import two_rooms
 
 ROWS, COLUMNS, DOOR = 9, 13, 8
 MUD, MUD_FAILS = (slice(2, 5), slice(8, 11)), 0.8
@@ -48,7 +47,7 @@ NEW_GOALS = ((3, 9), (2, 2), (5, 7), (7, 10), (1, 1))
 WALKERS, DRAWS = 10, 5
 """People to each goal, and how often all is done with other people."""
 STAKES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
-METHODS = {"costs": by_costs, "behavior": by_behavior}
+METHODS = {"costs": maxent_irl, "behavior": behavior_aware}
 OUTCOMES = ("arrives", "stays_put", "bumps")
 TITLES = {
     "goal": "The goal pays 1 × stakes, discount .95: people may stay away",
@@ -139,14 +138,16 @@ def walks(form: Form, seed: int) -> Demonstrations:
     return gather(simulate(jax.random.key(seed), world, tasks, starts), tasks)
 
 
-def learned(form: Form, demonstrations: Demonstrations) -> dict[str, Learned]:
+def learned(form: Form, demonstrations: Demonstrations) -> dict[str, ModelResult]:
     """The truth, and what each method makes of the walks on a map of which nothing is known."""
     world, settings = true_world(), form.settings
-    truth = Learned(world, reward_of(settings), settings.behavior(), np.asarray(world.blocked), robot(world, []), True)
+    truth = ModelResult(
+        world, reward_of(settings), settings.behavior(), np.asarray(world.blocked), risk_averse_robot(world, []), True
+    )
     return {"truth": truth} | {name: learn(_blank(), demonstrations, settings) for name, learn in METHODS.items()}
 
 
-def at_stakes(known: Learned, form: Form, goal: int, stakes: float) -> Task:
+def at_stakes(known: ModelResult, form: Form, goal: int, stakes: float) -> Task:
     """The task of reaching a state where all that it pays and that steps cost is `stakes` times as much.
 
     What cells cost stays as it was learned: a global cost function knows nothing of tasks.
@@ -157,7 +158,7 @@ def at_stakes(known: Learned, form: Form, goal: int, stakes: float) -> Task:
     return Task(own.reward + (stakes - 1) * bare.reward, final, own.terminal, own.discount)
 
 
-def tried(known: Learned, form: Form, goal: int, stakes: float) -> Trial:
+def tried(known: ModelResult, form: Form, goal: int, stakes: float) -> Trial:
     """What a robot does that plans, optimally, with what was learned."""
     world = true_world()
     made = plan(known.model, at_stakes(known, form, goal, stakes))
@@ -180,7 +181,7 @@ def _fewest_moves(goal: int) -> Float[np.ndarray, " states"]:
     return -np.asarray(plan(true_world(), task).solution.values)
 
 
-def _all_tried(known: Learned, form: Form) -> list[list[Trial]]:
+def _all_tried(known: ModelResult, form: Form) -> list[list[Trial]]:
     """Trials by goal and stakes."""
     return [[tried(known, form, _state(goal), stakes) for stakes in STAKES] for goal in NEW_GOALS]
 
@@ -211,7 +212,7 @@ def _blank() -> Grid:
 
 
 def _panels(
-    known: dict[str, Learned], trials: dict[str, list[list[Trial]]], demonstrations: Demonstrations
+    known: dict[str, ModelResult], trials: dict[str, list[list[Trial]]], demonstrations: Demonstrations
 ) -> list[PolicyPanel]:
     """The walks, what was learned from them, and what robots do with it that are to reach the first goal."""
     truth, goal, paths = two_rooms(ROWS, COLUMNS, DOOR), _state(NEW_GOALS[0]), demonstrations.paths()

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sidestep._files import write_json
 from sidestep.continuous.demonstrations import gather
 from sidestep.continuous.fit import Schedule, fit
 from sidestep.continuous.lattice import Lattice
@@ -24,7 +25,6 @@ from sidestep.continuous.policies import finite_policy
 from sidestep.continuous.simulation import simulate
 from sidestep.continuous.tasks import Hold, task_at
 from sidestep.inference.priors import Normal
-from sidestep.io.files import write_json
 from sidestep.plotting.maps import save
 from sidestep.plotting.physics import figure_belief
 from sidestep.tabular.backups import Behavior, LogSumExp
@@ -51,8 +51,8 @@ def run(folder: Path, seed: int = 0, report: Callable[[str], None] = lambda _: N
     spread = np.array([_ANGLES, _SPEEDS])
     starts = [np.array([goal, 0.0]) + random.uniform(-spread, spread, (WALKERS, 2)) for goal in GOALS]
     lattice = Lattice(jnp.array([-np.pi, -8.0]), jnp.array([np.pi, 8.0]), (96, 81), (True, False))
-    real, believed = Pendulum(gravity=REAL, noise=NOISE), Pendulum(gravity=BELIEVED, noise=NOISE)
-    walked = simulate(jax.random.key(seed), real, believed, tasks, starts, torques, people, lattice, MOVES)
+    real, mark_visited_free = Pendulum(gravity=REAL, noise=NOISE), Pendulum(gravity=BELIEVED, noise=NOISE)
+    walked = simulate(jax.random.key(seed), real, mark_visited_free, tasks, starts, torques, people, lattice, MOVES)
     demonstrations = gather(walked, tasks)
 
     report("finding the people's policy under the real gravity")

@@ -14,10 +14,9 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Array, Float, PyTree
 
+from sidestep._files import write_json
 from sidestep.continuous.likelihood import FitProgress
 from sidestep.continuous.obstacles import Field, ObstacleMotion, network_field, radial_field
-from sidestep.demonstrations import Demonstrations
-from sidestep.domains.rooms import RESOLUTION, SIDE, Room, room
 from sidestep.experiments.room import (
     BETA,
     CENTRES,
@@ -32,13 +31,14 @@ from sidestep.experiments.room import (
 )
 from sidestep.inference.fit import fit
 from sidestep.inference.priors import Normal, Prior
-from sidestep.io.demonstrations import demonstrations as on_grid
-from sidestep.io.files import write_json
+from sidestep.io.demonstrations import demonstrations_from_walks as on_grid
 from sidestep.io.walks import Walks, walks_of_table
 from sidestep.plotting.maps import Panel, figure_learned, save
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
+from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
+from sidestep.worlds.continuous_room import RESOLUTION, SIDE, Room, room
 
 CELL = 0.5
 """The side of the tabular half's cells, in metres."""
@@ -98,11 +98,11 @@ class Said(Prior):
         return self.each.log_density(jax.vmap(lambda place: self.field.logit(place, parameters))(self.places))
 
 
-Learned = tuple[Float[np.ndarray, "rows columns"], int, bool, str]
+ModelResult = tuple[Float[np.ndarray, "rows columns"], int, bool, str]
 """P(blocked) in small cells, how many parameters there are, whether the fit converged, and why it ended."""
 
 
-def _by_basis_functions(world: Room, demonstrations: Demonstrations, seed: int, report: Report) -> Learned:
+def _by_basis_functions(world: Room, demonstrations: Demonstrations, seed: int, report: Report) -> ModelResult:
     low, high = world.dynamics.low, world.dynamics.high
     field = radial_field(low, high, (CENTRES, CENTRES), PRIOR_MEAN)
     prior = Normal(PRIOR_MEAN, PRIOR_VARIANCE)
@@ -110,7 +110,7 @@ def _by_basis_functions(world: Room, demonstrations: Demonstrations, seed: int, 
     return blocked_in(found.dynamics, world), field.parameters.size, found.converged, found.message
 
 
-def _by_network(world: Room, demonstrations: Demonstrations, seed: int, report: Report) -> Learned:
+def _by_network(world: Room, demonstrations: Demonstrations, seed: int, report: Report) -> ModelResult:
     """The prior is that of the basis functions, on what the network says where their centres are."""
     low, high = world.dynamics.low, world.dynamics.high
     field = network_field(jax.random.key(seed), low, high, logit=PRIOR_MEAN)
@@ -120,7 +120,7 @@ def _by_network(world: Room, demonstrations: Demonstrations, seed: int, report: 
     return blocked_in(found.dynamics, world), count, found.converged, found.message
 
 
-def _by_grid(world: Room, demonstrations: Demonstrations, seed: int, report: Report) -> Learned:
+def _by_grid(world: Room, demonstrations: Demonstrations, seed: int, report: Report) -> ModelResult:
     """People's costs and sharpness are the same a metre; the Boltzmann average is proper however short a move is."""
     del world, seed, report
     count = round(SIDE / CELL)

@@ -8,7 +8,7 @@ forgotten and learned from their walks, in four ways:
 - `actions_only`: without the transitions' term (figure 3),
 - `transitions_only`: ordinary maximum likelihood (figure 4).
 
-The paper's own two maps survive only as pictures that we do not have; see `sidestep.domains.grids` for those used here.
+The paper's own two maps survive only as pictures that we do not have; see `sidestep.worlds.grids` for those used here.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,19 +19,20 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from sidestep.demonstrations import Demonstrations, gather
-from sidestep.domains.grids import WORLDS, World
-from sidestep.evaluation import Reward, evaluate, plan_paths
+from sidestep._files import write_json
+from sidestep.evaluation.evaluate import evaluate, plan_paths
 from sidestep.inference.fit import Fit, fit
-from sidestep.inference.optimisers import LBFGS, Ascent, Optimiser
+from sidestep.inference.optimizers import LBFGS, Adam, Optimizer
 from sidestep.inference.priors import Normal
-from sidestep.io.files import write_json
-from sidestep.planners import InModel
 from sidestep.plotting.maps import Panel, figure_environments, figure_learned, save
-from sidestep.simulation import simulate
+from sidestep.robots.planners import ModelPlanner
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, Gradient
+from sidestep.tabular.demonstrations import Demonstrations, gather
 from sidestep.tabular.likelihood import ALL_TERMS, Term
 from sidestep.tabular.models import ObstacleGrid, true_model
+from sidestep.tabular.simulation import simulate
+from sidestep.tabular.tasks import Reward
+from sidestep.worlds.grids import WORLDS, World
 
 WALKS_PER_PAIR = 10
 BETA = 10.0
@@ -45,13 +46,13 @@ class Variant(NamedTuple):
     title: str
     terms: tuple[Term, ...]
     gradient: Gradient
-    optimiser: Optimiser
+    optimizer: Optimizer
 
 
 VARIANTS: Mapping[str, Variant] = {
-    "bam": Variant("BAM", ALL_TERMS, "fixed_policy", Ascent()),
+    "bam": Variant("BAM", ALL_TERMS, "fixed_policy", Adam()),
     "bam_exact": Variant("BAM, exact gradient", ALL_TERMS, "exact", LBFGS()),
-    "actions_only": Variant("actions only", ("actions",), "fixed_policy", Ascent()),
+    "actions_only": Variant("actions only", ("actions",), "fixed_policy", Adam()),
     "transitions_only": Variant("transitions only", ("transitions",), "exact", LBFGS()),
 }
 FIGURES = {
@@ -103,13 +104,15 @@ def _learn(world: World, demonstrations: Demonstrations, variant: Variant) -> Fi
         prior=Normal(PRIOR_MEAN, PRIOR_VARIANCE),
         terms=variant.terms,
         gradient=variant.gradient,
-        optimiser=variant.optimiser,
+        optimizer=variant.optimizer,
     )
 
 
 def _scores(world: World, demonstrations: Demonstrations, found: Fit[ObstacleGrid]) -> dict[str, Any]:
     scored = np.ones(world.truth.shape, dtype=bool)
-    scores = evaluate(_planner(found), np.asarray(found.model.blocked), world.truth, scored, demonstrations.visited())
+    scores = evaluate(
+        _planner(found), np.asarray(found.model.blocked), world.truth, scored, demonstrations.visited_state_goals()
+    )
     return {
         **scores,
         "objective": found.final.objective,
@@ -118,9 +121,9 @@ def _scores(world: World, demonstrations: Demonstrations, found: Fit[ObstacleGri
     }
 
 
-def _planner(found: Fit[ObstacleGrid]) -> InModel:
+def _planner(found: Fit[ObstacleGrid]) -> ModelPlanner:
     """The paper's: what people pursue, in the learned dynamics."""
-    return InModel(found.model, partial(REWARD.reach, found.model.blank))
+    return ModelPlanner(found.model, partial(REWARD.reach, found.model.blank))
 
 
 def _panel(world: World, variant: Variant, found: Fit[ObstacleGrid]) -> Panel:

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from sklearn.metrics import roc_auc_score
 
+from sidestep._files import write_json
 from sidestep.continuous.fit import ContinuousFit, Schedule, fit
 from sidestep.continuous.likelihood import FitProgress
 from sidestep.continuous.obstacles import Field, ObstacleMotion, radial_field
@@ -24,13 +25,12 @@ from sidestep.continuous.planner import Planner
 from sidestep.continuous.policies import finite_policy
 from sidestep.continuous.simulation import simulate
 from sidestep.continuous.tasks import task_at
-from sidestep.demonstrations import Demonstrations
-from sidestep.domains.rooms import Room, room, walks_without_collisions
 from sidestep.inference.priors import Normal, Prior
-from sidestep.io.files import write_json
 from sidestep.plotting.maps import Panel, figure_learned, save
 from sidestep.tabular.backups import Behavior, LogSumExp
+from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import ALL_TERMS, Term
+from sidestep.worlds.continuous_room import Room, room, walks_without_collisions
 
 WALKERS, CENTRES = 24, 16
 """People to each goal, and centres of basis functions a side."""
@@ -126,12 +126,12 @@ def run(folder: Path, seed: int = 0, report: Report = lambda _: None) -> dict[st
     blocked, blind = blocked_in(found.dynamics, world), blocked_in(without.dynamics, world)
     report("planning in the learned room")
     trips = _trips(world, found.dynamics, seed)
-    by_transitions, walks = scores(blind, world), WALKERS * len(world.tasks)
+    transitions_only, walks = scores(blind, world), WALKERS * len(world.tasks)
     summary = {
         "command": "experiment room",
         "seed": seed,
         **scores(blocked, world)._asdict(),
-        "transitions_only": by_transitions._asdict(),
+        "transitions_only": transitions_only._asdict(),
         "walks": walks,
         "moves": len(demonstrations),
         "collisions_removed": collisions,
@@ -164,18 +164,20 @@ def run(folder: Path, seed: int = 0, report: Report = lambda _: None) -> dict[st
 
 def tasks_of(demonstrations: Demonstrations) -> Int[np.ndarray, " trajectories"]:
     """The task of each trajectory."""
-    first = demonstrations.firsts()
+    first = demonstrations.first_moves()
     return np.asarray(demonstrations.task)[first]
 
 
-def _trips(world: Room, believed: ObstacleMotion, seed: int) -> list[tuple[Float[np.ndarray, "places 2"], bool]]:
+def _trips(
+    world: Room, mark_visited_free: ObstacleMotion, seed: int
+) -> list[tuple[Float[np.ndarray, "places 2"], bool]]:
     """New walks of people who believe in the learned room and walk in the real one, and whether they arrive."""
     tasks = [world.tasks[goal] for _, goal in _TRIPS]
     begins = [np.asarray([start]) for start, _ in _TRIPS]
     walked = simulate(
         jax.random.key(seed + 1),
         world.dynamics,
-        believed,
+        mark_visited_free,
         tasks,
         begins,
         world.actions,

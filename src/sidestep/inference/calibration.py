@@ -24,9 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from sidestep.demonstrations import Demonstrations
 from sidestep.errors import NotConverged
 from sidestep.tabular.backups import Behavior
+from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import visited_action_values
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import solve
@@ -59,7 +59,7 @@ def scores(
     )
     information = np.asarray(jnp.sum(jnp.exp(log_policy) * by_log_beta**2, axis=-1))
     moves, actions = np.arange(len(q)), np.asarray(demonstrations.actions)
-    counts = np.asarray(demonstrations.counted) > 0
+    counts = np.asarray(demonstrations.weights) > 0
     return Scores(
         np.asarray(by_log_beta)[moves, actions][counts],
         information[counts],
@@ -68,7 +68,7 @@ def scores(
     )
 
 
-def effective_share(held_out: Sequence[Scores]) -> float:
+def effective_sample_ratio(held_out: Sequence[Scores]) -> float:
     """κ, from the scores of walks that were not learned from; infinite where scores do not vary."""
     score, information, _, trajectory = (np.concatenate(part) for part in zip(*held_out, strict=True))
     of_walks = np.bincount(trajectory, score - score.mean())

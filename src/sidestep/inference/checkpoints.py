@@ -18,8 +18,8 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from sidestep._files import read_whole, write_whole
 from sidestep.errors import InputError
-from sidestep.io.files import read_whole, write_whole
 
 
 def fingerprint(problem: PyTree) -> str:

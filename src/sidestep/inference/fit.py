@@ -19,20 +19,20 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError
 from sidestep.inference.checkpoints import Saver, fingerprint
-from sidestep.inference.climb import Climb, Progress
+from sidestep.inference.maximize import Climb, Progress
 from sidestep.inference.objective import MEMORY, Objective, Problem, Solved
-from sidestep.inference.optimisers import LBFGS, Ascent, Optimiser
+from sidestep.inference.optimizers import LBFGS, Adam, Optimizer
 from sidestep.inference.priors import Normal, Prior
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, Gradient
+from sidestep.tabular.behavior_model import BehaviorModel, behavior_model
+from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import ALL_TERMS, Term, arrivals_of, transition_probabilities
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.people import People, people
 from sidestep.tabular.solve import check_proper
-from sidestep.tabular.solvers.choice import solver_for
-from sidestep.tabular.solvers.process import Solver
+from sidestep.tabular.solvers.base import Solver
+from sidestep.tabular.solvers.choice import default_solver
 
 Model = TypeVar("Model", bound=TransitionModel)
 
@@ -48,7 +48,7 @@ class Fit(eqx.Module, Generic[Model]):
     """
 
     model: Model
-    people: People
+    people: BehaviorModel
     history: tuple[Progress, ...] = eqx.field(static=True)
     sweeps: Int[Array, " tasks"]
     residual: Float[Array, " tasks"]
@@ -65,14 +65,14 @@ class Fit(eqx.Module, Generic[Model]):
 def fit(
     model: Model,
     demonstrations: Demonstrations,
-    behavior: Behavior | People,
+    behavior: Behavior | BehaviorModel,
     *,
     prior: Prior | None = None,
     tempering: float = 1.0,
     terms: tuple[Term, ...] = ALL_TERMS,
     gradient: Gradient = "exact",
     horizon: int | None = None,
-    optimiser: Optimiser | None = None,
+    optimizer: Optimizer | None = None,
     solver: Solver | None = None,
     memory: float = MEMORY,
     mesh: Mesh | None = None,
@@ -82,13 +82,13 @@ def fit(
 ) -> Fit[Model]:
     """The model of `model`'s family that maximises the posterior of `demonstrations`, starting at `model`.
 
-    - `behavior`: how people behave; `people(...)` where that is to be learned too.
+    - `behavior`: how people behave; `behavior_model(...)` where that is to be learned too.
     - `prior`: over the model's parameters; by default the paper's N(−2, 4).
     - `tempering`: κ in (0, 1], how much the actions' log-likelihood counts; below 1 where steps depend on each other.
     - `terms`: which parts of the likelihood count, "actions", "transitions" or both.
     - `gradient`, `horizon`, `solver`: as for `solve`. On large maps, solves are only as exact as the optimiser needs
       until it has converged, and exact from then on; a solver with a tolerance of its own keeps to that.
-    - `optimiser`: `LBFGS()` by default, or `Ascent()`, or `Resilient()` (for large maps with people who avoid walls).
+    - `optimizer`: `LBFGS()` by default, or `Adam()`, or `Rprop()` (for large maps with people who avoid walls).
     - `memory`: about how many bytes the arrays may take on a device; tasks are solved in batches that fit.
     - `mesh`: devices to spread the tasks over (see `tasks_mesh`); the objective and its gradient are the same. With
       devices of several processes, each process calls `fit` with the same arguments and gets the same model.
@@ -101,18 +101,18 @@ def fit(
     checkpoint of another fit; `ImproperTask` for tasks without values; `NotConverged` if values do not converge at the
     start or stop converging on the way.
     """
-    optimiser = optimiser or LBFGS()
-    someone = people(behavior) if isinstance(behavior, Behavior) else behavior
-    _check_settings(terms, gradient, someone.behavior, optimiser)
+    optimizer = optimizer or LBFGS()
+    someone = behavior_model(behavior) if isinstance(behavior, Behavior) else behavior
+    _check_settings(terms, gradient, someone.behavior, optimizer)
     horizon = None if horizon is None else int(horizon)
     if not 0 < tempering <= 1:
         raise InputError(f"expected a share above 0 and at most 1, found {tempering}", field="tempering")
     check_proper(someone.tasks_of(demonstrations.tasks), someone.behavior_of(), model.graph.actions, horizon)
-    solver = solver or solver_for(someone.behavior.backup, model.graph.states)
+    solver = solver or default_solver(someone.behavior.backup, model.graph.states)
     problem = Problem(model, someone, demonstrations, prior or Normal(), terms, horizon, gradient, solver, tempering)
     _check_moves(problem)
-    saver = Saver(checkpoint, fingerprint((problem, optimiser.key)) if checkpoint is not None else "")
-    climb = Climb(Objective(problem, memory, mesh, optimiser.looks_roughly), optimiser, saver)
+    saver = Saver(checkpoint, fingerprint((problem, optimizer.key)) if checkpoint is not None else "")
+    climb = Climb(Objective(problem, memory, mesh, optimizer.looks_roughly), optimizer, saver)
     found = climb.run(report, resume)
     solved = _of_all_tasks(found.solved, len(demonstrations.tasks.terminal))
     return Fit(
@@ -140,12 +140,12 @@ def _of_all_tasks(parts: list[Solved], tasks: int) -> Solved:
     )
 
 
-def _check_settings(terms: tuple[Term, ...], gradient: Gradient, behavior: Behavior, optimiser: Optimiser) -> None:
+def _check_settings(terms: tuple[Term, ...], gradient: Gradient, behavior: Behavior, optimizer: Optimizer) -> None:
     if not terms or not set(terms) <= set(ALL_TERMS):
         raise InputError(f"expected one or both of {ALL_TERMS}, found {terms}", field="terms")
     if gradient not in ("exact", "fixed_policy"):
         raise InputError(f"expected 'exact' or 'fixed_policy', found {gradient!r}", field="gradient")
-    searches = not isinstance(optimiser, Ascent)
+    searches = not isinstance(optimizer, Adam)
     if gradient == "fixed_policy" and searches and isinstance(behavior.backup, BoltzmannAverage):
         raise InputError(
             "the fixed-policy gradient of the Boltzmann average is not the gradient of any function, so there is "

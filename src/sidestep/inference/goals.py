@@ -23,13 +23,13 @@ import numpy as np
 from jax.scipy.special import logsumexp
 from jaxtyping import Float
 
-from sidestep.demonstrations import Demonstrations, Trajectory, flat_moves, gather
 from sidestep.errors import InputError, NotConverged, check_count
 from sidestep.inference.fit import Fit, Model
 from sidestep.tabular.backups import Behavior
+from sidestep.tabular.demonstrations import Demonstrations, Trajectory, flat_moves, gather
 from sidestep.tabular.likelihood import log_policies
 from sidestep.tabular.models import TransitionModel
-from sidestep.tasks import Task, stack_tasks
+from sidestep.tabular.tasks import Task, stack_tasks
 
 
 class GoalFit(eqx.Module, Generic[Model]):

@@ -29,12 +29,13 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from sidestep.demonstrations import Demonstrations
 from sidestep.errors import InputError
-from sidestep.inference.batches import Batch, batches_of, planned
+from sidestep.inference.batching import Batch, batches_of, planned
 from sidestep.inference.checkpoints import fingerprint
 from sidestep.inference.priors import Prior
 from sidestep.tabular.backups import Gradient
+from sidestep.tabular.behavior_model import BehaviorModel, BehaviorParameters
+from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import (
     Arrivals,
     Choices,
@@ -44,9 +45,8 @@ from sidestep.tabular.likelihood import (
     choice_log_likelihood,
 )
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.people import People, Traits
-from sidestep.tabular.solvers.process import Solver, Start, reachable
-from sidestep.tasks import Task
+from sidestep.tabular.solvers.base import Solver, WarmStart, is_reachable
+from sidestep.tabular.tasks import Task
 
 MEMORY = 2.0 * 2**30
 """How many bytes the arrays of a fit may take on a device, unless more are allowed."""
@@ -58,14 +58,14 @@ class Parameters(NamedTuple):
     """All that is learned: θ of the transition model, and of people what is not known of them."""
 
     model: PyTree
-    people: Traits
+    people: BehaviorParameters
 
 
 class Problem(eqx.Module):
     """All that the objective depends on, besides what is learned; arguments as for `fit`."""
 
     model: TransitionModel
-    people: People
+    people: BehaviorModel
     demonstrations: Demonstrations
     prior: Prior
     terms: tuple[Term, ...] = eqx.field(static=True)
@@ -157,7 +157,7 @@ class Objective:
             return [jax.process_index()]
         return sorted({device.process_index for device in self.mesh.devices.flat})
 
-    def cold_starts(self) -> list[Start]:
+    def cold_starts(self) -> list[WarmStart]:
         """Where the solves of each batch start when nothing is known."""
         if not self.batches:
             return []
@@ -168,19 +168,19 @@ class Objective:
         # arrays do not change, so one serves all batches
         return self.placed([cold]) * len(self.batches)
 
-    def placed(self, starts: list[Start]) -> list[Start]:
+    def placed(self, starts: list[WarmStart]) -> list[WarmStart]:
         """Starts of batches on the devices where their tasks are."""
         return [_shared_out(start, self.mesh) for start in starts]
 
     def evaluate(
         self,
         parameters: Parameters,
-        starts: list[Start],
+        starts: list[WarmStart],
         tolerance: float | None = None,
         known: Sequence[Part] = (),
         negligible: float = 0.0,
         little: float = 0.0,
-    ) -> tuple[Evaluation, list[Start]]:
+    ) -> tuple[Evaluation, list[WarmStart]]:
         """The objective at θ, and where the next evaluation may start.
 
         - `tolerance`: that of the solves, where the solver leaves it open. The objective is NaN if a solve failed.
@@ -232,8 +232,8 @@ def _changed_by(part: Part, parameters: PyTree[np.ndarray]) -> float:
 
 
 def _evaluated(
-    problem: Problem, parameters: PyTree, batch: Batch, starts: Start, everywhere: bool, mesh: Mesh | None
-) -> tuple[tuple[Array, PyTree, Start, Solved], bool]:
+    problem: Problem, parameters: PyTree, batch: Batch, starts: WarmStart, everywhere: bool, mesh: Mesh | None
+) -> tuple[tuple[Array, PyTree, WarmStart, Solved], bool]:
     """`_of_actions`, of all states if without some of them there is no slope; and whether it was of all."""
     found, slope, left, solved = _of_actions(problem, parameters, batch, starts, everywhere, mesh)
     if everywhere or not jnp.isfinite(found) or all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(slope)):
@@ -261,8 +261,8 @@ def _apart_from_actions(
 
 
 def _of_actions(
-    problem: Problem, parameters: PyTree, batch: Batch, starts: Start, everywhere: bool, mesh: Mesh | None
-) -> tuple[Array, PyTree, Start, Solved]:
+    problem: Problem, parameters: PyTree, batch: Batch, starts: WarmStart, everywhere: bool, mesh: Mesh | None
+) -> tuple[Array, PyTree, WarmStart, Solved]:
     """The actions' log-likelihood over the tasks of a batch, the slope of the loss, new starts, how the solves went."""
     if mesh is None:
         return _share(problem, parameters, batch, starts, jnp.asarray(everywhere))
@@ -276,12 +276,18 @@ def _of_actions(
 
 @eqx.filter_jit
 def _share(
-    problem: Problem, parameters: Parameters, batch: Batch, starts: Start, everywhere: Bool[Array, ""]
-) -> tuple[Array, PyTree, Start, Solved]:
+    problem: Problem, parameters: Parameters, batch: Batch, starts: WarmStart, everywhere: Bool[Array, ""]
+) -> tuple[Array, PyTree, WarmStart, Solved]:
     """`_of_actions` on one device."""
 
     def of_one(
-        model: TransitionModel, people: People, task: Task, person: Array, choices: Choices, start: Start, region: Array
+        model: TransitionModel,
+        people: BehaviorModel,
+        task: Task,
+        person: Array,
+        choices: Choices,
+        start: WarmStart,
+        region: Array,
     ) -> tuple[Array, tuple]:
         value, found = choice_log_likelihood(
             model,
@@ -294,7 +300,7 @@ def _share(
             solver=problem.solver,
             region=region,
         )
-        stuck = (choices.counts > 0) & ~reachable(found.values[choices.states])
+        stuck = (choices.counts > 0) & ~is_reachable(found.values[choices.states])
         return value, (found.start, Solved(found.sweeps, found.residual, found.converged, stuck))
 
     def loss(parameters: Parameters, adjoint: Array) -> tuple[Array, tuple]:
@@ -314,12 +320,12 @@ def _share(
 
 @eqx.filter_jit
 def _shares(
-    problem: Problem, parameters: PyTree, batch: Batch, starts: Start, everywhere: Bool[Array, ""], mesh: Mesh
-) -> tuple[Array, PyTree, Start, Solved]:
+    problem: Problem, parameters: PyTree, batch: Batch, starts: WarmStart, everywhere: Bool[Array, ""], mesh: Mesh
+) -> tuple[Array, PyTree, WarmStart, Solved]:
     """`_share` of every device; sums over its tasks have an axis of devices in front."""
     known, settings = eqx.partition((problem, parameters, everywhere), eqx.is_array)
 
-    def share(known: PyTree, batch: Batch, starts: Start) -> tuple[Array, PyTree, Start, Solved]:
+    def share(known: PyTree, batch: Batch, starts: WarmStart) -> tuple[Array, PyTree, WarmStart, Solved]:
         problem, parameters, everywhere = eqx.combine(known, settings)
         part, slope, left, solved = _share(problem, parameters, batch, starts, everywhere)
         part, slope = jax.tree.map(lambda leaf: leaf[None], (part, slope))

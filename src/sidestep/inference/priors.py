@@ -66,7 +66,7 @@ class Normal(Prior):
         return -jnp.sum(jnp.stack(penalties))
 
 
-def sensed(
+def sensor_prior(
     probability: Float[np.ndarray, "rows columns"],
     variance: float | Float[np.ndarray, "rows columns"],
     elsewhere: Normal,
@@ -93,7 +93,7 @@ def sensed(
     return Normal(jnp.where(seen, logit, mean), jnp.where(seen, a, spread))
 
 
-class Smooth(Prior):
+class GaussianMRF(Prior):
     """A Gaussian Markov random field: parameters like those of their neighbours.
 
     - `each`: what is known of each parameter by itself.
@@ -115,7 +115,7 @@ class Smooth(Prior):
         return self.each.log_density(parameters) - self.strength.astype(parameters.dtype) * jnp.sum((one - other) ** 2)
 
 
-class Lines(Prior):
+class WallPrior(Prior):
     """Walls are lines: a cell between two blocked ones, in a row or in a column, is more probably blocked.
 
     - `each`: what is known of each cell's logit by itself.
@@ -142,7 +142,7 @@ class Lines(Prior):
         return self.each.log_density(parameters) + self.strength.astype(parameters.dtype) * lines
 
 
-class Stood(Prior):
+class FreeCellEvidence(Prior):
     """Evidence that cells are free: somebody stood there, as those did whose walks begin in them.
 
     - `other`: what else is known of the cells' logits.

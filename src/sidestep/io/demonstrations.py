@@ -4,27 +4,27 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.sparse.csgraph import connected_components
 
-from sidestep.demonstrations import Demonstrations, flat_moves
 from sidestep.errors import InputError
 from sidestep.io.gridding import Moves, grid_walks
 from sidestep.io.walks import Walks
-from sidestep.scoring import walkable_graph
+from sidestep.tabular.demonstrations import Demonstrations, flat_moves
+from sidestep.tabular.graph import walkable_graph
 from sidestep.tabular.grid import Grid
-from sidestep.tasks import reach, stack_tasks
+from sidestep.tabular.tasks import reach, stack_tasks
 
 
-def demonstrations(
+def demonstrations_from_walks(
     walks: Walks, grid: Grid, *, discount: float = 0.95, step_cost: float | None = None
 ) -> Demonstrations:
     """Demonstrations on a grid from walks in metres, one task for every goal.
 
     The walks are gridded (`sidestep.io.gridding`); `discount` and `step_cost` are those of `reach`. Raises `InputError`
-    as the gridding and `demonstrations_of_moves` do.
+    as the gridding and `demonstrations_from_moves` do.
     """
-    return demonstrations_of_moves(grid_walks(walks, grid), grid, discount=discount, step_cost=step_cost)
+    return demonstrations_from_moves(grid_walks(walks, grid), grid, discount=discount, step_cost=step_cost)
 
 
-def demonstrations_of_moves(
+def demonstrations_from_moves(
     moves: Moves, grid: Grid, *, discount: float = 0.95, step_cost: float | None = None
 ) -> Demonstrations:
     """Demonstrations on a grid from gridded walks, one task for every goal.

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sidestep.demonstrations import Trajectory
 from sidestep.errors import InputError, check_count
+from sidestep.tabular.demonstrations import Trajectory
 from sidestep.tabular.graph import graph
 from sidestep.tabular.models import FIXED, IMPOSSIBLE, TabularModel, TiedModel
-from sidestep.tasks import Task, check_discount
+from sidestep.tabular.tasks import Task, check_discount
 
 
 class Environment(NamedTuple):

@@ -15,8 +15,8 @@ import yaml
 from jaxtyping import Bool, Float
 from PIL import Image
 
+from sidestep._files import read_whole, write_whole
 from sidestep.errors import InputError
-from sidestep.io.files import read_whole, write_whole
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 
 MOST_PIXELS = 100_000_000

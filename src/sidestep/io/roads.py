@@ -19,11 +19,11 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Bool, Float, Int
 
-from sidestep.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.errors import InputError
 from sidestep.io.tables import check_columns, finite_column, read_table
+from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.graph import Graph
-from sidestep.tasks import reach
+from sidestep.tabular.tasks import reach
 
 EIGHTHS = 8
 """In how many directions a turn can lead."""

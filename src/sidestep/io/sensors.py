@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from sidestep._files import read_array
 from sidestep.errors import InputError
-from sidestep.io.files import read_array
 from sidestep.io.maps import read_raster
 from sidestep.tabular.grid import Grid
 
@@ -37,7 +37,7 @@ def read_sensor_map(path: str | Path, grid: Grid) -> Float[np.ndarray, "rows col
 
 
 def read_sensor_variance(path: str | Path, grid: Grid) -> Float[np.ndarray, "rows columns"]:
-    """How surely each cell is known, from a `.npy` file: a of its logit, rows top first (see `sensed`).
+    """How surely each cell is known, from a `.npy` file: a of its logit, rows top first (see `sensor_prior`).
 
     NaN or infinite where nothing is known. Raises `InputError` for a file that holds no array of the grid's shape, and
     for numbers that are not above 0.

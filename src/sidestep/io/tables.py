@@ -12,8 +12,8 @@ import pyarrow.csv
 import pyarrow.parquet
 from jaxtyping import Float
 
+from sidestep._files import read_whole, write_whole
 from sidestep.errors import InputError
-from sidestep.io.files import read_whole, write_whole
 
 _WHOLE_NUMBER = r"^-?(0|[1-9][0-9]{0,17})$"
 _NUMBER = r"^-?(0|[1-9][0-9]{0,14})(\.[0-9]+)?([eE][+-]?[0-9]{1,3})?$"

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 import pyarrow as pa
 
-from sidestep.demonstrations import Trajectory
 from sidestep.io.walks import Walks, walks_of_table
+from sidestep.tabular.demonstrations import Trajectory
 from sidestep.tabular.grid import Grid
 
 

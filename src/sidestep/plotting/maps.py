@@ -20,9 +20,9 @@ from matplotlib.image import AxesImage
 from matplotlib.patheffects import Normal, Stroke
 from matplotlib.transforms import Affine2D
 
-from sidestep.domains.grids import World
-from sidestep.io.files import write_whole
+from sidestep._files import write_whole
 from sidestep.tabular.grid import Cell, Grid
+from sidestep.worlds.grids import World
 
 COLOURS = "magma_r"
 """The colour map of P(blocked): perceptually uniform, from nearly white at 0 to black at 1."""

@@ -13,12 +13,12 @@ def figure_belief(
     angles: Sequence[Float[np.ndarray, " moves"]],
     time_step: float,
     way: Float[np.ndarray, " iterations"],
-    believed: float,
+    mark_visited_free: float,
     real: float,
 ) -> Figure:
     """A figure of pendulums over time (radians, seconds), and of the gravity learned, iteration by iteration.
 
-    `believed` and `real` are drawn as lines of their own.
+    `mark_visited_free` and `real` are drawn as lines of their own.
     """
     figure = Figure(figsize=(9.5, 3.6), layout="constrained")
     swings, learned = figure.subplots(1, 2)
@@ -29,10 +29,10 @@ def figure_belief(
         title=f"{len(angles)} people bring a pendulum to rest", xlabel="time (s)", ylabel="angle from upright (rad)"
     )
     learned.plot(np.arange(len(way)), way, color=_WALK, label="learned from actions")
-    learned.axhline(believed, color=_BELIEVED, linestyle="--", label="what people believe")
+    learned.axhline(mark_visited_free, color=_BELIEVED, linestyle="--", label="what people believe")
     learned.axhline(real, color=_REAL, linestyle=":", label="what is so")
     learned.set(title="Gravity", xlabel="iteration", ylabel="m/s²")
-    learned.set_ylim(0.6 * min(real, believed, way.min()), 1.15 * max(real, believed, way.max()))
+    learned.set_ylim(0.6 * min(real, mark_visited_free, way.min()), 1.15 * max(real, mark_visited_free, way.max()))
     learned.legend(frameon=False, loc="lower right")
     for axes in (swings, learned):
         axes.grid(color="0.92")

@@ -8,10 +8,11 @@ state (their probabilities add up) and an outcome may be the state itself.
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
+from scipy.sparse import csr_array
 
 from sidestep.errors import InputError
-from sidestep.tabular.grid import Grid
+from sidestep.tabular.grid import Cell, Grid
 
 
 class Graph(eqx.Module):
@@ -86,3 +87,34 @@ def moves_into(grid: Grid) -> Int[np.ndarray, "states actions 3"]:
     entered = cell(change[:, 0], change[:, 1])
     beside = [cell(change[:, 0], zero), cell(zero, change[:, 1])]
     return np.stack([entered, *(np.where(straight, grid.size, side) for side in beside)], axis=-1)
+
+
+def walkable_graph(truth: Grid) -> csr_array:
+    """The legal moves between free cells of a map, as a sparse matrix of lengths in cell sides (1 or √2).
+
+    Entry (s, s′) is the length of the move from state s to s′. Diagonals do not cut corners, and a cell that
+    the map does not know counts as not walkable. The matrix is symmetric.
+
+    >>> walkable_graph(Grid(np.array([[0, 0, 1]]))).toarray()[0].tolist()
+    [0.0, 1.0, 0.0]
+    """
+    needed = moves_into(truth)
+    legal = clear_moves(truth, needed) & free_cells(truth)[:, None]
+    state, action = np.nonzero(legal)
+    lengths = truth.lengths[action]
+    return csr_array((lengths, (state, needed[state, action, 0])), shape=(truth.size, truth.size))
+
+
+def free_cells(truth: Grid) -> Bool[np.ndarray, " states"]:
+    """Return which cells a map knows to be free."""
+    return truth.known.reshape(-1) == Cell.FREE
+
+
+def clear_moves(truth: Grid, needed: Int[np.ndarray, "states actions cells"]) -> Bool[np.ndarray, "states actions"]:
+    """Whether a move stays on the map and all cells that it needs are free."""
+    return clear_cells(truth)[needed].all(axis=-1) & (needed[..., 0] < truth.size)
+
+
+def clear_cells(truth: Grid) -> Bool[np.ndarray, " cells"]:
+    """Which cells are free, and true one past the last: the entry of `moves_into` for "no such cell"."""
+    return np.append(free_cells(truth), True)

@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.demonstrations import Demonstrations, rounded_up
 from sidestep.tabular.backups import Behavior, Gradient
+from sidestep.tabular.demonstrations import Demonstrations, next_power_of_two
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import Solution, solve
-from sidestep.tabular.solvers.process import Solver, Start, action_values
-from sidestep.tasks import Task
+from sidestep.tabular.solvers.base import Solver, WarmStart, action_values
+from sidestep.tabular.tasks import Task
 
 Term = Literal["actions", "transitions"]
 ALL_TERMS: tuple[Term, ...] = ("actions", "transitions")
@@ -122,7 +122,7 @@ def choice_log_likelihood(
     task: Task,
     choices: Choices,
     behavior: Behavior,
-    start: Start,
+    start: WarmStart,
     *,
     horizon: int | None = None,
     gradient: Gradient = "exact",
@@ -154,9 +154,9 @@ def choices_of(demonstrations: Demonstrations) -> Choices:
     """The moves of each task as choices, equal ones counted."""
     task, states, actions = (np.asarray(getattr(demonstrations, name)) for name in ("task", "states", "actions"))
     different, which = np.unique(np.stack([task, states, actions]), axis=1, return_inverse=True)
-    counts = np.bincount(which.ravel(), np.asarray(demonstrations.counted))
+    counts = np.bincount(which.ravel(), np.asarray(demonstrations.weights))
     sizes = np.bincount(different[0], minlength=len(demonstrations.tasks.terminal))
-    filled = np.arange(rounded_up(max(int(sizes.max()), 16))) < sizes[:, None]
+    filled = np.arange(next_power_of_two(max(int(sizes.max()), 16))) < sizes[:, None]
 
     def padded(part: np.ndarray) -> Array:
         whole = np.zeros(filled.shape, part.dtype if part.dtype.kind == "f" else np.int32)
@@ -179,8 +179,8 @@ def arrivals_of(demonstrations: Demonstrations) -> Arrivals:
     """The moves of all tasks as arrivals, equal ones counted; filled up by the first one, with counts of 0."""
     moves = np.stack([np.asarray(getattr(demonstrations, name)) for name in ("states", "actions", "next_states")])
     different, which = np.unique(moves, axis=1, return_inverse=True)
-    counts = np.bincount(which.ravel(), np.asarray(demonstrations.counted))
-    missing = rounded_up(max(len(counts), 16)) - len(counts)
+    counts = np.bincount(which.ravel(), np.asarray(demonstrations.weights))
+    missing = next_power_of_two(max(len(counts), 16)) - len(counts)
     filled = np.concatenate([different, np.repeat(different[:, :1], missing, axis=1)], axis=1)
     states, actions, next_states = (jnp.asarray(part) for part in filled)
     return Arrivals(states, actions, next_states, jnp.asarray(np.pad(counts, (0, missing))))
@@ -215,7 +215,7 @@ def _log_policy(
 
 def _weighted(demonstrations: Demonstrations, parts: Float[Array, " moves"]) -> Float[Array, ""]:
     """The sum over moves, each by its weight."""
-    return jnp.sum(parts * demonstrations.counted.astype(parts.dtype))
+    return jnp.sum(parts * demonstrations.weights.astype(parts.dtype))
 
 
 def _nan_unless(condition: Bool[Array, ""]) -> Float[Array, ""]:

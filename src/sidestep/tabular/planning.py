@@ -16,8 +16,8 @@ from sidestep.errors import InputError, NotConverged
 from sidestep.tabular.backups import Behavior, HardMax
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import Solution, check_proper, solve
-from sidestep.tabular.solvers.process import Solver, reachable
-from sidestep.tasks import Task
+from sidestep.tabular.solvers.base import Solver, is_reachable
+from sidestep.tabular.tasks import Task
 
 
 class Plan(eqx.Module):
@@ -44,7 +44,7 @@ class Plan(eqx.Module):
         """
         if not isinstance(start, (int, np.integer)) or not 0 <= start < len(self.terminal):
             raise InputError(f"expected a state in 0…{len(self.terminal) - 1}, found {start}", field="start")
-        if not bool(reachable(self.solution.values[start])):
+        if not bool(is_reachable(self.solution.values[start])):
             raise InputError(f"the goal cannot be reached from state {start}", field="start")
         return self.follow(np.array([start]))[0]
 
@@ -77,7 +77,7 @@ def plan(model: TransitionModel, task: Task, behavior: Behavior | None = None, s
 
     >>> from sidestep.tabular.grid import Grid
     >>> from sidestep.tabular.models import ObstacleGrid
-    >>> from sidestep.tasks import reach
+    >>> from sidestep.tabular.tasks import reach
     >>> grid = Grid.unknown(rows=1, columns=4)
     >>> plan(ObstacleGrid(grid), reach(grid, 3)).path_from(0).tolist()
     [0, 1, 2, 3]

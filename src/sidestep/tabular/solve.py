@@ -20,25 +20,25 @@ from jaxtyping import Array, Bool, Float, Int
 from sidestep.errors import ImproperTask, InputError
 from sidestep.tabular.backups import Backup, Behavior, Gradient, LogSumExp
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.solvers.choice import solver_for
-from sidestep.tabular.solvers.process import (
+from sidestep.tabular.solvers.base import (
     DecisionProcess,
     Region,
     Solver,
-    Start,
-    Sweeps,
+    SolveResult,
+    WarmStart,
     action_values,
     finite_horizon,
 )
-from sidestep.tasks import Task
+from sidestep.tabular.solvers.choice import default_solver
+from sidestep.tabular.tasks import Task
 
 
 class Solution(eqx.Module):
     """The values of a task under a model, and how the solve went (with a leading `tasks` axis for several tasks).
 
-    - `values`: V(s); at discount 1, states that cannot reach a terminal state are near `process.lowest` (for −∞).
+    - `values`: V(s); at discount 1, states that cannot reach a terminal state are near `process.neg_inf` (for −∞).
     - `action_values`: Q(s, a); of all states, or of those that were asked for.
-    - `sweeps`, `residual`, `converged`: see `process.Sweeps`; a finite horizon takes one exact sweep an action.
+    - `sweeps`, `residual`, `converged`: see `process.SolveResult`; a finite horizon takes one exact sweep an action.
     - `start`: what a solve of the same task under a model nearby may start from.
     """
 
@@ -47,7 +47,7 @@ class Solution(eqx.Module):
     sweeps: Int[Array, "*tasks"]
     residual: Float[Array, "*tasks"]
     converged: Bool[Array, "*tasks"]
-    start: Start
+    start: WarmStart
 
 
 def solve(
@@ -58,7 +58,7 @@ def solve(
     horizon: int | None = None,
     gradient: Gradient = "exact",
     solver: Solver | None = None,
-    start: Start | None = None,
+    start: WarmStart | None = None,
     visited: Int[Array, "*tasks visited"] | None = None,
     region: Bool[Array, "*tasks states"] | None = None,
 ) -> Solution:
@@ -66,14 +66,14 @@ def solve(
 
     - `horizon`: how many actions people look ahead; None for the fixed point of the Bellman equation.
     - `gradient`: what derivatives of the solution mean, "exact" or "fixed_policy" (eqs. 9, 10).
-    - `solver`: how the fixed point is found; by default as `solver_for` chooses.
+    - `solver`: how the fixed point is found; by default as `default_solver` chooses.
     - `start`: what an earlier solution of the same task or tasks left; without it, the solve starts from nothing. The
       solution (in the region) does not depend on it beyond the tolerance. Differentiating with respect to
       `start.adjoint` yields the new adjoint λ, for the next solve to start from.
     - `visited`: the states whose action values are wanted; by default all. Asking for few saves time and memory when
       they are differentiated.
     - `region`: the states that have to be solved, by default all; `start.region` are those that mattered to what the
-      solve that left the start was asked for. `Ordered` brings the others up to date only roughly, which saves time.
+      solve that left the start was asked for. `GaussSeidel` brings the others up to date only roughly, which saves time.
       Where they are seen to matter, derivatives are NaN; but a state that did not matter at all and does now goes
       unseen (see `process`). So this is for guesses that are looked at again, like those of a line search.
 
@@ -82,7 +82,7 @@ def solve(
     """
     if horizon is not None and horizon < 1:
         raise InputError(f"expected at least one action, found {horizon}", field="horizon")
-    solver = solver or solver_for(behavior.backup, model.graph.states)
+    solver = solver or default_solver(behavior.backup, model.graph.states)
     horizon = None if horizon is None else int(horizon)
     return _solve(model, task, behavior, horizon, gradient, solver, start, visited, region)
 
@@ -96,7 +96,7 @@ def _solve(
     horizon: int | None,
     gradient: Gradient,
     solver: Solver,
-    start: Start | None,
+    start: WarmStart | None,
     visited: Int[Array, "*tasks visited"] | None,
     region: Bool[Array, "*tasks states"] | None,
 ) -> Solution:
@@ -109,12 +109,12 @@ def _solve(
 
     solved = jnp.ones(task.terminal.shape, dtype=bool) if region is None else region
 
-    def one(task: Task, start: Start, visited: Array | None, region: Array) -> Solution:
+    def one(task: Task, start: WarmStart, visited: Array | None, region: Array) -> Solution:
         process = DecisionProcess(
             model.graph.successors,
             probabilities,
             task.reward.astype(dtype),
-            task.final_reward.astype(dtype),
+            task.terminal_reward.astype(dtype),
             task.terminal,
             task.discount.astype(dtype),
         )
@@ -124,7 +124,7 @@ def _solve(
         else:
             values = finite_horizon(process, behavior.backup, behavior.beta, horizon, gradient)
             residual = jnp.asarray(0, values.dtype)
-            found = Sweeps(values, start.order, jnp.asarray(horizon), residual, jnp.isfinite(values).all())
+            found = SolveResult(values, start.order, jnp.asarray(horizon), residual, jnp.isfinite(values).all())
             rows = probabilities[some]
         values = found.values
         if visited is None:
@@ -133,14 +133,14 @@ def _solve(
             reward = process.reward[visited] if len(process.reward) > 1 else process.reward
             after = values[process.successors[visited]]
             q = action_values(values[visited], after, rows, reward, process.discount)
-        left = Start(jax.lax.stop_gradient(values), start.adjoint, found.order)
+        left = WarmStart(jax.lax.stop_gradient(values), start.adjoint, found.order)
         return Solution(values, q, found.sweeps, found.residual, found.converged, left)
 
     arguments = task, begin, visited, solved
     return jax.vmap(one)(*arguments) if task.terminal.ndim == 2 else one(*arguments)
 
 
-def _cold_start(solver: Solver, states: int, dtype: jnp.dtype, tasks: tuple[int, ...]) -> Start:
+def _cold_start(solver: Solver, states: int, dtype: jnp.dtype, tasks: tuple[int, ...]) -> WarmStart:
     cold = solver.cold_start(states, dtype)
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*tasks, *leaf.shape)), cold)
 
@@ -176,11 +176,11 @@ def _solve_fixed_point(
     behavior: Behavior,
     gradient: Gradient,
     solver: Solver,
-    start: Start,
+    start: WarmStart,
     visited: Int[Array, " visited"],
     region: Region,
-) -> tuple[Sweeps, Float[Array, "visited actions outcomes"]]:
-    varying = (process.probabilities, process.reward, process.final_reward, process.discount, behavior.beta)
+) -> tuple[SolveResult, Float[Array, "visited actions outcomes"]]:
+    varying = (process.probabilities, process.reward, process.terminal_reward, process.discount, behavior.beta)
     held = jax.lax.stop_gradient(varying)
     given = (process.successors, process.terminal)
     found = solver.values(_process(given, held), behavior.backup, held[-1], jax.lax.stop_gradient(start), region)
@@ -190,8 +190,8 @@ def _solve_fixed_point(
 
 
 def _process(given: tuple, varying: tuple) -> DecisionProcess:
-    (successors, terminal), (probabilities, reward, final_reward, discount, _) = given[:2], varying
-    return DecisionProcess(successors, probabilities, reward, final_reward, terminal, discount)
+    (successors, terminal), (probabilities, reward, terminal_reward, discount, _) = given[:2], varying
+    return DecisionProcess(successors, probabilities, reward, terminal_reward, terminal, discount)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -225,8 +225,8 @@ def _implicit_backward(backup: Backup, gradient: Gradient, saved: tuple, cotange
     given, varying, values, adjoint = saved
     solver, order, region, visited = given[2:]
     process, beta = _process(given, varying), varying[-1]
-    start = Start(values, adjoint, order)
-    by, found = solver.pull_back(process, backup, beta, gradient, values, cotangents[0], start, region)
+    start = WarmStart(values, adjoint, order)
+    by, found = solver.vjp(process, backup, beta, gradient, values, cotangents[0], start, region)
     by = by._replace(probabilities=by.probabilities.at[visited].add(cotangents[1]))
     return None, tuple(by), jnp.zeros_like(values), found.values
 

@@ -14,8 +14,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from sidestep._files import write_whole_folder
 from sidestep.errors import InputError, SidestepError
-from sidestep.io.files import write_whole_folder
 
 _ID = re.compile(r"(?:(?P<namespace>[-\w]+(?:/[-\w]+)*)/)?[-\w]+?(?P<version>-v\d+)?")
 

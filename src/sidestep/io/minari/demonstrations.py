@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from sidestep.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.errors import InputError
 from sidestep.io.minari.datasets import Dataset, Episode, read_dataset, require_minari, write_dataset
 from sidestep.io.minari.tasks import described, goals, pursued, size_of
+from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.grid import Grid
-from sidestep.tasks import Task
+from sidestep.tabular.tasks import Task
 
 _NO_ENDS: Mapping[int, int] = {}
 
@@ -126,7 +126,7 @@ def _rewards(demonstrations: Demonstrations[Task], states: int, actions: int) ->
     tasks, task = demonstrations.tasks, np.asarray(demonstrations.task)
     number, after = len(tasks.discount), np.asarray(demonstrations.next_states)
     acting = np.broadcast_to(np.asarray(tasks.reward, dtype=np.float64), (number, states, actions))
-    final = np.broadcast_to(np.asarray(tasks.final_reward, dtype=np.float64), (number, states))
+    final = np.broadcast_to(np.asarray(tasks.terminal_reward, dtype=np.float64), (number, states))
     paid = acting[task, np.asarray(demonstrations.states), np.asarray(demonstrations.actions)]
     ending = np.asarray(tasks.terminal)[task, after] * final[task, after]
     return paid + np.asarray(tasks.discount, dtype=np.float64)[task] * ending

@@ -1,7 +1,7 @@
 """Tasks in the metadata of a Minari dataset, whole, so that a dataset is enough to learn from.
 
 The dataset's metadata hold `tasks`, one entry a task: `discount`, `terminal` (a list of states), and `reward` and
-`final_reward`, tables whose axes may have length 1 as in `Task`. Each episode's metadata hold `goal` (the terminal
+`terminal_reward`, tables whose axes may have length 1 as in `Task`. Each episode's metadata hold `goal` (the terminal
 state that pays most; several are a list), `discount`, and `task`, the number of its entry. Where a dataset has no
 `tasks`, each episode pursues its `goal` at its `discount`, as `reach` has it.
 """
@@ -17,7 +17,7 @@ from sidestep.errors import InputError
 from sidestep.io.minari.datasets import Dataset, Episode
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.grid import Grid
-from sidestep.tasks import Task, check_discount, reach
+from sidestep.tabular.tasks import Task, check_discount, reach
 
 
 def described(tasks: Task) -> list[dict[str, Any]]:
@@ -26,7 +26,7 @@ def described(tasks: Task) -> list[dict[str, Any]]:
         {
             "discount": float(tasks.discount[index]),
             "terminal": np.flatnonzero(tasks.terminal[index]).tolist(),
-            "final_reward": np.asarray(tasks.final_reward[index], dtype=np.float64).tolist(),
+            "terminal_reward": np.asarray(tasks.terminal_reward[index], dtype=np.float64).tolist(),
             "reward": np.asarray(tasks.reward[index], dtype=np.float64).tolist(),
         }
         for index in range(len(tasks.discount))
@@ -36,7 +36,7 @@ def described(tasks: Task) -> list[dict[str, Any]]:
 def goals(entry: Mapping[str, Any]) -> list[int]:
     """The terminal states of a task that pay most; none if nothing ends it."""
     terminal = np.asarray(entry["terminal"], dtype=np.int64)
-    final = np.asarray(entry["final_reward"])
+    final = np.asarray(entry["terminal_reward"])
     paid = final[terminal] if len(final) > 1 else np.repeat(final, len(terminal))
     return terminal[paid == paid.max(initial=-np.inf)].tolist()
 
@@ -116,7 +116,7 @@ def _whole(metadata: Mapping[str, Any], field: str, source: str) -> int:
 def _task(entry: Any, world: Grid | Graph, source: str) -> Task:
     """The task that an entry describes; raises `InputError` for one that does not fit the world."""
     states, actions = size_of(world)
-    if not isinstance(entry, Mapping) or not {"discount", "terminal", "final_reward", "reward"} <= entry.keys():
+    if not isinstance(entry, Mapping) or not {"discount", "terminal", "terminal_reward", "reward"} <= entry.keys():
         raise InputError("expected discount, terminal, final_reward and reward", source=source)
     discount = _number(entry, "discount", source)
     try:
@@ -128,7 +128,7 @@ def _task(entry: Any, world: Grid | Graph, source: str) -> Task:
         raise InputError(f"expected a list of states in 0…{states - 1}", source=source, field="terminal")
     terminal = jnp.asarray(np.isin(np.arange(states), ends))
     reward = _table(entry, "reward", (states, actions), source)
-    final = _table(entry, "final_reward", (states,), source)
+    final = _table(entry, "terminal_reward", (states,), source)
     return Task(jnp.asarray(reward), jnp.asarray(final), terminal, jnp.asarray(discount, jnp.result_type(float)))
 
 

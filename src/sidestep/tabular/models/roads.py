@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from sidestep.errors import InputError
 from sidestep.tabular.graph import Graph
-from sidestep.tabular.models.outcomes import FIXED, IMPOSSIBLE, TiedModel
+from sidestep.tabular.models.categorical import FIXED, IMPOSSIBLE, TiedModel
 
 
 def road_network(

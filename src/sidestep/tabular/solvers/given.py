@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sidestep.tabular.solvers.compiled import compiled
-from sidestep.tabular.solvers.host import shared_out
+from sidestep.tabular.solvers.native import shared_out
 
 
 class Given(NamedTuple):
@@ -15,13 +15,13 @@ class Given(NamedTuple):
     successors: Int[np.ndarray, "states actions outcomes"]
     probabilities: Float[np.ndarray, "states actions outcomes"]
     reward: Float[np.ndarray, "#states #actions"]
-    final_reward: Float[np.ndarray, "#states"]
+    terminal_reward: Float[np.ndarray, "#states"]
     terminal: Bool[np.ndarray, " states"]
     discount: np.floating
 
 
 class Found(NamedTuple):
-    """Where a solver writes what it found; fields as in `Sweeps`."""
+    """Where a solver writes what it found; fields as in `SolveResult`."""
 
     values: Float[np.ndarray, " states"]
     order: Int[np.ndarray, " states"]
@@ -34,7 +34,7 @@ class Outcome(NamedTuple):
     """How a solve went.
 
     - `sweeps`: how often a state was solved on average, rounded up.
-    - `residual`, `converged`: as in `Sweeps`.
+    - `residual`, `converged`: as in `SolveResult`.
     """
 
     sweeps: int

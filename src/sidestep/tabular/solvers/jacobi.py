@@ -18,19 +18,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sidestep.tabular.backups import Backup, Gradient
-from sidestep.tabular.solvers.process import (
+from sidestep.tabular.solvers.base import (
     Beta,
+    Cotangents,
     DecisionProcess,
-    Gradients,
     Region,
     Solver,
-    Start,
-    Sweeps,
+    SolveResult,
     Tolerance,
+    WarmStart,
     at_fixed_policy,
+    is_reachable,
     lower_bound,
-    lowest,
-    reachable,
+    neg_inf,
 )
 
 _PATIENCE = 1_000
@@ -54,11 +54,13 @@ class Jacobi(Solver):
     tolerance: Tolerance = None
     max_sweeps: int = eqx.field(default=20_000, static=True)
 
-    def cold_start(self, states: int, dtype: jnp.dtype) -> Start:
+    def cold_start(self, states: int, dtype: jnp.dtype) -> WarmStart:
         """No values, no adjoint; an order is not used."""
-        return Start(jnp.full(states, lowest(dtype), dtype), jnp.zeros(states, dtype), jnp.zeros(0, jnp.int32))
+        return WarmStart(jnp.full(states, neg_inf(dtype), dtype), jnp.zeros(states, dtype), jnp.zeros(0, jnp.int32))
 
-    def values(self, process: DecisionProcess, backup: Backup, beta: Beta, start: Start, region: Region) -> Sweeps:
+    def values(
+        self, process: DecisionProcess, backup: Backup, beta: Beta, start: WarmStart, region: Region
+    ) -> SolveResult:
         """V of the fixed point, of all states whatever the region."""
         del region
         split = _split(process)
@@ -72,10 +74,10 @@ class Jacobi(Solver):
             solved = process.end(_own_equation(backup, beta, elsewhere, leaving, values))
             return solved, jnp.maximum(jnp.abs(solved), jnp.abs(elsewhere).max(axis=0))
 
-        known = jnp.where(reachable(start.values), start.values, lower_bound(process))
+        known = jnp.where(is_reachable(start.values), start.values, lower_bound(process))
         return self._iterate(sweep, process.end(known), start.order)
 
-    def pull_back(
+    def vjp(
         self,
         process: DecisionProcess,
         backup: Backup,
@@ -83,18 +85,18 @@ class Jacobi(Solver):
         gradient: Gradient,
         values: Float[Array, " states"],
         cotangent: Float[Array, " states"],
-        start: Start,
+        start: WarmStart,
         region: Region,
-    ) -> tuple[Gradients, Sweeps]:
+    ) -> tuple[Cotangents, SolveResult]:
         """The gradient by all that the values depend on: the adjoint, and one backup pulled back by JAX."""
         del region
         # states that cannot reach a terminal state have no values to speak of, and no part in the gradient
-        live = reachable(values) & ~process.terminal
+        live = is_reachable(values) & ~process.terminal
 
         def action_values(process: DecisionProcess) -> Float[Array, "states actions"]:
             return jnp.where(live[:, None], process.action_values(values), 0)
 
-        def one_backup(by: Gradients) -> Float[Array, " states"]:
+        def one_backup(by: Cotangents) -> Float[Array, " states"]:
             varied = DecisionProcess(process.successors, *by[:3], process.terminal, by.discount)
             q = action_values(varied)
             backed_up = backup.value(q, by.beta) if gradient == "exact" else at_fixed_policy(backup, by.beta, q)
@@ -104,7 +106,7 @@ class Jacobi(Solver):
         policy = backup.fixed_policy_weights(q, beta)
         weights = backup.weights(q, beta) if gradient == "exact" else policy
         found = self._adjoint(process, weights, policy, live, cotangent, start)
-        at = Gradients(process.probabilities, process.reward, process.final_reward, process.discount, beta)
+        at = Cotangents(process.probabilities, process.reward, process.terminal_reward, process.discount, beta)
         adjoint = jnp.where(found.converged, found.values, jnp.nan)
         by = jax.vjp(one_backup, at)[1](adjoint)[0]
         # what the adjoint had no part in would stay 0
@@ -118,8 +120,8 @@ class Jacobi(Solver):
         policy: Float[Array, "states actions"],
         live: Bool[Array, " states"],
         cotangent: Float[Array, " states"],
-        start: Start,
-    ) -> Sweeps:
+        start: WarmStart,
+    ) -> SolveResult:
         """λ = g + Wᵀλ for the gradient g = `cotangent`.
 
         `weights` are those in W, `policy` those of the policy held fixed; `live` are the states whose values pass on
@@ -144,7 +146,7 @@ class Jacobi(Solver):
         sweep: Callable[[Array], tuple[Array, Array]],
         start: Float[Array, " states"],
         order: Int[Array, " ordered"],
-    ) -> Sweeps:
+    ) -> SolveResult:
         """Sweeps until no change is large beside the sizes that `sweep` gives with its values."""
         tolerance = self.tolerance_for(start.dtype)
         patience = max(_PATIENCE, len(start))
@@ -167,10 +169,10 @@ class Jacobi(Solver):
             lost = jnp.isnan(residual) & jnp.isfinite(pace.smallest)
             anew = lost | ((waited >= patience) & (turns >= _TURNS))
             # nobody goes part of the way to or from a state that has no value yet
-            part = jnp.where(reachable(values) & reachable(old), pace.share, 1)
+            part = jnp.where(is_reachable(values) & is_reachable(old), pace.share, 1)
             taken = jnp.where(part < 1, old + part * (values - old), values)
             left = jnp.where(lost, jnp.inf, residual)
-            found = Sweeps(jnp.where(anew, start, taken), order, pace.found.sweeps + 1, left, left <= tolerance)
+            found = SolveResult(jnp.where(anew, start, taken), order, pace.found.sweeps + 1, left, left <= tolerance)
             return _Pace(
                 found,
                 jnp.where(anew, 0, change),
@@ -181,7 +183,7 @@ class Jacobi(Solver):
             )
 
         none, endless = jnp.asarray(0), jnp.asarray(jnp.inf, start.dtype)
-        found = Sweeps(start, order, none, endless, jnp.asarray(False))
+        found = SolveResult(start, order, none, endless, jnp.asarray(False))
         begun = _Pace(found, jnp.zeros_like(start), jnp.ones_like(endless), endless, none, none)
         return jax.lax.while_loop(unfinished, step, begun).found
 
@@ -195,7 +197,7 @@ class _Pace(NamedTuple):
     - `waited`, `turns`: sweeps since then, and in how many of them a large change turned about.
     """
 
-    found: Sweeps
+    found: SolveResult
     change: Float[Array, " states"]
     share: Float[Array, ""]
     smallest: Float[Array, ""]
@@ -226,8 +228,8 @@ def _moves_so_far(
 
     Once no state can be reached any more, the states that have not been are hopeless, and whatever leads there too.
     """
-    known = reachable(after)
-    frontier = ~reachable(values) & jnp.any(known & (split.elsewhere > 0), axis=(0, 1))
+    known = is_reachable(after)
+    frontier = ~is_reachable(values) & jnp.any(known & (split.elsewhere > 0), axis=(0, 1))
     return jnp.where(known | ~frontier.any(), split.elsewhere, 0)
 
 
@@ -239,11 +241,11 @@ def _own_equation(
     old: Float[Array, " states"],
 ) -> Float[Array, " states"]:
     """One Newton step on each state's own equation, from its old value, kept on the right side of the escape."""
-    bottom = lowest(old.dtype)
+    bottom = neg_inf(old.dtype)
     escapes = jnp.where(leaving > 0, elsewhere / jnp.where(leaving > 0, leaving, 1), bottom)
     escape = jnp.maximum(escapes.max(axis=0), bottom)
     toward = jnp.maximum if backup.above_maximum else jnp.minimum
-    start = jnp.where(reachable(old), toward(old, escape), escape)
+    start = jnp.where(is_reachable(old), toward(old, escape), escape)
     advantage = (elsewhere - leaving * start).T
     divisor = _divisor(backup.weights(advantage, beta), backup.fixed_policy_weights(advantage, beta), leaving)
     value = backup.value(advantage, beta)
@@ -254,7 +256,7 @@ def _own_equation(
         chord = backup.value((elsewhere - leaving * escape).T, beta) - value
         divisor = jnp.where(too_high, chord / jnp.where(too_high, start - escape, 1), divisor)
     solved = toward(start + value / divisor, escape)
-    return jnp.where(reachable(escape), jnp.maximum(solved, bottom), bottom)
+    return jnp.where(is_reachable(escape), jnp.maximum(solved, bottom), bottom)
 
 
 def _divisor(

@@ -11,7 +11,7 @@ from jaxtyping import Int
 
 from sidestep.tabular.solvers.compiled import compiled
 from sidestep.tabular.solvers.given import Given
-from sidestep.tabular.solvers.host import shared_out
+from sidestep.tabular.solvers.native import shared_out
 
 
 class Numbered(NamedTuple):

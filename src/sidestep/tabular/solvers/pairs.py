@@ -12,7 +12,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from sidestep.tabular.solvers.host import at_once, heed_interrupts
+from sidestep.tabular.solvers.native import at_once, heed_interrupts
 
 _Result = TypeVar("_Result")
 _SweepOf = Callable[[np.ndarray], _Result]

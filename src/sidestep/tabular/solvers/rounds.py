@@ -23,12 +23,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from sidestep.tabular.solvers.base import neg_inf
 from sidestep.tabular.solvers.given import Outcome
-from sidestep.tabular.solvers.host import heed_interrupts, shared_out
+from sidestep.tabular.solvers.native import heed_interrupts, shared_out
 from sidestep.tabular.solvers.numbering import Numbered
 from sidestep.tabular.solvers.pairs import one_behind_the_other
-from sidestep.tabular.solvers.process import lowest
-from sidestep.tabular.solvers.sweeping import BOLTZMANN, LOG_SUM_EXP, Marks, Valuing, sweep_for
+from sidestep.tabular.solvers.value_kernels import BOLTZMANN, LOG_SUM_EXP, Marks, Valuing, sweep_for
 
 _SHIFTED = (BOLTZMANN, LOG_SUM_EXP)
 """The backups whose sweeps shift farther values."""
@@ -212,7 +212,7 @@ class Rounds:
             shifted,
             everyone or sweep.number == 1,
             _STILL * self.tolerance,
-            self.values.dtype.type(lowest(self.values.dtype)),
+            self.values.dtype.type(neg_inf(self.values.dtype)),
         )
 
     def _given_up(self) -> bool:

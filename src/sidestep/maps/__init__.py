@@ -1,0 +1,1 @@
+"""Learned maps: the configuration, learning from walks, and the result on disk."""

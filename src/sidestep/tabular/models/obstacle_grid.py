@@ -1,0 +1,199 @@
+"""Grids on which cells, or the borders between them, may be blocked.
+
+The **obstacle grid** has one logit θ(s) a cell, P(blocked at s) = σ(θ(s)). A move succeeds if every cell that it needs
+is free, and otherwise stays put (the paper's experiments):
+
+    T_θ(s, a, s′) = Π_{c needed} (1 − σ(θ(c))),    T_θ(s, a, s) = 1 − T_θ(s, a, s′).
+
+In a **featured grid** the logits are a function of what is known of each cell, θ(s) = f_w(features(s)), and its weights
+w are learned. In a **walled grid** it is the border between two cells that may be closed, P(closed) = σ(θ(border)).
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+
+from sidestep.errors import InputError
+from sidestep.tabular.graph import Graph, grid_graph
+from sidestep.tabular.grid import STEPS, Cell, Grid
+from sidestep.tabular.models.base import TransitionModel
+from sidestep.tabular.models.categorical import FIXED, IMPOSSIBLE, TiedModel
+
+
+class ObstacleGrid(TransitionModel):
+    """A grid whose cells may be blocked; moves into a blocked cell stay put.
+
+    - `parameters`: one logit a cell, θ(s), P(blocked) = σ(θ(s)); those of known cells have no effect.
+    - `known`: what the map says of each cell (a `Cell` value); known cells are held at 0 or 1.
+
+    >>> ObstacleGrid(Grid.unknown(2, 3)).blocked.shape
+    (2, 3)
+    """
+
+    graph: Graph
+    parameters: Float[Array, " cells"]
+    known: Int[Array, "rows columns"]
+
+    def __init__(self, grid: Grid, logits: Float[Array | np.ndarray, " cells"] | float = -2.0):
+        """A model of a grid at the given logits (one number for all, or one a cell)."""
+        self.graph = grid_graph(grid)
+        self.known = jnp.asarray(grid.known)
+        dtype = logits.dtype if isinstance(logits, (jax.Array, np.ndarray)) else jnp.result_type(float)
+        self.parameters = jnp.broadcast_to(jnp.asarray(logits, dtype), (grid.size,))
+
+    @property
+    def blocked(self) -> Float[Array, "rows columns"]:
+        """P(blocked), one value a cell, row 0 at the top; exactly 0 or 1 where the map knows."""
+        return blocked_of(self.parameters, self.known)
+
+    def probabilities(self) -> Float[Array, "states actions outcomes"]:
+        """(success, failure) of every move."""
+        return chances_of_moves(self.parameters, self.known, self.graph.actions)
+
+    @property
+    def blank(self) -> Grid:
+        """The grid, with nothing known of its cells."""
+        rows, columns = self.known.shape
+        return Grid.unknown(rows, columns, 4 if self.graph.actions == 4 else 8)
+
+
+class FeaturedGrid(TransitionModel):
+    """A grid whose cells are blocked as a function of what is known of each of them says.
+
+    A floor type, a colour in an image of the site, what a sensor saw of it: what is learned of one cell so holds for
+    all that look alike.
+
+    - `parameters`: w, the floating-point arrays of a network.
+    - `features`: what is known of each cell, cells in the order of states.
+    - `known`: as in `ObstacleGrid`.
+
+    >>> import equinox as eqx
+    >>> network = eqx.nn.Linear(2, "scalar", key=jax.random.key(0))
+    >>> FeaturedGrid(Grid.unknown(2, 3), jnp.ones((6, 2)), network).blocked.shape
+    (2, 3)
+    """
+
+    graph: Graph
+    parameters: PyTree[Float[Array, "..."]]
+    network: Callable[[Float[Array, " features"]], Float[Array, ""]]
+    features: Float[Array, "cells features"]
+    known: Int[Array, "rows columns"]
+
+    def __init__(
+        self,
+        grid: Grid,
+        features: Float[Array | np.ndarray, "cells features"],
+        network: Callable[[Float[Array, " features"]], Float[Array, ""]],
+    ):
+        """A model from a network (an Equinox module) that makes one logit of the features of a cell.
+
+        Raises `InputError` for features that are not finite or not those of every cell, and for a network without
+        parameters or with another output.
+        """
+        features = jnp.asarray(features)
+        if features.shape[0] != grid.size or not np.isfinite(features).all():
+            raise InputError(f"expected {grid.size} rows of finite numbers, found {features.shape}", field="features")
+        self.graph, self.known, self.features = grid_graph(grid), jnp.asarray(grid.known), features
+        self.parameters, self.network = eqx.partition(network, eqx.is_inexact_array)
+        if not jax.tree.leaves(self.parameters):
+            raise InputError("expected parameters to learn, found none", field="network")
+        found = jax.eval_shape(network, features[0]).shape
+        if found != ():
+            raise InputError(f"expected one number for each cell, found shape {found}", field="network")
+
+    @property
+    def logits(self) -> Float[Array, " cells"]:
+        """f_w of every cell."""
+        return jax.vmap(eqx.combine(self.parameters, self.network))(self.features)
+
+    @property
+    def blocked(self) -> Float[Array, "rows columns"]:
+        """P(blocked), as in `ObstacleGrid`."""
+        return blocked_of(self.logits, self.known)
+
+    def probabilities(self) -> Float[Array, "states actions outcomes"]:
+        """(success, failure) of every move."""
+        return chances_of_moves(self.logits, self.known, self.graph.actions)
+
+
+def borders(grid: Grid) -> Int[np.ndarray, "borders 2"]:
+    """The two cells on either side of every border inside a grid: first those between columns, then between rows."""
+    cells = np.arange(grid.size).reshape(grid.shape)
+    sides = (cells[:, :-1], cells[:, 1:]), (cells[:-1], cells[1:])
+    return np.concatenate([np.stack([one.ravel(), other.ravel()], axis=1) for one, other in sides])
+
+
+def walled_grid(grid: Grid, logits: Float[Array | np.ndarray, " borders"] | float = -2.0) -> TiedModel:
+    """A grid in which the borders between cells may be closed, P(closed) = σ(θ), in the order of `borders(grid)`.
+
+    A border is the same from both sides. Cells that the map knows to be blocked stay so. Raises `InputError` for
+    8-connected grids: a diagonal crosses no border.
+    """
+    if grid.connectivity != 4:
+        raise InputError("expected 4: a diagonal crosses no border", field="connectivity")
+    graph, between = grid_graph(grid), borders(grid)
+    number = {(int(a), int(b)): index for index, pair in enumerate(between) for a, b in (pair, pair[::-1])}
+    index = np.full(graph.successors.shape, IMPOSSIBLE)
+    for state, targets in enumerate(np.asarray(graph.successors[..., 0])):
+        for action, target in enumerate(targets):
+            if target == state or grid.known.flat[target] == Cell.OCCUPIED:
+                index[state, action, 1] = FIXED
+            else:
+                index[state, action] = FIXED, number[state, int(target)]
+    return TiedModel(graph, index, jnp.broadcast_to(jnp.asarray(logits, jnp.result_type(float)), (len(between),)))
+
+
+def blocked_of(logits: Float[Array, " cells"], known: Int[Array, "rows columns"]) -> Float[Array, "rows columns"]:
+    """P(blocked), exactly 0 or 1 where the map knows."""
+    learned = jax.nn.sigmoid(logits).reshape(known.shape)
+    return jnp.where(known == Cell.UNKNOWN, learned, (known == Cell.OCCUPIED).astype(learned.dtype))
+
+
+def chances_of_moves(
+    logits: Float[Array, " cells"], known: Int[Array, "rows columns"], actions: int
+) -> Float[Array, "states actions outcomes"]:
+    """(success, failure) of every move, from the logits of the cells."""
+    certain = jnp.where(known == Cell.OCCUPIED, jnp.inf, -jnp.inf)
+    logits = jnp.where(known == Cell.UNKNOWN, logits.reshape(known.shape), certain)
+    # off the map nothing is blocked
+    free = jnp.pad(jax.nn.sigmoid(-logits), 1, constant_values=1)
+    blocked = jnp.pad(jax.nn.sigmoid(logits), 1)
+    # without a barrier the compiler works these out anew for every move
+    free, blocked = jax.lax.optimization_barrier((free, blocked))
+    outcomes = [
+        outcome for down, right in STEPS[:actions].tolist() for outcome in _outcomes(free, blocked, down, right)
+    ]
+    return jnp.stack(outcomes, axis=-1).reshape(-1, actions, 2)
+
+
+def _outcomes(
+    free: Float[Array, "padded_rows padded_columns"],
+    blocked: Float[Array, "padded_rows padded_columns"],
+    down: int,
+    right: int,
+) -> tuple[Float[Array, "rows columns"], Float[Array, "rows columns"]]:
+    """The probabilities that a move from each cell succeeds, and that it fails, from those of the padded map's cells.
+
+    Slices of the map rather than look-ups: their derivatives are slices too.
+    """
+    rows, columns = free.shape[0] - 2, free.shape[1] - 2
+
+    def beside(cells: Array, i: int, j: int) -> Array:
+        return cells[1 + i : 1 + i + rows, 1 + j : 1 + j + columns]
+
+    success, failure = beside(free, down, right), beside(blocked, down, right)
+    for i, j in ((down, 0), (0, right)) if down and right else ():
+        # 1 − Π free, summed without cancellation where obstacles are improbable
+        failure = failure + success * beside(blocked, i, j)
+        success = success * beside(free, i, j)
+    return success, failure
+
+
+def true_model(grid: Grid) -> ObstacleGrid:
+    """The deterministic model of a map that is taken at its word; what it does not know counts as blocked."""
+    known = np.where(grid.known == Cell.FREE, Cell.FREE, Cell.OCCUPIED)
+    return ObstacleGrid(Grid(known, grid.resolution, grid.origin, grid.connectivity))

@@ -1,0 +1,89 @@
+"""Grids on which moves slip sideways, beside cells that may be blocked.
+
+A walker in a cell of terrain t who moves one way goes that way with probability 1 − p_t and slips at a right angle with
+p_t = σ(φ_t), to either side as often. Whichever way it is, the move then succeeds or stays put as in the obstacle grid.
+With f(s, d) = Π_{c needed} (1 − σ(θ(c))), the probability that nothing is in the way in direction d, and l, r the sides
+of a,
+
+    T_θ(s, a, s + a) = (1 − p) f(s, a),    T_θ(s, a, s + l) = (p/2) f(s, l),    T_θ(s, a, s + r) = (p/2) f(s, r),
+
+and s itself takes the rest. The slip is one and the same wherever the terrain is, so what is seen of it in one place
+holds everywhere; and who slips against a wall learns of it.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sidestep.errors import InputError
+from sidestep.tabular.graph import Graph, grid_graph
+from sidestep.tabular.grid import STEPS, Grid
+from sidestep.tabular.models.base import TransitionModel
+from sidestep.tabular.models.obstacle_grid import blocked_of, chances_of_moves
+
+_WAYS = np.array([[STEPS.tolist().index(way) for way in ([i, j], [j, -i], [-j, i])] for i, j in STEPS.tolist()])
+"""Each direction, and the two at a right angle to it."""
+
+
+class SlipperyGrid(TransitionModel):
+    """A grid whose cells may be blocked and on which moves slip sideways, as often wherever the terrain is the same.
+
+    - `parameters`: the cells' logits θ, then the logits φ of the slips, one a terrain.
+    - `terrain`: of each cell, 0…n−1; −1 where nobody slips.
+    - `known`: as in `ObstacleGrid`.
+
+    >>> SlipperyGrid(Grid.unknown(2, 3), slip=0.0).slip.tolist()
+    [0.5]
+    """
+
+    graph: Graph
+    parameters: Float[Array, " logits"]
+    terrain: Int[Array, " cells"]
+    known: Int[Array, "rows columns"]
+
+    def __init__(
+        self,
+        grid: Grid,
+        logits: Float[Array | np.ndarray, " cells"] | float = -2.0,
+        slip: Float[Array | np.ndarray, " terrains"] | float = -2.0,
+        terrain: Int[np.ndarray, "rows columns"] | None = None,
+    ):
+        """A model at the given logits of cells and of slips (one number for all, or one a cell or terrain).
+
+        `terrain` is by default the same everywhere. Raises `InputError` for terrain of another shape than the grid,
+        below −1, or without a cell of some kind below the largest.
+        """
+        terrain = np.zeros(grid.shape, dtype=np.int64) if terrain is None else terrain
+        if terrain.shape != grid.shape:
+            raise InputError(f"expected the grid's shape {grid.shape}, found {terrain.shape}", field="terrain")
+        kinds = np.unique(terrain[terrain >= 0])
+        if terrain.min() < -1 or len(kinds) == 0 or kinds[-1] != len(kinds) - 1:
+            raise InputError("expected the kinds 0…n−1 all to be there, and −1 where nobody slips", field="terrain")
+        straight = grid_graph(grid)
+        onto, staying = straight.successors[..., 0], straight.successors[..., 1:]
+        successors = jnp.concatenate([onto[:, _WAYS[: straight.actions]], staying], axis=-1)
+        self.graph = Graph(successors, straight.lengths)
+        self.known, self.terrain = jnp.asarray(grid.known), jnp.asarray(terrain.ravel(), jnp.int32)
+        cells = jnp.broadcast_to(jnp.asarray(logits, jnp.result_type(float)), (grid.size,))
+        self.parameters = jnp.append(cells, jnp.broadcast_to(jnp.asarray(slip, cells.dtype), (len(kinds),)))
+
+    @property
+    def blocked(self) -> Float[Array, "rows columns"]:
+        """P(blocked), as in `ObstacleGrid`."""
+        return blocked_of(self.parameters[: self.known.size], self.known)
+
+    @property
+    def slip(self) -> Float[Array, " terrains"]:
+        """P(slip) of each terrain, to either side together."""
+        return jax.nn.sigmoid(self.parameters[self.known.size :])
+
+    def probabilities(self) -> Float[Array, "states actions 4"]:
+        """Of going ahead, to one side, to the other, and of staying put."""
+        cells, slips = jnp.split(self.parameters, [self.known.size])
+        own = jnp.where(self.terrain < 0, -jnp.inf, slips[self.terrain])
+        ahead, aside = jax.nn.sigmoid(-own), jax.nn.sigmoid(own) / 2
+        shares = jnp.stack([ahead, aside, aside], axis=-1)[:, None, :, None]
+        chances = chances_of_moves(cells, self.known, self.graph.actions)
+        outcomes = shares * chances[:, _WAYS[: self.graph.actions]]
+        return jnp.concatenate([outcomes[..., 0], outcomes[..., 1].sum(axis=-1, keepdims=True)], axis=-1)

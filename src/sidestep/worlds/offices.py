@@ -1,0 +1,121 @@
+"""Offices made at random: rooms with doors on both sides of corridors, all free cells within reach."""
+
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Int
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from sidestep.errors import InputError
+from sidestep.tabular.graph import walkable_graph
+from sidestep.tabular.grid import Cell, Connectivity, Grid
+
+_SMALLEST = (10, 8)
+_WING = 18
+"""Rows from one outer wall to the next: rooms, a corridor, rooms."""
+_BETWEEN_CROSSINGS = 40
+"""Columns from one crossing corridor to the next."""
+_CANDIDATES = 16
+
+
+def office(rows: int, columns: int, seed: int, connectivity: Connectivity = 4) -> Grid:
+    """A random office of `rows` × `columns` cells of one metre, fully known.
+
+    Corridors run from left to right with rooms above and below, each with a door to the corridor and some
+    with one to the room beside it; where there are several corridors, others cross them. Equal seeds give
+    equal offices. Raises `InputError` below 10 rows or 8 columns.
+
+    >>> office(20, 30, seed=0).shape
+    (20, 30)
+    """
+    if rows < _SMALLEST[0] or columns < _SMALLEST[1]:
+        raise InputError(
+            f"expected at least {_SMALLEST[0]} rows and {_SMALLEST[1]} columns, found {rows} and {columns}"
+        )
+    random = np.random.default_rng(seed)
+    cells = np.full((rows, columns), int(Cell.OCCUPIED), dtype=np.int64)
+    wings = max(1, round((rows - 1) / _WING))
+    crossings = _crossings(wings, columns, random)
+    for top, bottom in pairwise(np.linspace(0, rows - 1, wings + 1).round().astype(int).tolist()):
+        _add_wing(cells, top, bottom, crossings, random)
+    for left in crossings:
+        cells[1:-1, left : left + 2] = Cell.FREE
+    return Grid(cells, connectivity=connectivity)
+
+
+def places(grid: Grid, count: int, seed: int) -> Int[np.ndarray, " count"]:
+    """`count` different free cells (states) that lie well apart and can reach one another, drawn at random.
+
+    Each is the one farthest on foot from those before it, out of 16 drawn at random from the largest
+    connected part of the map. Raises `InputError` if that has fewer than `count` cells, or for a count below
+    1.
+    """
+    graph = walkable_graph(grid)
+    candidates = connected_cells(grid)
+    if not 1 <= count <= len(candidates):
+        raise InputError(f"expected 1…{len(candidates)} (the free cells within reach), found {count}", field="count")
+    random = np.random.default_rng(seed)
+    chosen = [int(random.choice(candidates))]
+    distance = dijkstra(graph, indices=chosen[0])
+    while len(chosen) < count:
+        remaining = candidates[distance[candidates] > 0]
+        drawn = random.choice(remaining, size=min(_CANDIDATES, len(remaining)), replace=False)
+        chosen.append(int(drawn[np.argmax(distance[drawn])]))
+        distance = np.minimum(distance, dijkstra(graph, indices=chosen[-1]))
+    return np.array(chosen)
+
+
+def connected_cells(grid: Grid) -> Int[np.ndarray, " cells"]:
+    """The free cells (states) of the largest part of a map in which every cell can be reached from every other."""
+    label = connected_components(walkable_graph(grid), directed=False)[1]
+    free = grid.known.reshape(-1) == Cell.FREE
+    return np.flatnonzero(free & (label == np.argmax(np.bincount(label, weights=free))))
+
+
+def _crossings(wings: int, columns: int, random: np.random.Generator) -> list[int]:
+    """The left columns of the corridors that cross the wings; a single wing needs none."""
+    if wings == 1:
+        return []
+    count = max(1, round(columns / _BETWEEN_CROSSINGS))
+    stretch = columns / count
+    drawn = stretch * (np.arange(count) + random.uniform(0.3, 0.7, size=count))
+    # three columns from the outer walls, so that the outermost rooms have a floor
+    return np.clip(drawn.astype(int), 3, columns - 5).tolist()
+
+
+def _add_wing(cells: np.ndarray, top: int, bottom: int, crossings: list[int], random: np.random.Generator) -> None:
+    """Clear a corridor and the rooms beside it, between the walls in rows `top` and `bottom`."""
+    height = 2 if bottom - top > 12 else 1
+    corridor = top + (bottom - top - height) // 2 + int(random.integers(0, 2))
+    cells[corridor : corridor + height, 1:-1] = Cell.FREE
+    below = corridor + height
+    _add_rooms(cells, (top + 1, corridor - 2), corridor - 1, crossings, random)
+    _add_rooms(cells, (below + 1, bottom - 1), below, crossings, random)
+
+
+def _add_rooms(
+    cells: np.ndarray, rows: tuple[int, int], door_row: int, crossings: list[int], random: np.random.Generator
+) -> None:
+    """Clear a line of rooms in `rows` (first and last), each with a door in the wall at `door_row`."""
+    first, last = rows
+    columns = cells.shape[1]
+    # a crossing corridor has a wall on either side, and the rooms end there
+    stretches = pairwise([0, *(column for left in crossings for column in (left - 1, left + 2)), columns - 1])
+    for index, (left, right) in enumerate(stretches):
+        if index % 2 == 1:
+            continue
+        walls = _room_walls(left, right, random)
+        for west, east in pairwise(walls):
+            cells[first : last + 1, west + 1 : east] = Cell.FREE
+            cells[door_row, random.integers(west + 1, east)] = Cell.FREE
+        for wall in walls[1:-1]:
+            if random.random() < 0.3:
+                cells[random.integers(first, last + 1), wall] = Cell.FREE
+
+
+def _room_walls(left: int, right: int, random: np.random.Generator) -> list[int]:
+    """The columns of the walls of a line of rooms, 3 to 8 columns of floor between them if there is room."""
+    walls = [left]
+    while right - walls[-1] > 9:
+        walls.append(walls[-1] + int(random.integers(4, min(9, right - walls[-1] - 4) + 1)))
+    return [*walls, right]

@@ -1,0 +1,191 @@
+"""Rivals on small maps where it is known what they must find, and what they cannot."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sidestep.baselines import behavior_cloning as cloning
+from sidestep.baselines.behavior_cloning import behavior_cloning
+from sidestep.baselines.constraint_inference import constraint_inference
+from sidestep.baselines.interface import behavior_aware, known_map, mean_log_likelihood, transitions_only, visit_counts
+from sidestep.baselines.joint import joint_estimation
+from sidestep.baselines.maxent_irl import CostlyReward, maxent_irl
+from sidestep.maps.config import Settings
+from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
+from sidestep.tabular.demonstrations import Trajectory, gather
+from sidestep.tabular.grid import Grid
+from sidestep.tabular.models import ObstacleGrid, true_model
+from sidestep.tabular.planning import plan
+from sidestep.tabular.simulation import simulate
+from sidestep.tabular.tasks import reach, with_state_costs
+
+WALL = np.zeros((5, 5), int)
+WALL[:4, 2] = 1
+TRUTH, BLANK = Grid(WALL), Grid.unknown(5, 5)
+GOALS = (0, 4, 9, 15)
+
+
+@pytest.fixture(scope="module")
+def walks():
+    """Optimal walks around a wall, in both directions."""
+    free = np.flatnonzero(WALL.ravel() == 0)
+    tasks = [reach(BLANK, goal) for goal in GOALS]
+    starts = [np.setdiff1d(free, [goal]) for goal in GOALS]
+    return gather(simulate(jax.random.key(0), true_model(TRUTH), tasks, starts), tasks)
+
+
+@pytest.mark.parametrize("method", [behavior_aware, constraint_inference, joint_estimation])
+def test_a_wall_that_stood_in_the_way_is_found(method, walks):
+    """All of it that anybody would have crossed, which is more than every cell that nobody visited."""
+    learned = method(BLANK, walks, Settings())
+    assert learned.ranking[WALL == 1].min() > learned.ranking[WALL == 0].max()
+    assert (np.asarray(learned.model.blocked)[WALL == 1] > 0.5).all()
+    path = plan(learned.model, learned.reward.reach(BLANK, 4)).path_from(0)
+    assert len(path) == 13
+    assert not WALL.ravel()[path].any()
+
+
+def test_visits_are_counted():
+    walk = Trajectory(np.array([0, 1, 2, 1, 2, 7]), np.array([3, 3, 2, 3, 1]), 0)
+    demos = gather([walk], [reach(BLANK, 7)])
+    learned = visit_counts(BLANK, demos, Settings())
+    blocked = np.asarray(learned.model.blocked).ravel()
+    np.testing.assert_allclose(blocked[[0, 1, 2, 7]], [1 / 2, 1 / 3, 1 / 3, 1 / 2])
+    np.testing.assert_allclose(np.delete(blocked, [0, 1, 2, 7]), 0.98)
+    assert learned.ranking.ravel()[[0, 1, 3]].tolist() == [-1, -2, 0]
+
+
+def test_transitions_alone_say_nothing_of_what_nobody_touched(walks):
+    blocked = np.asarray(transitions_only(BLANK, walks, Settings(lines=0.0)).model.blocked)
+    prior = 1 / (1 + np.exp(-Settings().prior_mean))
+    np.testing.assert_allclose(blocked[WALL == 1], prior, atol=1e-4)
+    assert blocked[WALL == 0].max() < prior
+
+
+def test_costs_explain_detours_without_walls(walks):
+    """They are highest where people would have walked, no move fails, and plans go round what is dear."""
+    learned = maxent_irl(BLANK, walks, Settings())
+    assert np.asarray(learned.model.blocked).max() == 0
+    assert learned.ranking[1:4, 2].min() > learned.ranking[WALL == 0].mean()
+    path = plan(learned.model, learned.reward.reach(BLANK, 9)).path_from(5)
+    assert not WALL.ravel()[path].any()
+
+
+def test_costs_are_what_makes_actions_most_probable():
+    """A corridor and a way round it: of a hundred walkers forty go through, and the cost explains that share."""
+    known = np.array([[0, 0, 0], [0, 1, 0], [0, 0, 0]])
+    grid = Grid(known)
+    around = Trajectory(np.array([3, 0, 1, 2, 5]), np.array([0, 3, 3, 1]), 0)
+    under = Trajectory(np.array([3, 6, 7, 8, 5]), np.array([1, 3, 3, 0]), 0)
+    settings = Settings(beta=40.0)
+    demos = gather([around] * 60 + [under] * 40, [reach(grid, 5)])
+    learned = maxent_irl(grid, demos, settings)
+    task = learned.reward.reach(grid, 5)
+    policy = plan(learned.model, task, learned.behavior).policy
+    assert float(policy[3, 0] / (policy[3, 0] + policy[3, 1])) == pytest.approx(0.6, abs=0.05)
+    assert learned.ranking[2].sum() > learned.ranking[0].sum()
+    paid = np.asarray(task.reward - reach(grid, 5).reward)
+    np.testing.assert_allclose(paid[3, 0], -learned.ranking[0, 0], rtol=1e-9)
+
+
+def test_constraints_end_where_the_walls_end():
+    """People who walk on an empty map, straight to the goal from everywhere, are no reason to forbid anything."""
+    tasks = [reach(BLANK, goal) for goal in (0, 24)]
+    starts = [np.setdiff1d(np.arange(25), [0, 24, 12])] * 2
+    world = ObstacleGrid(BLANK, jnp.full(25, -20.0))
+    demos = gather(simulate(jax.random.key(1), world, tasks, starts, Behavior(BoltzmannAverage(), 7.0)), tasks)
+    assert np.asarray(constraint_inference(BLANK, demos, Settings()).model.blocked).max() < 0.5
+
+
+def test_joint_tells_a_costly_floor_from_a_wall():
+    """People who dislike a carpet, and cross it where that pays: the cost is found, and nothing blocked."""
+    carpet = WALL.astype(float).ravel()
+    goals = (*GOALS, 7, 12)
+    plain = [reach(BLANK, goal) for goal in goals]
+    room = true_model(BLANK.passable())
+    disliked = [with_state_costs(task, jnp.asarray(0.1 * carpet), room.graph.successors[..., 0]) for task in plain]
+    starts = [np.repeat(np.setdiff1d(np.arange(25), [goal]), 4) for goal in goals]
+    walks = simulate(jax.random.key(0), room, disliked, starts, Behavior(LogSumExp(), 40.0))
+    learned = joint_estimation(BLANK, gather(walks, plain), Settings(beta=40.0))
+    assert isinstance(learned.reward, CostlyReward)
+    assert learned.reward.costs is not None
+    np.testing.assert_allclose(learned.reward.costs[carpet == 1], 0.1, atol=0.03)
+    assert learned.reward.costs[carpet == 0].max() < 0.02
+    assert learned.ranking.max() < 0.1
+    # people pay what was learned: 4 moves around the end of the carpet rather than 2 across it; robots go across
+    path = plan(learned.model, learned.reward.reach(BLANK, 18)).path_from(16)
+    assert path.tolist() == [16, 21, 22, 23, 18]
+    assert learned.planner.plan_to(18).follow(np.array([16]))[0].tolist() == [16, 17, 18]
+
+
+def walk(*states):
+    """Along a row of cells or, in grids of 5 columns, through neighbouring cells."""
+    action = {-5: 0, 5: 1, -1: 2, 1: 3}
+    return Trajectory(np.array(states), np.array([action[move] for move in np.diff(states).tolist()]), 0)
+
+
+def test_cloning_does_what_was_demonstrated_in_a_corridor():
+    """To one end; what was done nowhere is thought possible, and a known obstacle is not walked into."""
+    corridor = Grid(np.array([[-1, -1, -1, -1, 1]]))
+    learned = behavior_cloning(corridor, gather([walk(0, 1, 2, 3)], [reach(corridor, 3)]), Settings())
+    policy = learned.policy(3)
+    assert (policy[:3].argmax(axis=1) == 3).all()
+    assert policy[:3, 3].min() > 0.5
+    assert policy.min() > 0
+    np.testing.assert_allclose(policy.sum(axis=1), 1)
+    assert [path.tolist() for path in learned.planner.plan_to(3).follow(np.array([0, 2]))] == [[0, 1, 2, 3], [2, 3]]
+    assert learned.planner.plan_to(4).follow(np.array([3]))[0].tolist() == [3, 2]
+    assert learned.planner.possible().tolist() == [[True, True, True, True, False]]
+
+
+def test_cloning_generalises_to_goals_that_nobody_had():
+    """In a free room people walk straight to five goals; by the direction, so does who cloned them to any other."""
+    room = Grid.unknown(7, 7)
+    tasks = [reach(room, goal) for goal in (0, 6, 42, 48, 24)]
+    starts = [np.random.default_rng(goal).choice(np.delete(np.arange(49), 24), 12) for goal in range(5)]
+    starts = [own[own != goal] for own, goal in zip(starts, (0, 6, 42, 48, 24), strict=True)]
+    shown = gather(simulate(jax.random.key(2), true_model(room.passable()), tasks, starts), tasks)
+    learned = behavior_cloning(room, shown, Settings())
+    for goal in (10, 20, 33, 45):
+        others = np.delete(np.arange(49), goal)
+        shortest = [abs(start // 7 - goal // 7) + abs(start % 7 - goal % 7) for start in others]
+        paths = learned.planner.plan_to(goal).follow(others)
+        assert [path[-1] for path in paths] == [goal] * 48
+        assert [len(path) - 1 for path in paths] == shortest
+
+
+@pytest.mark.parametrize(("logit", "found"), [(8.0, True), (20.0, False)])
+def test_what_people_do_cannot_be_told_where_they_have_no_values(logit, found, walks):
+    """Once in a hundred million tries somebody gets through a wall, and each try costs: values are out of reach."""
+    paying = Settings(discount=1.0, step_cost=1.0, beta=0.5)
+    walled = ObstacleGrid(BLANK, jnp.where(jnp.arange(25) % 5 == 1, logit, -3.0))
+    nats = mean_log_likelihood(known_map(walled, walks, paying), walks)
+    assert (nats is not None) == found
+    if nats is not None:
+        assert nats == pytest.approx(float(known_map(walled, walks, paying).log_policies(walks).mean()))
+
+
+def test_cloning_is_particular_to_places():
+    """The goal is four cells to the right, and people go straight there in one row, and by another row in another."""
+    straight, around = walk(5, 6, 7, 8, 9), walk(15, 10, 11, 12, 13, 14, 19)._replace(task=1)
+    shown = gather([straight, around] * 5, [reach(BLANK, goal) for goal in (9, 19)])
+    learned = behavior_cloning(BLANK, shown, Settings())
+    assert learned.planner.plan_to(9).follow(np.array([5]))[0].tolist() == straight.states.tolist()
+    assert learned.planner.plan_to(19).follow(np.array([15]))[0].tolist() == around.states.tolist()
+
+
+def test_cloning_takes_actions_to_be_as_probable_as_its_policy_says(walks):
+    learned = behavior_cloning(BLANK, walks, Settings())
+    assert learned.ranking is learned.shares is None
+    each = learned.log_policies(walks)
+    for move in (0, 17, len(walks) - 1):
+        policy = learned.policy(GOALS[int(walks.task[move])])
+        assert each[move] == pytest.approx(np.log(policy[int(walks.states[move]), int(walks.actions[move])]))
+    assert each.mean() > np.log(0.5)
+
+
+@pytest.mark.parametrize(("most", "converged"), [(1, False), (2000, True)])
+def test_cloning_says_whether_it_converged(walks, monkeypatch, most, converged):
+    monkeypatch.setattr(cloning, "_ITERATIONS", most)
+    assert behavior_cloning(BLANK, walks, Settings()).converged == converged

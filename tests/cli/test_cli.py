@@ -1,0 +1,253 @@
+"""The command line's manners: help, exit codes, and one line for everything that is wrong with the input."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from sidestep.cli import app as cli
+from sidestep.cli.app import main
+from sidestep.io.maps import write_map
+from sidestep.tabular.grid import Grid
+
+COMMANDS = ("demo", "reproduce", "learn", "plan", "evaluate", "simulate")
+WALKS = """walk,step,x,y,goal_x,goal_y
+a,0,0.5,0.5,2.5,1.5
+a,1,1.5,0.5,2.5,1.5
+a,2,2.5,0.5,2.5,1.5
+a,3,2.5,1.5,2.5,1.5
+"""
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A folder with `walks.csv` and a map of 2 × 3 cells, the upper middle one known to be occupied."""
+    monkeypatch.chdir(tmp_path)
+    Path("walks.csv").write_text(WALKS)
+    write_map("map.yaml", np.array([[0.5, 1.0, 0.5], [0.5, 0.5, 0.0]]), Grid.unknown(2, 3))
+    return tmp_path
+
+
+def run(arguments: str) -> int:
+    """The exit code of `sidestep` with these arguments."""
+    return main(arguments.split())
+
+
+def written(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+def refused(here: Path, capsys, arguments: str, *expected: str) -> None:
+    """Exit code 1, one line that says all that is expected, and nothing written."""
+    before = written(here)
+    assert run(arguments) == 1
+    told = capsys.readouterr()
+    lines = told.err.strip().splitlines()
+    assert len(lines) == 1, told.err
+    for text in ("error: ", *expected):
+        assert text in lines[0]
+    assert "Traceback" not in told.err
+    assert "sidestep failed" not in told.err
+    assert written(here) == before
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_shows_an_example(command, capsys):
+    assert main([command, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert f"Example: sidestep {command}" in text
+    assert "--out" in text
+
+
+@pytest.mark.parametrize("arguments", [
+    "",
+    "explore",
+    "learn walks.csv --out out",  # no map
+    "learn walks.csv --map map.yaml",  # nowhere to write to
+    "learn --map map.yaml --out out",  # no walks
+    "learn walks.csv --map map.yaml --out out --beta much",
+    "learn walks.csv --map map.yaml --out out --connectivity 6",
+    "learn walks.csv --map map.yaml --out out --backup softmax",
+    "learn walks.csv --map map.yaml --out out --terms none",
+    "learn walks.csv --map map.yaml --out out --seed -1",
+    "learn walks.csv --map map.yaml --out out --faster",
+    "plan learned --start abc --goal 1,1",
+    "plan learned --start 1,1 --goal 1,2,3",
+    "plan learned --start 1,1",
+    "evaluate learned",
+    "simulate map.yaml",
+    "demo --seed x",
+])  # fmt: skip
+def test_wrong_usage_gives_exit_code_2(here, arguments, capsys):
+    before = written(here)
+    assert run(arguments) == 2
+    told = capsys.readouterr()
+    assert "Traceback" not in told.err
+    assert told.err + told.out
+    assert written(here) == before
+
+
+ROWS = {
+    "outside the map": ("a,3,2.5,1.5", "a,3,2.5,7.5", "row 4", "field 'y'", "7.5"),
+    "NaN": ("a,1,1.5,0.5", "a,1,nan,0.5", "row 2", "field 'x'", "NaN"),
+    "infinity": ("a,1,1.5,0.5", "a,1,inf,0.5", "row 2", "field 'x'", "infinity"),
+    "an empty cell": ("a,1,1.5,0.5", "a,1,,0.5", "row 2", "field 'x'", "empty"),
+    "text": ("a,1,1.5,0.5", "a,1,1.5,far", "row 2", "field 'y'", "'far'"),
+    "unsorted steps": ("a,2,2.5,0.5", "a,0,2.5,0.5", "row 3", "field 'step'"),
+    "repeated steps": ("a,2,2.5,0.5", "a,1,2.5,0.5", "row 3", "field 'step'"),
+    "a walk of one point": ("a,0,", "b,0,", "row 1", "field 'walk'", "'b'"),
+    "a goal in a known obstacle": ("2.5,1.5\n", "1.5,1.5\n", "row 1", "field 'goal_x'", "occupied"),
+    "a goal outside the map": ("2.5,1.5\n", "9.5,1.5\n", "row 1", "field 'goal_x'"),
+    "a walk through a known obstacle": ("a,1,1.5,0.5", "a,1,1.5,1.5", "row 2", "occupied"),
+    "a goal that changes": ("a,3,2.5,1.5,2.5,1.5", "a,3,2.5,1.5,2.5,0.5", "row 4", "field 'goal_y'"),
+    "a missing column": ("walk,step,x,y", "walk,step,x,z", "field 'y'"),
+    "a ragged row": ("a,1,1.5,0.5,2.5,1.5", "a,1,1.5,0.5", "row 2"),
+    "walks that start at their goal": ("2.5,1.5\n", "0.5,0.5\n", "starts at its goal"),
+}
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_bad_walks(here, capsys, name):
+    good, bad, *expected = ROWS[name]
+    assert good in WALKS
+    Path("walks.csv").write_text(WALKS.replace(good, bad))
+    refused(here, capsys, "learn walks.csv --map map.yaml --out out", "walks.csv", *expected)
+
+
+KEYS = {
+    "image": (None, "missing"),
+    "resolution": (None, "missing"),
+    "origin": ([0, 0], "three numbers"),
+    "negate": ("maybe", "0 or 1"),
+    "occupied_thresh": (2, "from 0 to 1"),
+    "mode": ("rainbow", "trinary"),
+}
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_bad_maps(here, capsys, key):
+    value, expected = KEYS[key]
+    settings = yaml.safe_load(Path("map.yaml").read_text()) | {key: value}
+    Path("map.yaml").write_text(yaml.safe_dump({key: value for key, value in settings.items() if value is not None}))
+    refused(here, capsys, "learn walks.csv --map map.yaml --out out", "map.yaml", f"field '{key}'", expected)
+    refused(here, capsys, "simulate map.yaml --out new.csv", "map.yaml", f"field '{key}'", expected)
+
+
+@pytest.mark.parametrize("image", ["../elsewhere.pgm", "/etc/hostname", "missing.pgm"])
+def test_images_outside_the_folder_of_the_map(here, capsys, image):
+    Image.new("L", (3, 2)).save(here.parent / "elsewhere.pgm")
+    Path("map.yaml").write_text(Path("map.yaml").read_text().replace("map.pgm", image))
+    refused(here, capsys, "learn walks.csv --map map.yaml --out out", "map.yaml", "field 'image'")
+
+
+def test_images_of_absurd_size(here, capsys):
+    Path("map.pgm").write_bytes(b"P5 200000 200000 255\n")
+    refused(here, capsys, "learn walks.csv --map map.yaml --out out", "map.pgm", "pixels")
+
+
+@pytest.mark.parametrize(("options", "expected"), [
+    ("--beta 0", "field 'beta'"),
+    ("--beta nan", "field 'beta'"),
+    ("--discount 0", "field 'discount'"),
+    ("--discount 1.1", "field 'discount'"),
+    ("--discount 1", "field 'discount'"),
+    ("--step-cost -1", "field 'step_cost'"),
+    ("--prior-variance 0", "field 'prior variance'"),
+    ("--prior-mean inf", "field 'prior mean'"),
+    ("--horizon 0", "at least one action"),
+    ("--iterations 0", "field 'iterations'"),
+    ("--sample 0", "field 'sample'"),
+    ("--sample 2", "field 'sample'"),
+    ("--backup logsumexp --discount 1 --step-cost 1 --beta 1", "log-sum-exp"),
+])  # fmt: skip
+def test_bad_settings(here, capsys, options, expected):
+    refused(here, capsys, f"learn walks.csv --map map.yaml --out out {options}", expected)
+
+
+def test_walks_whose_goal_is_walled_off(here, capsys):
+    write_map("map.yaml", np.array([[0.5, 1.0, 0.5], [0.5, 1.0, 0.0]]), Grid.unknown(2, 3))
+    Path("walks.csv").write_text("walk,step,x,y,goal_x,goal_y\na,0,0.5,0.5,2.5,1.5\na,1,0.5,1.5,2.5,1.5\n")
+    walled_off = "learn walks.csv --map map.yaml --out out --discount 1 --step-cost 1"
+    refused(here, capsys, walled_off, "walks.csv, row 2", "cannot be reached")
+
+
+@pytest.mark.parametrize(("arguments", "expected"), [
+    ("learn none.csv --map map.yaml --out out", "none.csv"),
+    ("learn walks.txt --map map.yaml --out out", "walks.txt"),
+    ("learn walks.csv --map none.yaml --out out", "none.yaml"),
+    ("plan nowhere --start 1,1 --goal 2,2", "summary.json"),
+    ("evaluate nowhere --truth map.yaml", "summary.json"),
+    ("simulate none.yaml --out new.csv", "none.yaml"),
+    ("simulate map.yaml --out new.csv", "free cells"),
+    ("simulate map.yaml --out new.csv --walks 0", "field 'walks'"),
+    ("simulate map.yaml --out new.csv --goals 0", "field 'goals'"),
+])  # fmt: skip
+def test_bad_files_and_numbers(here, capsys, arguments, expected):
+    if expected == "free cells":
+        write_map("map.yaml", np.array([[0.0, 1.0, 0.0]]), Grid.unknown(1, 3))
+        arguments += " --goals 1"
+    refused(here, capsys, arguments, expected)
+
+
+def test_a_folder_that_cannot_be_written(here, capsys):
+    Path("taken").write_text("a file, not a folder")
+    refused(here, capsys, "learn walks.csv --map map.yaml --out taken/out", "taken", "cannot be written")
+
+
+class TestWithALearnedMap:
+    """`plan` and `evaluate` on a map that was learned from one walk."""
+
+    @pytest.fixture
+    def learned(self, here):
+        assert run("learn walks.csv --map map.yaml --out learned --terms transitions") == 0
+        write_map("true.yaml", np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]), Grid.unknown(2, 3))
+        write_map("other.yaml", np.zeros((3, 3)), Grid.unknown(3, 3))
+        write_map("finer.yaml", np.zeros((2, 3)), Grid(np.zeros((2, 3), dtype=int), resolution=0.5))
+        return here
+
+    def test_refusals(self, learned, capsys):
+        capsys.readouterr()
+        for arguments, *expected in (
+            ("plan learned --start 0.5,0.5 --goal 9,0.5", "field 'goal'", "outside the map"),
+            ("plan learned --start nan,0.5 --goal 0.5,0.5", "field 'start'", "outside the map"),
+            ("plan learned --start 0.5,0.5 --goal 1.5,1.5", "field 'goal'", "known obstacle"),
+            ("plan learned --start 1.5,1.5 --goal 0.5,0.5", "field 'start'", "known obstacle"),
+            ("evaluate learned --truth other.yaml", "other.yaml", "2 × 3"),
+            ("evaluate learned --truth finer.yaml", "finer.yaml", "field 'resolution'"),
+            ("evaluate learned --truth none.yaml", "none.yaml"),
+        ):
+            refused(learned, capsys, arguments, *expected)
+        Path("learned/blocked.npy").write_bytes(b"broken")
+        refused(learned, capsys, "plan learned --start 0.5,0.5 --goal 2.5,0.5", "blocked.npy")
+        refused(learned, capsys, "evaluate learned --truth true.yaml", "blocked.npy")
+
+    def test_walled_off(self, learned, capsys):
+        capsys.readouterr()
+        blocked = np.load("learned/blocked.npy")
+        blocked[1, 1] = 1
+        np.save("learned/blocked.npy", blocked)
+        refused(learned, capsys, "plan learned --start 0.5,0.5 --goal 2.5,0.5", "no way from (0.5, 0.5)")
+
+
+def test_a_fit_that_fails_on_its_way_writes_no_map(here, capsys, monkeypatch):
+    """The reporter breaks down, as a defect of ours would: one line, no traceback, no half-written map."""
+
+    def broken(progress):
+        print(1 / (2 - progress.iteration))
+
+    def learn(walks, map_file, folder, settings, _, *others):
+        return whole(walks, map_file, folder, settings, broken, *others)
+
+    whole = cli.learn
+    monkeypatch.setattr(cli, "learn", learn)
+    assert run("learn walks.csv --map map.yaml --out out") == 1
+    told = capsys.readouterr().err
+    assert told.strip().splitlines() == [
+        "error: sidestep failed (ZeroDivisionError: division by zero); set SIDESTEP_DEBUG=1 for details to report"
+    ]
+    assert written(here / "out") <= {"fit.checkpoint"}
+    monkeypatch.setenv("SIDESTEP_DEBUG", "1")
+    assert run("learn walks.csv --map map.yaml --out out") == 1
+    assert "Traceback" in capsys.readouterr().err

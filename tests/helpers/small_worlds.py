@@ -1,0 +1,101 @@
+"""Small worlds for the tests of the continuous half, with their exact answers by plain dense sums."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sidestep.continuous.dynamics import LinearGaussian, TableDynamics
+from sidestep.continuous.policies import FinitePolicy, GaussianPolicy, Policy, Scaled, table_policy
+from sidestep.continuous.tasks import QuadraticTask, TableTask, table_tasks
+from sidestep.tabular.backups import Behavior
+from sidestep.tabular.graph import graph
+from sidestep.tabular.models import TabularModel
+from sidestep.tabular.planning import plan
+from sidestep.tabular.tasks import Task
+
+TASKS, STATES, ACTIONS = 2, 5, 3
+ENDS = jnp.eye(TASKS, STATES, dtype=bool)[:, ::-1].at[1].set(jnp.arange(STATES) == 0)
+WHICH, PLACES = jnp.nonzero(~ENDS)  # every task and state in which one acts
+
+
+class Table(NamedTuple):
+    """A small discrete world with two tasks, seen as a continuous one; its policy is neither uniform nor good."""
+
+    dynamics: TableDynamics
+    tasks: TableTask
+    policy: FinitePolicy
+
+
+def table(seed=3) -> Table:
+    """Five states in which three actions lead to the next, the one after, or nowhere; each task ends in one of them."""
+    random = np.random.default_rng(seed)
+    successors = (np.arange(STATES)[:, None, None] + np.arange(3) + np.zeros((1, ACTIONS, 1), int)) % STATES
+    model = TabularModel(graph(successors), jnp.asarray(1.5 * random.normal(size=successors.shape)))
+    reward = random.uniform(-1, 0.5, size=(TASKS, STATES, ACTIONS)) + np.array([0, -2, 1, -1, 0])[:, None]
+    final = np.full((TASKS, STATES), [[0.5], [-1]])
+    tasks = Task(jnp.asarray(reward), jnp.asarray(final), ENDS, jnp.asarray(np.array([0.8, 0.6])))
+    policy = with_logits(jnp.asarray(random.normal(size=reward.shape)))
+    return Table(TableDynamics(model), table_tasks(tasks, STATES, ACTIONS), policy)
+
+
+def with_logits(logits) -> FinitePolicy:
+    """The policy ∝ exp of logits[task, state, action], in the table world."""
+    blank = table_policy(ACTIONS, TASKS * STATES)
+    return eqx.tree_at(lambda policy: policy.network.network.weight, blank, logits.reshape(-1, ACTIONS).T)
+
+
+def policy_table(policy: FinitePolicy):
+    """π[task, state, action]."""
+    log_probs = jax.vmap(policy.log_probs)(jnp.eye(TASKS * STATES))
+    return jnp.exp(log_probs).reshape(TASKS, STATES, ACTIONS)
+
+
+def peoples_policy(world: Table, behavior: Behavior):
+    """π[task, state, action] of people who know the world, by the tabular half."""
+    tasks = [jax.tree.map(lambda leaf, index=index: leaf[index], world.tasks.task) for index in range(TASKS)]
+    return jnp.stack([plan(world.dynamics.model, task, behavior).policy for task in tasks])
+
+
+def entropies(pi):
+    """H[task, state]."""
+    return -(pi * jnp.log(pi)).sum(axis=-1)
+
+
+@eqx.filter_jit
+def exact_values(world: Table, parameters, pi, horizon, bonus: jax.Array | float = 0.0):
+    """V[task, state] and Q[task, state, action] of a fixed policy that looks so far; acting adds `bonus` to V."""
+    model, tasks = world.dynamics.model.with_parameters(parameters), world.tasks.task
+    states, actions = np.arange(STATES)[:, None, None], np.arange(ACTIONS)[:, None]
+    transitions = jnp.zeros((STATES, ACTIONS, STATES))
+    transitions = transitions.at[states, actions, model.graph.successors].add(model.probabilities())
+    values = jnp.where(tasks.terminal, tasks.terminal_reward, 0.0)
+    q = jnp.zeros_like(pi)
+    for _ in range(horizon):
+        q = tasks.reward + tasks.discount[:, None, None] * jnp.einsum("sat,kt->ksa", transitions, values)
+        values = jnp.where(tasks.terminal, tasks.terminal_reward, (pi * q).sum(axis=-1) + bonus)
+    return values, q
+
+
+GAIN, OFFSET, SPREAD = jnp.asarray([[-0.4, -0.6]]), jnp.asarray([0.1]), 0.3
+
+
+class Linear(NamedTuple):
+    """A linear-Gaussian world of two components and one input, with two tasks; its policy is linear, not the best."""
+
+    dynamics: LinearGaussian
+    tasks: QuadraticTask
+    policy: Policy
+
+
+def linear(goals=((0.5, -0.2), (-0.3, 0.4))) -> Linear:
+    state, action = [[0.9, 0.3], [-0.2, 0.8]], [[0.2], [0.7]]
+    dynamics = LinearGaussian(jnp.asarray(state), jnp.asarray(action), jnp.asarray([0.2, 0.1]))
+    costs = [[[1.0, 0.2], [0.2, 0.5]]] * len(goals), [[[0.3]]] * len(goals)
+    tasks = QuadraticTask(*(jnp.asarray(part) for part in (goals, *costs, [0.8, 0.9][: len(goals)])))
+    blank = eqx.nn.Linear(2, 1, key=jax.random.key(0))
+    mean = eqx.tree_at(lambda layer: (layer.weight, layer.bias), blank, (GAIN, OFFSET))
+    policy = GaussianPolicy(Scaled(mean, jnp.zeros(2), jnp.ones(2)), jnp.log(jnp.asarray([SPREAD])))
+    return Linear(dynamics, tasks, policy)

@@ -1,0 +1,74 @@
+"""The fit that settings describe: what a walk's first cell says."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import root_scalar
+
+from sidestep.inference.fit import fit
+from sidestep.inference.goals import weighted
+from sidestep.inference.priors import Normal
+from sidestep.maps.config import Settings, fit_map
+from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
+from sidestep.tabular.grid import Grid
+from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.tasks import Task, reach
+
+GRID = Grid.unknown(1, 4)
+SETTINGS = Settings(lines=0.0, prior_mean=1.0, prior_variance=5.0, terms="transitions")
+
+
+def walks(*lengths: int) -> Demonstrations[Task]:
+    """Walks to the right end of a corridor, each so many moves long: all but the first cell are entered."""
+    right, goal = 3, 3
+    paths = [np.arange(goal - length, goal + 1) for length in lengths]
+    return gather([Trajectory(path, np.full(len(path) - 1, right), 0) for path in paths], [reach(GRID, goal)])
+
+
+def logits(demonstrations: Demonstrations[Task], settings: Settings = SETTINGS) -> np.ndarray:
+    """The logits that are learned."""
+    found = fit_map(ObstacleGrid(GRID, settings.prior_mean), demonstrations, settings)
+    assert found.converged
+    return np.asarray(found.model.parameters)
+
+
+def most_probable(observations: float) -> float:
+    """Where −(θ − b)²/a + n ln(1 − σ(θ)) is highest, of a cell that was seen to be free n times."""
+
+    def slope(logit: float) -> float:
+        return -2 * (logit - 1.0) / 5.0 - observations / (1 + np.exp(-logit))
+
+    return root_scalar(slope, bracket=(-20, 20)).root
+
+
+def test_where_walks_begin_is_free():
+    found = logits(walks(3, 3, 1))
+    # two begin in cell 0; through cell 1 two pass; two enter cell 2, where one begins; three arrive
+    np.testing.assert_allclose(found, [most_probable(n) for n in (2, 2, 3, 3)], atol=1e-4)
+
+
+def test_of_a_known_map_the_first_cells_say_nothing():
+    known = ObstacleGrid(GRID.passable(), 1.0)
+    assert fit_map(known, walks(3, 1), SETTINGS).final.prior == 0
+
+
+def test_a_walk_that_may_have_had_several_goals_begins_once():
+    candidates = [reach(GRID, goal) for goal in (3, 2)]
+    walk = Trajectory(np.array([0, 1, 2]), np.array([3, 3]), 0)
+    shown = weighted([walk, walk], candidates, np.array([[0.3, 0.7], [1.0, 0.0]]))
+    np.testing.assert_allclose(logits(shown), [*[most_probable(2)] * 3, 1.0], atol=1e-4)
+
+
+def test_only_walks_that_count_begin_anywhere():
+    found = logits(walks(3, 1).with_only(np.array([False, True])))
+    np.testing.assert_allclose(found, [1.0, 1.0, most_probable(1), most_probable(1)], atol=1e-4)
+
+
+def test_actions_alone_do_not_say_who_stood_where():
+    settings = replace(SETTINGS, terms="actions")
+    prior = Normal(settings.prior_mean, settings.prior_variance)
+    model = ObstacleGrid(GRID, settings.prior_mean)
+    by_actions = fit(model, walks(3, 3), settings.behavior(), prior=prior, terms=("actions",)).model.parameters
+    np.testing.assert_allclose(logits(walks(3, 3), settings), by_actions, atol=1e-6)
+    # with transitions, the first cell is freer than by actions
+    assert logits(walks(3, 3), replace(SETTINGS, terms="both"))[0] < float(by_actions[0]) - 1

@@ -1,0 +1,101 @@
+"""A learned map in its folder, there and back, and folders that hold none."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sidestep.errors import InputError
+from sidestep.maps.learned_map import LearnedMap, read_learned_map, write_learned_map
+from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.tasks import Reward
+
+BLOCKED = np.array([[0.0, 0.25, 1.0], [0.5, 1e-7, 0.999]])
+KNOWN = np.where(BLOCKED == 0, Cell.FREE, np.where(BLOCKED == 1, Cell.OCCUPIED, Cell.UNKNOWN)).astype(int)
+GRID = Grid(KNOWN, resolution=0.05, origin=(1.5, -2.0, 0.3), connectivity=8)
+VISITED = np.array([[0, 4], [3, 4]])
+LEARNED = LearnedMap(GRID, BLOCKED, VISITED, Reward(0.9, 2.5))
+SUMMARY = {"command": "learn", "settings": {"connectivity": 8, "discount": 0.9, "step_cost": 2.5, "beta": 3.0}}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_learned_map(tmp_path, LEARNED, SUMMARY)
+    return tmp_path
+
+
+def test_round_trip(folder):
+    found = read_learned_map(folder)
+    np.testing.assert_array_equal(found.blocked, BLOCKED)
+    np.testing.assert_array_equal(found.visited, VISITED)
+    np.testing.assert_array_equal(found.grid.known, KNOWN)
+    assert (found.grid.resolution, found.grid.origin, found.grid.connectivity) == (0.05, (1.5, -2.0, 0.3), 8)
+    assert found.reward == Reward(0.9, 2.5)
+    np.testing.assert_array_equal(found.unknown, [[False, True, False], [True, True, True]])
+    assert json.loads((folder / "summary.json").read_text()) == SUMMARY
+
+
+def test_the_model_has_the_probabilities_of_the_map(folder):
+    np.testing.assert_allclose(read_learned_map(str(folder)).model().blocked, BLOCKED, rtol=1e-9)
+
+
+FILES = ("summary.json", "map.yaml", "map.pgm", "blocked.npy", "visited.npy")
+
+
+def array_file(tmp_path, array) -> bytes:
+    np.save(tmp_path / "bad.npy", array)
+    return (tmp_path / "bad.npy").read_bytes()
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("content", [None, b"", b"{]garbage: [", bytes(range(128, 256))])
+def test_a_file_that_is_missing_or_garbled_is_named(folder, name, content):
+    if content is None:
+        (folder / name).unlink()
+    else:
+        (folder / name).write_bytes(content)
+    with pytest.raises(InputError, match=name.replace(".", r"\.")):
+        read_learned_map(folder)
+
+
+BAD_ARRAYS = {
+    "blocked.npy": [
+        np.zeros((3, 2)),
+        np.full((2, 3), 1.5),
+        np.full((2, 3), np.nan),
+        np.full((2, 3), "a"),
+        np.zeros((2, 3), dtype=complex),
+    ],
+    "visited.npy": [
+        np.zeros(4, dtype=int),
+        np.zeros((4, 3), dtype=int),
+        np.array([[0, 6]]),
+        np.array([[-1, 0]]),
+        np.array([[0.5, 1.0]]),
+        np.array([["a", "b"]]),
+    ],
+}
+
+
+@pytest.mark.parametrize(("name", "index"), [(name, i) for name, bad in BAD_ARRAYS.items() for i in range(len(bad))])
+def test_arrays_that_do_not_fit_the_map_are_refused(folder, tmp_path, name, index):
+    (folder / name).write_bytes(array_file(tmp_path, BAD_ARRAYS[name][index]))
+    with pytest.raises(InputError, match=name.replace(".", r"\.")):
+        read_learned_map(folder)
+
+
+@pytest.mark.parametrize("summary", [
+    [],
+    {},
+    {"settings": None},
+    {"settings": {"connectivity": 8, "discount": 0.9}},
+    {"settings": {"connectivity": 5, "discount": 0.9, "step_cost": None}},
+    {"settings": {"connectivity": 4, "discount": "much", "step_cost": None}},
+    {"settings": {"connectivity": 4, "discount": 1.5, "step_cost": None}},
+    {"settings": {"connectivity": 4, "discount": 0.9, "step_cost": -1.0}},
+    {"settings": {"connectivity": 4, "discount": 0.9, "step_cost": "a"}},
+])  # fmt: skip
+def test_settings_that_no_learning_has_written_are_refused(folder, summary):
+    (folder / "summary.json").write_text(json.dumps(summary))
+    with pytest.raises(InputError, match=r"summary\.json"):
+        read_learned_map(folder)

@@ -1,0 +1,155 @@
+"""Plans on worlds small enough to plan by hand, and what happens to those who follow them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sidestep.errors import ImproperTask, InputError, NotConverged
+from sidestep.tabular.backups import Behavior, HardMax, LogSumExp
+from sidestep.tabular.graph import graph
+from sidestep.tabular.grid import Grid
+from sidestep.tabular.models import ObstacleGrid, TabularModel, true_model
+from sidestep.tabular.planning import plan, roll_out
+from sidestep.tabular.solvers.jacobi import Jacobi
+from sidestep.tabular.tasks import reach
+
+OPEN = Grid(np.zeros((3, 3), dtype=int))
+BEND = Grid(np.array([[0, 0, 0], [1, 1, 0], [0, 0, 0]]))
+DIAGONAL = Grid(np.array([[0, 0, 0], [0, 1, 0], [0, 0, 0]]), connectivity=8)
+APART = Grid(np.array([[0, 0, 1, 0]]))
+UP, DOWN, LEFT, RIGHT = range(4)
+
+
+@pytest.mark.parametrize("reward", [{"discount": 0.9}, {"discount": 1.0, "step_cost": 1.0}])
+@pytest.mark.parametrize(("world", "start", "goal", "path"), [
+    (BEND, 0, 6, [0, 1, 2, 5, 8, 7, 6]),
+    (BEND, 6, 0, [6, 7, 8, 5, 2, 1, 0]),
+    (OPEN, 3, 5, [3, 4, 5]),
+    (OPEN, 4, 4, [4]),
+    (DIAGONAL, 0, 5, [0, 1, 2, 5]),  # no corner is cut
+    (Grid(np.zeros((3, 3), dtype=int), connectivity=8), 0, 8, [0, 4, 8]),
+])  # fmt: skip
+def test_paths_by_hand(world, start, goal, path, reward):
+    made = plan(true_model(world), reach(world.forget(), goal, **reward))
+    assert made.path_from(start).tolist() == path
+    assert bool(made.solution.converged)
+
+
+def test_an_optimal_plan_is_uniform_over_ties():
+    policy = np.asarray(plan(true_model(OPEN), reach(OPEN, 0)).policy)
+    expected = {8: [UP, LEFT], 4: [UP, LEFT], 5: [UP, LEFT], 1: [LEFT], 2: [LEFT], 6: [UP]}
+    for state, actions in expected.items():
+        np.testing.assert_allclose(policy[state], np.isin(range(4), actions) / len(actions), atol=1e-12)
+
+
+def test_a_soft_plan_acts_by_the_action_values():
+    """A corridor of three cells, each blocked with p = 1/4, at γ = 1/2: V = g² and g for g = γ(1−p)/(1−γp) = 3/7."""
+    grid, beta = Grid.unknown(1, 3), 2.0
+    made = plan(ObstacleGrid(grid, -float(np.log(3))), reach(grid, 2, discount=0.5), Behavior(HardMax(), beta))
+    stay, left, right = 3 / 14, 0.5 * (0.75 * 9 / 49 + 0.25 * 3 / 7), 3 / 7
+    odds = np.exp(beta * np.array([stay, stay, left, right]))
+    np.testing.assert_allclose(made.policy[1], odds / odds.sum(), rtol=1e-9)
+    assert made.path_from(0).tolist() == [0, 1, 2]
+
+
+def test_a_learned_obstacle_is_walked_around_to_goals_that_nobody_had():
+    """P(blocked) = .9 in the middle column but for the lowest cell: the way through is dearer than the way around."""
+    logits = np.full((3, 3), -3.0)
+    logits[:2, 1] = np.log(9)
+    made = plan(ObstacleGrid(Grid.unknown(3, 3), logits.reshape(-1)), reach(OPEN, 2, discount=1.0, step_cost=1.0))
+    assert made.path_from(0).tolist() == [0, 3, 6, 7, 8, 5, 2]
+    logits[:2, 1] = 0.0  # a coin toss costs one move more: the way through is now the shorter
+    made = plan(ObstacleGrid(Grid.unknown(3, 3), logits.reshape(-1)), reach(OPEN, 2, discount=1.0, step_cost=1.0))
+    assert made.path_from(0).tolist() == [0, 1, 2]
+
+
+def test_an_action_is_meant_to_lead_to_its_most_probable_outcome_elsewhere():
+    world = graph(np.array([[[0, 1, 2]], [[1, 1, 1]], [[2, 2, 2]]]))
+    model = TabularModel(world, jnp.log(jnp.array([[[0.6, 0.1, 0.3]], [[1.0, 1.0, 1.0]], [[1.0, 1.0, 1.0]]])))
+    made = plan(model, reach(world, 1))
+    assert made.intended.tolist() == [2, 1, 2]  # state 2 leads nowhere else
+    assert made.path_from(0).tolist() == [0, 2]
+
+
+def test_paths_that_cannot_arrive_end_before_they_repeat():
+    path = plan(true_model(APART), reach(APART, 3)).path_from(0)
+    assert 3 not in path
+    assert len(set(path.tolist())) == len(path)
+    with pytest.raises(InputError, match="'start': the goal cannot be reached from state 0"):
+        plan(true_model(APART), reach(APART, 3, discount=1.0, step_cost=1.0)).path_from(0)
+
+
+@pytest.mark.parametrize("start", [-1, 9])
+def test_a_start_that_is_no_state_is_refused(start):
+    with pytest.raises(InputError, match=r"'start': expected a state in 0…8"):
+        plan(true_model(OPEN), reach(OPEN, 0)).path_from(start)
+
+
+def test_plans_without_values_are_refused():
+    with pytest.raises(ImproperTask):
+        plan(true_model(OPEN), reach(OPEN, 0, discount=1.0, step_cost=0.1), Behavior(LogSumExp(), 1.0))
+    with pytest.raises(NotConverged, match="sweep 1"):
+        plan(true_model(OPEN), reach(OPEN, 0), solver=Jacobi(max_sweeps=1))
+
+
+def test_a_plan_bumps_for_ever_into_a_wall_that_it_does_not_know():
+    corridor = Grid(np.array([[0, 0, 1, 0]]))
+    made = plan(true_model(Grid(np.zeros((1, 4), dtype=int))), reach(corridor, 3))
+    walked = roll_out(
+        jax.random.key(0), true_model(corridor), made.policy, made.terminal, jnp.array([0, 1, 3]), moves=6
+    )
+    assert walked.states.tolist() == [[0, 1, 1, 1, 1, 1, 1], [1] * 7, [3] * 7]
+    assert walked.actions.tolist() == [[RIGHT] * 6, [RIGHT] * 6, [-1] * 6]
+    assert walked.failed.tolist() == [5, 6, 0]
+    assert walked.moves.tolist() == [6, 6, 0]
+    assert walked.arrived.tolist() == [False, False, True]
+
+
+def test_nothing_is_done_after_arriving():
+    made = plan(true_model(OPEN), reach(OPEN, 2))
+    walked = roll_out(jax.random.key(1), true_model(OPEN), made.policy, made.terminal, jnp.array([0, 1]), moves=4)
+    assert walked.states.tolist() == [[0, 1, 2, 2, 2], [1, 2, 2, 2, 2]]
+    assert walked.actions.tolist() == [[RIGHT, RIGHT, -1, -1], [RIGHT, -1, -1, -1]]
+    assert walked.moves.tolist() == [2, 1]
+    assert walked.failed.tolist() == [0, 0]
+    assert walked.arrived.all()
+
+
+def test_walkers_stay_where_they_arrive_even_if_their_policy_would_lead_on():
+    always_right = jnp.zeros((9, 4)).at[:, RIGHT].set(1.0)
+    walked = roll_out(jax.random.key(0), true_model(OPEN), always_right, jnp.arange(9) == 1, jnp.array([0, 3]), moves=3)
+    assert walked.states.tolist() == [[0, 1, 1, 1], [3, 4, 5, 5]]
+    assert walked.arrived.tolist() == [True, False]
+
+
+WALKERS = 4000
+POLICY = np.array([[0.25, 0.75], [0.5, 0.5], [0.5, 0.5]])
+CHANCES = np.array([[[0.2, 0.3, 0.5], [0.7, 0.3, 0.0]]])
+
+
+def stochastic(seed):
+    world = graph(np.broadcast_to(np.arange(3), (3, 2, 3)))
+    with np.errstate(divide="ignore"):
+        logits = np.log(np.broadcast_to(CHANCES, (3, 2, 3)))
+    ends = jnp.array([False, True, True])
+    starts = jnp.zeros(WALKERS, dtype=int)
+    return roll_out(
+        jax.random.key(seed), TabularModel(world, jnp.asarray(logits)), jnp.asarray(POLICY), ends, starts, moves=1
+    )
+
+
+def test_frequencies_are_the_probabilities():
+    """Within four standard errors, actions and outcomes alike."""
+    walked = stochastic(0)
+    action, outcome = np.asarray(walked.actions)[:, 0], np.asarray(walked.states)[:, 1]
+    for a in (0, 1):
+        for k in (0, 1, 2):
+            expected = POLICY[0, a] * CHANCES[0, a, k]
+            error = 4 * np.sqrt(expected * (1 - expected) / WALKERS)
+            assert abs(np.mean((action == a) & (outcome == k)) - expected) <= error, (a, k)
+
+
+def test_equal_keys_give_equal_walks():
+    np.testing.assert_array_equal(stochastic(1).states, stochastic(1).states)
+    assert (stochastic(1).states != stochastic(2).states).any()
