@@ -9,7 +9,8 @@ are to reach 24 others. `tartarus` are the mazes of `real_people.py`, whose peop
 reach twelve other cells. Of the walks N are learned from, but at most four fifths. Others, at most a hundred, tell how
 probable the actions are that each method expects (nats a move).
 
-Robots set out from every free cell and plan by what each method has learned (`sidestep.robots.robot`; who knows nothing but
+Robots set out from every free cell and plan by what each method has learned (`sidestep.robots.robot`; who knows
+nothing but
 costs pursues these). `legal` is the share of planned paths that bump into nothing, `regret` by how many cells robots go
 farther than they had to, bumps and ways around included, and `arriving` the share of those who ever arrive; the regret
 is a mean over the worlds in which all do, held-out nats over those in which values are found for all held-out goals.

@@ -10,7 +10,8 @@ value and gradient of the walkers' action log-likelihood with respect to all cel
 - **cold**: starting from nothing;
 - **warm**: after a step of an optimiser, starting from what the solve before it left (values, order, adjoint). The step
   is along the gradient, its largest component `--step` long; with `--step-by-sign` every component is that long;
-- **region**: the same, but that only the states are solved that mattered to the solve before (`GaussSeidel` alone leaves
+- **region**: the same, but that only the states are solved that mattered to the solve before (`GaussSeidel` alone
+  leaves
   the others out), as a fit of a large map does where it tries a step that changes little;
 - **Dijkstra**: `scipy.sparse.csgraph.dijkstra` from the goal over the expected cost of every move, the matrix given.
 

@@ -240,7 +240,7 @@ def test_a_fit_that_fails_on_its_way_writes_no_map(here, capsys, monkeypatch):
     def learn(walks, map_file, folder, settings, _, *others):
         return whole(walks, map_file, folder, settings, broken, *others)
 
-    whole = cli.learn
+    whole = cli.learn  # pyright: ignore
     monkeypatch.setattr(cli, "learn", learn)
     assert run("learn walks.csv --map map.yaml --out out") == 1
     told = capsys.readouterr().err

@@ -198,7 +198,7 @@ def test_simulation_repeats_by_seed(office, tmp_path):
 
 def test_an_interrupted_run_goes_on(office, learned, tmp_path, monkeypatch, capsys):
     learn = ("learn", office / "walks.csv", "--map", office / "half.yaml", "--out", tmp_path)
-    whole = cli.learn
+    whole = cli.learn  # pyright: ignore
 
     def interrupted(walks, map_file, folder, settings, report, *others):
         def stop(progress):

@@ -48,7 +48,7 @@ def test_an_experiment_that_does_not_exist_is_wrong_usage(capsys):
 
 
 def test_moves_into_the_wall_are_taken_out():
-    world = room.room()
+    world = room.room()  # pyright: ignore
     demonstrations, _ = room.demonstrated(world, seed=3)
     aims = demonstrations.states + world.actions[demonstrations.actions]
     assert not world.inside(aims.__array__()).any()

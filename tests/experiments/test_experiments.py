@@ -87,7 +87,7 @@ def test_ten_optimal_walks_for_each_pair_with_ties_at_random():
 def test_the_demonstration_in_a_small_office(tmp_path, monkeypatch):
     monkeypatch.setattr(demo, "ROWS", 10)
     monkeypatch.setattr(demo, "COLUMNS", 10)
-    monkeypatch.setattr(demo, "WALKERS", demo.Walkers(walks=60, goals=5))
+    monkeypatch.setattr(demo, "WALKERS", demo.Walkers(walks=60, goals=5))  # pyright: ignore
     told = []
     summary = demo.demo(tmp_path, seed=1, report=told.append)
     assert len(told) == 3

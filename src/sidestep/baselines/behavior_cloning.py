@@ -10,7 +10,8 @@ own; the coarser `compass` knows the straight lines only. So the policy is parti
 and elsewhere, and to goals that nobody had, it goes by the direction. How much the weights are held down (L2) is what
 makes the actions of other walks most probable.
 
-Nothing is learned of cells, so they are not ranked. A robot follows the policy greedily, see `sidestep.robots.planners`.
+Nothing is learned of cells, so they are not ranked. A robot follows the policy greedily, see
+`sidestep.robots.planners`.
 """
 
 import warnings

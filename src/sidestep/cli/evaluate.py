@@ -22,7 +22,8 @@ def evaluate_map(
 
     They are written to `summary.json` in `out`; without `out`, added to the learned map's own. Beside them stands
     `planned_at_most`: between how many starts and goals paths were planned, and how many of those with bumps were
-    followed; and `bump_cost`, what the first bump at a place costs the robot that plans (`sidestep.robots.robot`). On maps
+    followed; and `bump_cost`, what the first bump at a place costs the robot that plans (`sidestep.robots.robot`). On
+    maps
     too large for paths between all pairs of free cells `seed` draws them. Raises `InputError` for a true map of another
     size, resolution or origin.
     """

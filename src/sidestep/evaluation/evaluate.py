@@ -79,7 +79,8 @@ def evaluate(
     - `ranking`: what cells are ranked by, higher for obstacles: P(blocked), where there is such a thing; None where
       cells are not ranked.
     - `scored`: the cells that had to be learned.
-    - `visited`: (state, goal) of what people passed (`Demonstrations.visited_state_goals`); they tell which obstacles matter.
+    - `visited`: (state, goal) of what people passed (`Demonstrations.visited_state_goals`); they tell which obstacles
+      matter.
     - `seed` draws starts and goals of paths on maps too large for all pairs (see `sample_for`).
     - `goals`: the states that paths lead to, where these are not all free cells.
 

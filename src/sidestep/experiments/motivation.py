@@ -1,7 +1,8 @@
 """The paper's section "Motivation": what one loses who explains detours by what places cost.
 
 People walk optimally, ties broken at random, in two rooms with a door between them and mud in the right one: a move
-into mud fails four times out of five. From the same walks a global cost function is learned (`maxent_irl`: no move fails,
+into mud fails four times out of five. From the same walks a global cost function is learned (`maxent_irl`: no move
+fails,
 cells cost something), and a transition model (`behavior_aware`: nothing costs anything, moves fail). Then the reward
 changes: the goal lies elsewhere, once in the mud, and what is at stake is larger or smaller. A robot plans with what
 was learned. It may also stay where it is for ever, which is worth nothing, and does so where no plan is worth more.

@@ -36,7 +36,8 @@ class Settings:
     """How a map is learned; `docs/real-people.md` tells how the defaults were chosen.
 
     - `backup`: a name in `BACKUPS`; `beta`: β above 0. `lapse`: the share of actions at random.
-    - `unknown`: what is learned of people with the map, of `LEARNABLE`. `tempering`: how much actions count, as in `fit`.
+    - `unknown`: what is learned of people with the map, of `LEARNABLE`. `tempering`: how much actions count, as in
+      `fit`.
     - `discount`, `step_cost`: the walkers' reward, as in `reach`.
     - `prior_mean`, `prior_variance`: of every unknown cell's logit. `lines`: how many nats it is worth, beside that, if
       a blocked cell lies between two others (`WallPrior`).
@@ -74,7 +75,8 @@ class Settings:
         return Behavior(BACKUPS[self.backup](), self.beta, self.lapse)
 
     def people(self, person: Int[np.ndarray, " tasks"] | None = None) -> BehaviorModel:
-        """People of whom is known what the settings say; `person`: whose each task is, where they differ (`split_by_person`)."""
+        """People of whom is known what the settings say; `person`: whose each task is, where they differ
+        (`split_by_person`)."""
         discount = self.discount if "discount" in self.unknown else None
         return behavior_model(self.behavior(), self.unknown, discount=discount, person=person)
 
@@ -90,7 +92,8 @@ def fit_map(
     walkers: BehaviorModel | None = None,
     afresh: bool = True,
 ) -> Fit[ObstacleGrid]:
-    """The fit that `settings` describe. Where transitions count, so do the cells in which walks begin (`FreeCellEvidence`).
+    """The fit that `settings` describe. Where transitions count, so do the cells in which walks begin
+    (`FreeCellEvidence`).
 
     - `each` is the prior of cells' logits and `walkers` are the people, where they are not the settings' own.
     - `afresh`: begin where transitions and first cells lead, rather than at `model`.

@@ -132,7 +132,8 @@ def behavior_model(
 ) -> BehaviorModel:
     """People who behave as `behavior` says, but for what is to be learned of them.
 
-    - `learned`: those of `LEARNABLE` that are learned, from where `behavior` and `discount` have them (lapses from a share
+    - `learned`: those of `LEARNABLE` that are learned, from where `behavior` and `discount` have them (lapses from a
+      share
       of .05 if it has none).
     - `person`: whose each task is, 0…persons − 1; then each has a sharpness of their own.
     - `features`: what people may like or dislike; `tastes` are the weights to start from, 0 by default, in units of

@@ -73,7 +73,8 @@ def solve(
     - `visited`: the states whose action values are wanted; by default all. Asking for few saves time and memory when
       they are differentiated.
     - `region`: the states that have to be solved, by default all; `start.region` are those that mattered to what the
-      solve that left the start was asked for. `GaussSeidel` brings the others up to date only roughly, which saves time.
+      solve that left the start was asked for. `GaussSeidel` brings the others up to date only roughly, which saves
+      time.
       Where they are seen to matter, derivatives are NaN; but a state that did not matter at all and does now goes
       unseen (see `process`). So this is for guesses that are looked at again, like those of a line search.
 

@@ -124,7 +124,7 @@ def with_state_costs(tasks: Task, costs: Float[Array, " states"], aimed_at: Int[
     >>> from sidestep.tabular.graph import grid_graph
     >>> grid = Grid.unknown(rows=1, columns=3)
     >>> aimed_at = grid_graph(grid).successors[..., 0]
-    >>> with_state_costs(reach(grid, 2), jnp.array([0.0, 0.25, 0.0]), aimed_at).reward[0].tolist()  # up, down, left, right
+    >>> with_state_costs(reach(grid, 2), jnp.array([0.0, 0.25, 0.0]), aimed_at).reward[0].tolist()
     [0.0, 0.0, 0.0, -0.25]
     """
     return Task(tasks.reward - costs[aimed_at], tasks.terminal_reward, tasks.terminal, tasks.discount)
