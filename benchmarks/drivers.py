@@ -26,7 +26,7 @@ from sidestep.tabular.likelihood import action_log_likelihood
 from sidestep.tabular.models import TiedModel, closed, road_network
 from two_way import FEATURES, TwoWay, turn_features, two_way
 
-OPEN, SURELY = -7.0, 0.01
+OPEN, SURELY = -7.0, 0.005
 """The prior of a link that was driven: the mean of its logit, and the variance."""
 CLOSED = 3.0
 """The logit of a link that is taken as closed: some twenty tries, longer than most ways round."""
@@ -50,7 +50,7 @@ class Settings:
     backup: str = "boltzmann"
     tastes: bool = True
     prior_mean: float = -4.0
-    prior_variance: float = 0.3
+    prior_variance: float = 0.15
     iterations: int = 100
     tolerance: float = 0.05
     many: int = 100_000

@@ -146,7 +146,7 @@ def _arguments() -> argparse.Namespace:
     add("--backup", default="logsumexp")
     add("--beta", type=float, default=5.0)
     add("--prior-mean", type=float, default=0.0)
-    add("--prior-variance", type=float, default=8.0)
+    add("--prior-variance", type=float, default=4.0)
     add("--lines", type=float, default=1.0)
     add("--iterations", type=int, help="at most this many")
     add("--memory", type=float, default=2.0, help="GiB for the fit's arrays")

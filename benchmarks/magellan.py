@@ -47,7 +47,7 @@ DRIVERS = Settings(
     discount=1.0,
     step_cost=1.0,
     prior_mean=-2.0,
-    prior_variance=4.0,
+    prior_variance=2.0,
     lines=0.0,
     connectivity=8,
 )

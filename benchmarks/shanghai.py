@@ -2,7 +2,7 @@
 
     python benchmarks/shanghai.py --out shanghai.png
     python benchmarks/shanghai.py --trips 2000 --seeds 3 --json shanghai.json
-    python benchmarks/shanghai.py --trips 200 --set prior_mean=-2 prior_variance=4
+    python benchmarks/shanghai.py --trips 200 --set prior_mean=-2 prior_variance=2
     python benchmarks/shanghai.py --quick
 
 Zhao & Liang (2022): 12,000 taxi trips on 714 links of Shanghai's roads, 338 of them one-way. The learner is given the

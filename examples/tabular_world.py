@@ -24,7 +24,7 @@ walk = ss.Trajectory(states=np.arange(PLACES), actions=np.full(PLACES - 1, WALK)
 demonstrations = ss.gather([walk] * 20, [task])
 
 people = ss.Behavior(ss.BoltzmannAverage(), beta=10.0)
-fit = ss.fit(world, demonstrations, people, prior=ss.Normal(0.0, 4.0))
+fit = ss.fit(world, demonstrations, people, prior=ss.Normal(0.0, 2.0))
 
 works = fit.model.probabilities()[:, :, 0]
 print(fit.message)

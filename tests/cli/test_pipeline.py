@@ -150,7 +150,7 @@ def test_eight_directions_parquet_and_the_paper_s_gradient(office, tmp_path):
     simulate = ("simulate", office / "true.yaml", "--out", walks, "--walks", 40, "--connectivity", 8, "--beta", 40)
     assert call(*simulate, "--seed", 3) == 0
     assert "failed_x" in pyarrow.parquet.read_table(walks).column_names
-    options = ("--connectivity", 8, "--gradient", "fixed-policy", "--prior-mean", -2, "--prior-variance", 4)
+    options = ("--connectivity", 8, "--gradient", "fixed-policy", "--prior-mean", -2, "--prior-variance", 2)
     assert call("learn", walks, "--map", office / "blank.yaml", "--out", out, *options) == 0
     told = summary(out)
     assert told["settings"]["gradient"] == "fixed_policy"

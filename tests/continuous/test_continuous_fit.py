@@ -33,7 +33,7 @@ pytestmark = pytest.mark.usefixtures("unoptimised")
 # people then value Q(s, a) = −s² − γ E(s + a + θ + noise)², whatever they do next.
 WAYS, DISCOUNT, NOISE, TRUTH, MOVES = np.array([-1.0, 0.0, 1.0]), 0.9, 0.4, 0.6, 90
 NEAR = QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.zeros((1, 1)), jnp.asarray(DISCOUNT))
-PEOPLE, PRIOR = Behavior(BoltzmannAverage(), 1.5), Normal(0.0, 100.0)
+PEOPLE, PRIOR = Behavior(BoltzmannAverage(), 1.5), Normal(0.0, 50.0)
 POLICY = finite_policy(jax.random.key(1), vector(*WAYS)[:, None], jnp.linspace(-2, 2, 9)[:, None], width=4, depth=1)
 PLANNER = Planner(horizon=2, places=8, samples=2, learning_rate=0.03, critic_width=4)
 BEGINNING = Drift(vector(-0.5), vector(NOISE))
@@ -82,7 +82,7 @@ def test_from_transitions_alone_linear_dynamics_are_learned_by_least_squares():
     begin = LinearGaussian(jnp.zeros((1, 1)), jnp.zeros((1, 1)), vector(0.3))
     found = fit(
         begin, demonstrated(STATES, CHOICES, following), PEOPLE, POLICY, PLANNER,
-        prior=Normal(0.0, 1e6), terms=("transitions",),
+        prior=Normal(0.0, 5e5), terms=("transitions",),
         schedule=Schedule(iterations=300, moves=MOVES, learning_rate=0.05),
     )  # fmt: skip
     learned = [float(found.dynamics.parameters[name][0, 0]) for name in ("state", "action")]
@@ -220,7 +220,7 @@ def test_parameters_that_still_drift_are_not_found_yet(asked, converged):
 def test_parameters_that_go_one_way_drift_as_far_as_they_can():
     """A prior far away is a slope that does not change, and Adam then takes whole steps."""
     schedule = Schedule(iterations=40, moves=MOVES, learning_rate=0.01)
-    found = learn(terms=("transitions",), schedule=schedule, prior=Normal(1e4, 1e3))
+    found = learn(terms=("transitions",), schedule=schedule, prior=Normal(1e4, 5e2))
     assert found.drift == pytest.approx(1, rel=0.05)
     assert not found.converged
 
@@ -287,7 +287,7 @@ def test_a_fit_with_other_settings_or_data_does_not_go_on(checkpoint):
     before = checkpoint.read_bytes()
     others = {
         "seed": partial(BOTH, seed=1),
-        "prior": partial(BOTH, prior=Normal(0.0, 4.0)),
+        "prior": partial(BOTH, prior=Normal(0.0, 2.0)),
         "terms": partial(BOTH, terms=("actions",)),
         "data": partial(fit, BEGINNING, demonstrated(*walks(1)), PEOPLE, POLICY, PLANNER, schedule=SHORT),
     }

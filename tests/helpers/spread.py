@@ -83,7 +83,7 @@ def measured(name: str, mesh: jax.sharding.Mesh | None) -> dict[str, np.ndarray]
 def fitted(name, mesh, **settings):
     """A fit of a few iterations."""
     solver, memory = WAYS[name]
-    settings |= {"solver": solver, "memory": memory, "mesh": mesh, "optimiser": LBFGS(iterations=ITERATIONS)}
+    settings |= {"solver": solver, "memory": memory, "mesh": mesh, "optimizer": LBFGS(iterations=ITERATIONS)}
     return fit(model(), demonstrations(), walkers(), **settings)
 
 

@@ -46,7 +46,7 @@ def walks(grid: Grid = BLANK, discount: float = 0.95, step_cost: float | None = 
     return gather(trajectories, [reach(grid, goal, discount=discount, step_cost=step_cost) for goal in GOALS])
 
 
-def objective(model, demonstrations, behavior, parameters, mean=-2.0, variance=4.0, **settings):
-    """log L(θ) − Σ (θ − b)²/a: what a fit should climb, from the likelihood and the paper's prior."""
+def objective(model, demonstrations, behavior, parameters, mean=-2.0, variance=2.0, **settings):
+    """log L(θ) − Σ (θ − b)²/(2σ²): the objective of a fit, from the likelihood and a normal prior."""
     likelihood = log_likelihood(model.with_parameters(parameters), demonstrations, behavior, **settings)
-    return likelihood.total - jnp.sum((parameters - mean) ** 2 / variance)
+    return likelihood.total - jnp.sum((parameters - mean) ** 2 / (2 * variance))

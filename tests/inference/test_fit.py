@@ -37,9 +37,9 @@ CASES = {
     "horizon 12": (PAYING, BoltzmannAverage(), 10.0, {"horizon": 12}, {}),
     "actions": (PAYING, BoltzmannAverage(), 10.0, {"terms": ("actions",)}, {}),
     "transitions": (PAYING, BoltzmannAverage(), 10.0, {"terms": ("transitions",)}, {}),
-    "ascent": (PAYING, BoltzmannAverage(), 10.0, {}, {"optimiser": ASCENT}),
-    "fixed policy": (PAYING, BoltzmannAverage(), 10.0, {}, {"optimiser": ASCENT, "gradient": "fixed_policy"}),
-    "log-sum-exp, fixed policy": (COSTLY, LogSumExp(), 2.0, {}, {"optimiser": ASCENT, "gradient": "fixed_policy"}),
+    "ascent": (PAYING, BoltzmannAverage(), 10.0, {}, {"optimizer": ASCENT}),
+    "fixed policy": (PAYING, BoltzmannAverage(), 10.0, {}, {"optimizer": ASCENT, "gradient": "fixed_policy"}),
+    "log-sum-exp, fixed policy": (COSTLY, LogSumExp(), 2.0, {}, {"optimizer": ASCENT, "gradient": "fixed_policy"}),
 }
 SMOOTH = ["Boltzmann", "mellowmax", "log-sum-exp", "horizon 12", "actions", "transitions"]
 CLIMBING = [*SMOOTH, "hard max"]
@@ -114,7 +114,7 @@ def test_the_wall_that_nobody_touched_is_found(name):
 def test_a_fit_says_honestly_whether_it_converged(name):
     """The hard max has kinks: no step gains anything although the gradient is far from zero."""
     found = fitted(name)
-    tolerance = CASES[name][4].get("optimiser", LBFGS()).tolerance
+    tolerance = CASES[name][4].get("optimizer", LBFGS()).tolerance
     assert found.converged == (found.final.gradient <= tolerance) == (name != "hard max")
     assert f"{found.final.gradient:.2g}" in found.message
     assert found.task_converged.all()

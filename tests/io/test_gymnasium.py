@@ -85,7 +85,7 @@ def lake(seed, episodes=200):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_slip_of_a_lake_is_found(seed, terms, within):
     world, people, demos = lake(seed)
-    found = fit(slippery(world, -3.0), demos, people, prior=Normal(0.0, 10.0), terms=terms)
+    found = fit(slippery(world, -3.0), demos, people, prior=Normal(0.0, 5.0), terms=terms)
     assert found.converged
     assert slip_of(found.model) == pytest.approx(2 / 3, abs=within)
 

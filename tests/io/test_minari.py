@@ -132,7 +132,7 @@ def test_a_lake_s_slip_is_learned_alike_from_what_was_read():
     write_demonstrations(dataset, demonstrations, world.model.graph)
     again = read_demonstrations(dataset, world.model.graph)
     first, second = (
-        fit(slippery(world, -3.0), each, people, prior=Normal(0.0, 10.0)) for each in (demonstrations, again)
+        fit(slippery(world, -3.0), each, people, prior=Normal(0.0, 5.0)) for each in (demonstrations, again)
     )
     assert first.final.objective == second.final.objective
     assert first.converged

@@ -15,7 +15,7 @@ from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.tasks import Task, reach
 
 GRID = Grid.unknown(1, 4)
-SETTINGS = Settings(lines=0.0, prior_mean=1.0, prior_variance=5.0, terms="transitions")
+SETTINGS = Settings(lines=0.0, prior_mean=1.0, prior_variance=2.5, terms="transitions")
 
 
 def walks(*lengths: int) -> Demonstrations[Task]:
@@ -33,10 +33,10 @@ def logits(demonstrations: Demonstrations[Task], settings: Settings = SETTINGS) 
 
 
 def most_probable(observations: float) -> float:
-    """Where −(θ − b)²/a + n ln(1 − σ(θ)) is highest, of a cell that was seen to be free n times."""
+    """Where −(θ − b)²/(2σ²) + n ln(1 − p) is highest, of a cell that was seen to be free n times."""
 
     def slope(logit: float) -> float:
-        return -2 * (logit - 1.0) / 5.0 - observations / (1 + np.exp(-logit))
+        return -(logit - 1.0) / 2.5 - observations / (1 + np.exp(-logit))
 
     return root_scalar(slope, bracket=(-20, 20)).root
 

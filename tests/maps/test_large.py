@@ -24,7 +24,7 @@ from sidestep.worlds.offices import office
 TRUTH = office(20, 24, seed=0)
 UNKNOWN = Grid.unknown(20, 24)
 SETTINGS = Settings(
-    backup="logsumexp", beta=5.0, discount=1.0, step_cost=1.0, prior_mean=0.5, prior_variance=8.0, lines=0.0
+    backup="logsumexp", beta=5.0, discount=1.0, step_cost=1.0, prior_mean=0.5, prior_variance=4.0, lines=0.0
 )
 
 
@@ -109,7 +109,7 @@ def test_it_ends_where_a_search_along_the_gradient_does(demonstrations, monkeypa
 def transitions_only(grid, demonstrations):
     """Where the transitions alone lead, and where walks begin."""
     begun = np.bincount(demonstrations.states[demonstrations.first_moves()], minlength=grid.size)
-    prior = FreeCellEvidence(Normal(0.5, 8.0), jnp.asarray(np.where(grid.known.ravel() == -1, begun, 0.0)))
+    prior = FreeCellEvidence(Normal(0.5, 4.0), jnp.asarray(np.where(grid.known.ravel() == -1, begun, 0.0)))
     people = Behavior(LogSumExp(), 5.0)
     return fit(ObstacleGrid(grid, 0.5), demonstrations, people, prior=prior, terms=("transitions",)).final
 

@@ -20,7 +20,7 @@ from sidestep.tabular.simulation import simulate
 from sidestep.tabular.tasks import reach
 from sidestep.worlds.rooms import two_rooms
 
-NORMAL = ("--prior-mean", 0.5, "--prior-variance", 8, "--lines", 0)
+NORMAL = ("--prior-mean", 0.5, "--prior-variance", 4, "--lines", 0)
 """Each cell for itself: then what a sensor says of one cell moves no other."""
 
 SEEN = np.rint(255 * np.random.default_rng(3).uniform(0.05, 0.95, (5, 5))) / 255
@@ -50,8 +50,8 @@ def passed(office):
 
 
 def posterior(times, mean, variance):
-    """P(blocked) of a cell that was passed so often: where −n σ(θ) − 2 (θ − b)/a is 0."""
-    return expit(brentq(lambda logit: times * expit(logit) + 2 * (logit - mean) / variance, -50, 50))
+    """P(blocked) of a cell that was passed so often: where −n p − (θ − b)/σ² is 0."""
+    return expit(brentq(lambda logit: times * expit(logit) + (logit - mean) / variance, -50, 50))
 
 
 def test_where_nobody_went_the_posterior_is_the_map(office, tmp_path):
@@ -59,23 +59,23 @@ def test_where_nobody_went_the_posterior_is_the_map(office, tmp_path):
     assert learn(office, tmp_path, "--terms", "transitions", "--sensor-map", office / "seen.yaml") == 0
     blocked, times = np.load(tmp_path / "blocked.npy"), passed(office)
     np.testing.assert_allclose(blocked[WALL], SEEN[WALL], atol=1e-6)
-    expected = [posterior(n, logit(p), 1.0) for n, p in zip(times[~WALL], SEEN[~WALL], strict=True)]
+    expected = [posterior(n, logit(p), 0.5) for n, p in zip(times[~WALL], SEEN[~WALL], strict=True)]
     np.testing.assert_allclose(blocked[~WALL], expected, atol=1e-4)
     told = summary(tmp_path)
     assert told["data"]["sensed_cells"] == 25
-    assert told["sensor"] == {"map": str(office / "seen.yaml"), "variance": 1.0}
+    assert told["sensor"] == {"map": str(office / "seen.yaml"), "variance": 0.5}
 
 
 def test_how_surely_each_cell_is_known(office, tmp_path):
     """A variance a cell; what has none is as if no sensor had looked."""
-    variance = np.random.default_rng(4).uniform(0.1, 5, (5, 5))
+    variance = np.random.default_rng(4).uniform(0.05, 2.5, (5, 5))
     variance[:, 3] = np.nan
     variance[1, :3] = np.inf
     np.save(tmp_path / "variance.npy", variance)
     options = ("--sensor-map", office / "seen.yaml", "--sensor-variance", tmp_path / "variance.npy")
     assert learn(office, tmp_path / "out", "--terms", "transitions", *options) == 0
     seen = np.isfinite(variance)
-    means, variances = np.where(seen, logit(SEEN), 0.5), np.where(seen, variance, 8.0)
+    means, variances = np.where(seen, logit(SEEN), 0.5), np.where(seen, variance, 4.0)
     expected = [posterior(*each) for each in zip(passed(office).flat, means.flat, variances.flat, strict=True)]
     np.testing.assert_allclose(np.load(tmp_path / "out" / "blocked.npy").ravel(), expected, atol=1e-4)
     told = summary(tmp_path / "out")
@@ -130,7 +130,7 @@ def test_half_of_a_wall_is_sensed_and_the_other_half_found_by_behavior(tmp_path)
     write_map(tmp_path / "blank.yaml", np.full(FLAT.shape, 0.5), FLAT)
     write_map(tmp_path / "seen.yaml", np.where(FLAT.known == Cell.OCCUPIED, 0.9, 0.1), FLAT)
     variance = np.full(FLAT.shape, np.nan)
-    variance[UPPER] = 1.0
+    variance[UPPER] = 0.5
     np.save(tmp_path / "variance.npy", variance)
     arguments = ("learn", tmp_path / "walks.csv", "--map", tmp_path / "blank.yaml", *NORMAL, "--out")
     assert call(*arguments, tmp_path / "alone") == 0

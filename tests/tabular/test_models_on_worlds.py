@@ -87,7 +87,7 @@ def test_the_rule_of_gravity_is_found_from_ten_demonstrations_a_goal():
         random.choice(np.setdiff1d(own, 4 * goal + np.arange(4)), 10) for own, goal in zip(arriving, goals, strict=True)
     ]
     demos = gather(simulate(jax.random.key(0), world, tasks, starts), tasks)
-    found = fit(FALLING.model(), demos, Behavior(BoltzmannAverage(), 10.0), prior=Normal(0.0, 4.0))
+    found = fit(FALLING.model(), demos, Behavior(BoltzmannAverage(), 10.0), prior=Normal(0.0, 2.0))
     assert found.converged
     assert rule_of(found.model).tolist() == RULE.tolist()
 
@@ -126,7 +126,7 @@ def test_what_machines_can_enter_is_found_from_ten_demonstrations_a_goal(terms):
     demos = gather(simulate(jax.random.key(0), world, tasks, starts), tasks)
     bumped = demos.states == demos.next_states
     assert not bumped.any()
-    found = fit(FARM.model(), demos, Behavior(BoltzmannAverage(), 10.0), prior=Normal(0.0, 4.0), terms=terms)
+    found = fit(FARM.model(), demos, Behavior(BoltzmannAverage(), 10.0), prior=Normal(0.0, 2.0), terms=terms)
     assert found.converged
     assert ((np.asarray(FARM.stopped(found.model)) < 0.5) == ENTERS).all()
 
@@ -146,7 +146,7 @@ def test_a_wall_between_cells_is_found_where_nobody_could_pass():
     starts = [random.choice(np.setdiff1d(np.arange(30), [goal]), 15) for goal in goals]
     demos = gather(simulate(jax.random.key(0), world, tasks, starts), tasks)
     assert not (demos.states == demos.next_states).any()
-    found = fit(walled_grid(Grid.unknown(5, 6)), demos, Behavior(BoltzmannAverage(), 10.0), prior=Normal(-2.0, 8.0))
+    found = fit(walled_grid(Grid.unknown(5, 6)), demos, Behavior(BoltzmannAverage(), 10.0), prior=Normal(-2.0, 4.0))
     chances = np.asarray(closed(found.model))
     others = np.delete(chances, wall)
     assert found.converged
@@ -178,7 +178,7 @@ def test_a_closed_link_is_found_from_trips_around_it():
     tasks = [reach(world.graph, goal) for goal in goals]
     starts = [random.choice(np.setdiff1d(np.arange(16), [goal, 3]), 12) for goal in goals]
     demos = gather(simulate(jax.random.key(0), world, tasks, starts), tasks)
-    found = fit(road_network(turns, np.ones(16)), demos, Behavior(BoltzmannAverage(), 10.0), prior=Normal(-2.0, 8.0))
+    found = fit(road_network(turns, np.ones(16)), demos, Behavior(BoltzmannAverage(), 10.0), prior=Normal(-2.0, 4.0))
     chances = np.asarray(closed(found.model))
     assert found.converged
     assert chances.argmax() == 3
@@ -245,7 +245,7 @@ def learned_with_slips(flat, slips, terrain, goals):
     starts = [random.choice(np.setdiff1d(free, [goal]), 10) for goal in goals]
     demos = gather(simulate(jax.random.key(0), world, tasks, starts), tasks)
     people = Behavior(BoltzmannAverage(), 3.0)
-    found = fit(SlipperyGrid(flat.forget(), terrain=terrain), demos, people, prior=Normal(-2.0, 8.0))
+    found = fit(SlipperyGrid(flat.forget(), terrain=terrain), demos, people, prior=Normal(-2.0, 4.0))
     assert found.converged
     blocked, wall = np.asarray(found.model.blocked), flat.known == Cell.OCCUPIED
     assert blocked[wall].min() > 0.8

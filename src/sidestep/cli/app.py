@@ -140,7 +140,7 @@ def learn_command(
         float, typer.Option(help="Prior mean of an unknown cell's logit (0: P = .5).")
     ] = Settings.prior_mean,
     prior_variance: Annotated[
-        float, typer.Option(help="a in the penalty (logit - mean)²/a.")
+        float, typer.Option(help="Prior variance of an unknown cell's logit.")
     ] = Settings.prior_variance,
     lines: Annotated[
         float, typer.Option(help="What it is worth to a blocked cell to lie between two others, in nats.")
@@ -151,8 +151,8 @@ def learn_command(
     ] = None,
     sensor_variance: Annotated[
         str,
-        typer.Option(help="a of what the sensors saw: a number, or a .npy file of one a cell.", metavar="A|FILE.npy"),
-    ] = "1",
+        typer.Option(help="Variance of sensed cells' logits: a number or a .npy file.", metavar="V|FILE.npy"),
+    ] = "0.5",
     connectivity: Connected = "4",
     terms: Annotated[Terms, typer.Option(help="Which parts of the likelihood count.")] = Settings.terms,
     gradient: Annotated[

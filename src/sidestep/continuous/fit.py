@@ -116,7 +116,7 @@ def fit(
 
     - `demonstrations`: from `gather`. `policy`: where the people's policy begins.
     - `planner`: how roll-outs are made and the policy is improved; its `samples` count here too.
-    - `prior`: over all parameters, the paper's N(−2, 4) by default. `terms`: "actions", "transitions" or both.
+    - `prior`: over all parameters, `Normal()` by default. `terms`: "actions", "transitions" or both.
     - `estimator`: "score" (eq. 11), or "pathwise" for reparameterised dynamics and smooth rewards.
     - `report`: called with a `FitProgress` and the dynamics as they are then, after every iteration.
     - `checkpoint`: a file that is kept up to date; with `resume` the fit goes on from there and ends exactly as if it

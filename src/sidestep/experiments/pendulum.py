@@ -70,7 +70,7 @@ def run(folder: Path, seed: int = 0, report: Callable[[str], None] = lambda _: N
         people,
         finite_policy(jax.random.key(seed), torques, seen, width=_WIDTH),
         PLANNER,
-        prior=Normal(np.log(REAL), 1.0),
+        prior=Normal(np.log(REAL), 0.5),
         terms=("actions",),
         estimator="pathwise",
         schedule=SCHEDULE,

@@ -37,7 +37,7 @@ from sidestep.worlds.grids import WORLDS, World
 WALKS_PER_PAIR = 10
 BETA = 10.0
 REWARD = Reward(discount=0.95)
-PRIOR_MEAN, PRIOR_VARIANCE = -2.0, 4.0
+PRIOR_MEAN, PRIOR_VARIANCE = -2.0, 4.0 / 2  # the paper's penalty is (θ − b)²/a, so a = 4 is twice the variance
 
 
 class Variant(NamedTuple):

@@ -34,7 +34,7 @@ from sidestep.worlds.continuous_room import Room, room, walks_without_collisions
 
 WALKERS, CENTRES = 24, 16
 """People to each goal, and centres of basis functions a side."""
-BETA, PRIOR_MEAN, PRIOR_VARIANCE = 4.0, -2.5, 20.0
+BETA, PRIOR_MEAN, PRIOR_VARIANCE = 4.0, -2.5, 10.0
 PLANNER = Planner(horizon=24, learning_rate=0.02)
 SCHEDULE = Schedule(iterations=300, rehearsals=80, learning_rate=0.15, lag=0.2)
 _WIDTH = 48

@@ -83,7 +83,7 @@ def fit(
     """The model of `model`'s family that maximises the posterior of `demonstrations`, starting at `model`.
 
     - `behavior`: how people behave; `behavior_model(...)` where that is to be learned too.
-    - `prior`: over the model's parameters; by default the paper's N(−2, 4).
+    - `prior`: over the model's parameters; by default `Normal()`, the paper's.
     - `tempering`: κ in (0, 1], how much the actions' log-likelihood counts; below 1 where steps depend on each other.
     - `terms`: which parts of the likelihood count, "actions", "transitions" or both.
     - `gradient`, `horizon`, `solver`: as for `solve`. On large maps, solves are only as exact as the optimiser needs

@@ -37,7 +37,7 @@ def read_sensor_map(path: str | Path, grid: Grid) -> Float[np.ndarray, "rows col
 
 
 def read_sensor_variance(path: str | Path, grid: Grid) -> Float[np.ndarray, "rows columns"]:
-    """How surely each cell is known, from a `.npy` file: a of its logit, rows top first (see `sensor_prior`).
+    """The variance of each cell's logit from a `.npy` file, rows top first (see `sensor_prior`).
 
     NaN or infinite where nothing is known. Raises `InputError` for a file that holds no array of the grid's shape, and
     for numbers that are not above 0.

@@ -57,7 +57,7 @@ class Settings:
     discount: float = 0.95
     step_cost: float | None = None
     prior_mean: float = -1.5
-    prior_variance: float = 16.0
+    prior_variance: float = 8.0
     lines: float = 1.0
     connectivity: Connectivity = 4
     terms: Terms = "both"

@@ -14,11 +14,11 @@ from sidestep.tabular.grid import Cell, Grid
 class Sensor(NamedTuple):
     """A map of what sensors have seen, and how surely they saw it.
 
-    `variance` is a of each cell's logit, as in `Settings.prior_variance`: one number, or a `.npy` file of one a cell.
+    `variance` is that of each cell's logit: one number, or a `.npy` file of one a cell.
     """
 
     map_file: Path
-    variance: float | Path = 1.0
+    variance: float | Path = 0.5
 
     def told(self) -> dict[str, str | float]:
         """What a summary says of it."""
