@@ -16,7 +16,7 @@ from scaling import SOLVERS, Problem, take
 from sidestep.tabular.backups import BACKUPS, Behavior
 from sidestep.tabular.likelihood import choices_of
 from sidestep.tabular.models import TabularModel, TransitionModel
-from sidestep.tabular.solve import solve
+from sidestep.tabular.solve import SolveOptions, solve
 from sidestep.tabular.solvers.base import DecisionProcess, action_values, at_fixed_policy
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from worlds import World
@@ -84,7 +84,7 @@ def values(problem: Problem, parameters: Parameters) -> Found:
         problem.model.with_parameters(parameters),
         problem.demonstrations.tasks,
         problem.behavior,
-        solver=problem.solver,
+        options=SolveOptions(solver=problem.solver),
     )
     return jnp.where(found.converged[0], found.values[0], jnp.nan), found.sweeps[0]
 

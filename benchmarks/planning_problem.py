@@ -15,7 +15,7 @@ from sidestep.errors import NotConverged
 from sidestep.tabular.backups import Behavior, LogSumExp
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.planning import plan
-from sidestep.tabular.solve import solve
+from sidestep.tabular.solve import SolveOptions, solve
 from sidestep.tabular.solvers.base import Solver
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
@@ -70,7 +70,7 @@ def soft_values(
     model: ObstacleGrid, task: Task, behavior: Behavior, solver: Solver | None, horizon: int | None
 ) -> tuple[Array, Array]:
     """Soft values and whether they converged."""
-    found = solve(model, task, behavior, solver=solver, horizon=horizon)
+    found = solve(model, task, behavior, options=SolveOptions(solver=solver, horizon=horizon))
     return found.values, found.converged
 
 
@@ -80,7 +80,9 @@ def own_call(problem: Problem, name: str, soft: bool, tolerance: float, horizon:
     solvers = {"sidestep ordered": GaussSeidel(tolerance=tolerance), "sidestep jacobi": Jacobi(tolerance=tolerance)}
     solver = solvers.get(name)
     if not soft:
-        return lambda: np.asarray(jax.block_until_ready(plan(model, task, solver=solver)).solution.values)
+        return lambda: np.asarray(
+            jax.block_until_ready(plan(model, task, options=SolveOptions(solver=solver))).solution.values
+        )
 
     def call() -> np.ndarray:
         people = Behavior(LogSumExp(), problem.beta)

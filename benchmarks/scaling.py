@@ -57,7 +57,7 @@ from sidestep.tabular.backups import BACKUPS, Behavior, Gradient
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import Choices, choice_log_likelihood, choices_of
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.solve import Solution
+from sidestep.tabular.solve import Solution, SolveOptions
 from sidestep.tabular.solvers.base import Solver, WarmStart
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
@@ -120,7 +120,7 @@ def take(
         model, begun = problem.model.with_parameters(parameters), start._replace(adjoint=adjoint)
 
         def one(task: Task, choices: Choices, begun: WarmStart, region: Array) -> tuple[Array, Solution]:
-            how = {"gradient": problem.gradient, "solver": problem.solver, "region": region}
+            how = {"options": SolveOptions(problem.gradient, solver=problem.solver), "region": region}
             return choice_log_likelihood(model, task, choices, problem.behavior, begun, **how)
 
         values, found = jax.vmap(one)(problem.demonstrations.tasks, problem.choices, begun, region)

@@ -39,7 +39,7 @@ from sidestep.tabular.models import (
 )
 from sidestep.tabular.planning import Plan, RollOuts, plan, roll_out
 from sidestep.tabular.simulation import simulate
-from sidestep.tabular.solve import Solution, check_proper, solve
+from sidestep.tabular.solve import Solution, SolveOptions, check_proper, solve
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import Reward, Task, reach, stack_tasks, task
@@ -79,6 +79,7 @@ __all__ = [
     "SidestepError",
     "SlipperyGrid",
     "Solution",
+    "SolveOptions",
     "TabularModel",
     "Task",
     "TiedModel",

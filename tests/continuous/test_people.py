@@ -16,7 +16,7 @@ from sidestep.continuous.tasks import Hold, reach, stack
 from sidestep.errors import ImproperTask, InputError, NotConverged
 from sidestep.tabular.backups import Behavior, LogSumExp
 from sidestep.tabular.demonstrations import Trajectory
-from sidestep.tabular.solve import solve
+from sidestep.tabular.solve import SolveOptions, solve
 from sidestep.tabular.solvers.jacobi import Jacobi
 
 pytestmark = pytest.mark.usefixtures("unoptimised")
@@ -148,7 +148,7 @@ def test_people_who_never_want_to_arrive_are_no_examples():
 
 
 def test_values_that_were_not_found_are_not_acted_on(monkeypatch):
-    monkeypatch.setattr(simulation, "solve", partial(solve, solver=Jacobi(max_sweeps=2)))
+    monkeypatch.setattr(simulation, "solve", partial(solve, options=SolveOptions(solver=Jacobi(max_sweeps=2))))
     with pytest.raises(NotConverged, match=r"values did not converge for task 0: a finer lattice or a smaller β"):
         people(ROOM, SHARP)
 

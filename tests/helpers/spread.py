@@ -21,6 +21,7 @@ from sidestep.tabular.behavior_model import BehaviorModel, BehaviorParameters, b
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.likelihood import ALL_TERMS
 from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import reach
@@ -60,7 +61,7 @@ def demonstrations(repeats: int = 1) -> Demonstrations:
 def problem(name: str, repeats: int = 1) -> Problem:
     """What is to be solved."""
     solver = WAYS[name][0]
-    return Problem(model(), walkers(), demonstrations(repeats), Normal(), ALL_TERMS, None, "exact", solver)
+    return Problem(model(), walkers(), demonstrations(repeats), Normal(), ALL_TERMS, SolveOptions(solver=solver))
 
 
 def measured(name: str, mesh: jax.sharding.Mesh | None) -> dict[str, np.ndarray]:
@@ -83,7 +84,12 @@ def measured(name: str, mesh: jax.sharding.Mesh | None) -> dict[str, np.ndarray]
 def fitted(name, mesh, **settings):
     """A fit of a few iterations."""
     solver, memory = WAYS[name]
-    settings |= {"solver": solver, "memory": memory, "mesh": mesh, "optimizer": LBFGS(iterations=ITERATIONS)}
+    settings |= {
+        "options": SolveOptions(solver=solver),
+        "memory": memory,
+        "mesh": mesh,
+        "optimizer": LBFGS(iterations=ITERATIONS),
+    }
     return fit(model(), demonstrations(), walkers(), **settings)
 
 

@@ -20,7 +20,7 @@ from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import ObstacleGrid, TabularModel
-from sidestep.tabular.solve import solve
+from sidestep.tabular.solve import SolveOptions, solve
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import reach
 
@@ -34,12 +34,24 @@ CASES = {
     "mellowmax": (PAYING, Mellowmax(), 10.0, {}, {}),
     "log-sum-exp": (COSTLY, LogSumExp(), 2.0, {}, {}),
     "hard max": (PAYING, HardMax(), 10.0, {}, {}),
-    "horizon 12": (PAYING, BoltzmannAverage(), 10.0, {"horizon": 12}, {}),
+    "horizon 12": (PAYING, BoltzmannAverage(), 10.0, {"options": SolveOptions(horizon=12)}, {}),
     "actions": (PAYING, BoltzmannAverage(), 10.0, {"terms": ("actions",)}, {}),
     "transitions": (PAYING, BoltzmannAverage(), 10.0, {"terms": ("transitions",)}, {}),
     "ascent": (PAYING, BoltzmannAverage(), 10.0, {}, {"optimizer": ASCENT}),
-    "fixed policy": (PAYING, BoltzmannAverage(), 10.0, {}, {"optimizer": ASCENT, "gradient": "fixed_policy"}),
-    "log-sum-exp, fixed policy": (COSTLY, LogSumExp(), 2.0, {}, {"optimizer": ASCENT, "gradient": "fixed_policy"}),
+    "fixed policy": (
+        PAYING,
+        BoltzmannAverage(),
+        10.0,
+        {},
+        {"optimizer": ASCENT, "options": SolveOptions("fixed_policy")},
+    ),
+    "log-sum-exp, fixed policy": (
+        COSTLY,
+        LogSumExp(),
+        2.0,
+        {},
+        {"optimizer": ASCENT, "options": SolveOptions("fixed_policy")},
+    ),
 }
 SMOOTH = ["Boltzmann", "mellowmax", "log-sum-exp", "horizon 12", "actions", "transitions"]
 CLIMBING = [*SMOOTH, "hard max"]
@@ -221,10 +233,9 @@ def test_a_model_that_knows_nothing_of_grids_learns_a_forbidden_transition():
 
 
 @pytest.mark.parametrize(("settings", "message"), [
-    ({"gradient": "fixed_policy"}, r"'gradient'.*Ascent\(\)"),
+    ({"options": SolveOptions("fixed_policy")}, r"'gradient'.*Ascent\(\)"),
     ({"terms": ()}, "'terms'"),
     ({"resume": True}, "'resume'"),
-    ({"horizon": 0}, "at least one action"),
 ])  # fmt: skip
 def test_settings_that_do_not_go_together(settings, message):
     with pytest.raises(InputError, match=message):
@@ -240,18 +251,24 @@ def test_tasks_without_values_are_refused():
 def test_solves_that_stop_early_are_never_used():
     people, demonstrations = Behavior(BoltzmannAverage()), walks(BLANK, *PAYING)
     with pytest.raises(NotConverged, match=r"task\(s\) \[0, 1, 2\]"):
-        fit(MODEL, demonstrations, people, solver=Jacobi(max_sweeps=2))
+        fit(MODEL, demonstrations, people, options=SolveOptions(solver=Jacobi(max_sweeps=2)))
     enough = int(eqx.filter_jit(solve)(MODEL, demonstrations.tasks, people).sweeps.max())
     with pytest.raises(NotConverged, match="stopped converging at iteration"):
         # steps so long that starting from the last values does not help
-        fit(MODEL, demonstrations, people, solver=Jacobi(max_sweeps=enough), optimizer=Adam(learning_rate=3.0))
+        fit(
+            MODEL,
+            demonstrations,
+            people,
+            options=SolveOptions(solver=Jacobi(max_sweeps=enough)),
+            optimizer=Adam(learning_rate=3.0),
+        )
 
 
 def test_lbfgs_never_ends_where_solves_stop_early():
     """The solves of this fit converge near its start only; the search turns back at that border."""
     people, demonstrations = Behavior(BoltzmannAverage()), walks(BLANK, *PAYING)
     enough = 2 + int(eqx.filter_jit(solve)(MODEL, demonstrations.tasks, people).sweeps.max())
-    found = fit(MODEL, demonstrations, people, solver=Jacobi(max_sweeps=enough))
+    found = fit(MODEL, demonstrations, people, options=SolveOptions(solver=Jacobi(max_sweeps=enough)))
     assert found.task_converged.all()
     assert (np.diff([progress.objective for progress in found.history]) > 0).all()
     assert not found.converged

@@ -18,6 +18,7 @@ from sidestep.tabular.graph import grid_graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import ALL_TERMS, log_likelihood
 from sidestep.tabular.models import ObstacleGrid, TabularModel
+from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.solvers.native import cores
@@ -34,7 +35,7 @@ ONE_TASK = STATES * 4 * 2 * 8.0
 
 
 def problem_of(solver=SOLVERS["jacobi"], terms=ALL_TERMS, shown=None, model=MODEL):
-    return Problem(model, behavior_model(PEOPLE), shown or demonstrations(), PRIOR, terms, None, "exact", solver)
+    return Problem(model, behavior_model(PEOPLE), shown or demonstrations(), PRIOR, terms, SolveOptions(solver=solver))
 
 
 def directly(problem, parameters):
@@ -42,7 +43,10 @@ def directly(problem, parameters):
 
     def loss(parameters):
         likelihood = log_likelihood(
-            problem.model.with_parameters(parameters), problem.demonstrations, PEOPLE, solver=problem.solver
+            problem.model.with_parameters(parameters),
+            problem.demonstrations,
+            PEOPLE,
+            options=SolveOptions(solver=problem.solver),
         )
         prior = problem.prior.log_density(parameters)
         return -likelihood.total - prior, (likelihood.actions, likelihood.transitions, prior)

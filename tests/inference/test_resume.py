@@ -14,6 +14,7 @@ from sidestep.inference.optimizers import LBFGS, Adam, Rprop
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 
 OPTIMISERS = {"L-BFGS": LBFGS(), "ascent": Adam(iterations=40), "resilient": Rprop(tolerance=1e-4)}
@@ -49,7 +50,7 @@ def a_batch_for_each_task(monkeypatch):
 def test_resumed_to_the_last_bit(tmp_path, monkeypatch, name, large):
     if large:
         a_batch_for_each_task(monkeypatch)
-    fitted = partial(fit_with, name, solver=GaussSeidel() if large else None)
+    fitted = partial(fit_with, name, options=SolveOptions(solver=GaussSeidel() if large else None))
     expected = fitted()
     checkpoint = tmp_path / "fit.checkpoint"
     for iteration in (3, 3, 9):
@@ -77,7 +78,7 @@ def test_without_resume_a_fit_starts_again(tmp_path):
     ("ascent", {}),
     ("L-BFGS", {"prior": Normal(0.0, 4.0)}),
     ("L-BFGS", {"terms": ("actions",)}),
-    ("L-BFGS", {"horizon": 9}),
+    ("L-BFGS", {"options": SolveOptions(horizon=9)}),
 ])  # fmt: skip
 def test_a_fit_with_other_settings_does_not_go_on(tmp_path, name, settings):
     checkpoint = tmp_path / "fit.checkpoint"

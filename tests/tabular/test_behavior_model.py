@@ -17,6 +17,7 @@ from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import ALL_TERMS
 from sidestep.tabular.models import ObstacleGrid, true_model
 from sidestep.tabular.simulation import simulate
+from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import reach, task
 
@@ -56,7 +57,7 @@ def test_the_slope_of_all_that_is_learned_is_that_of_the_objective(backup):
         aimed_at=np.asarray(OPEN.graph.successors[..., 0]),
     )
     model = ObstacleGrid(GRID, 0.3 * np.sin(np.arange(GRID.size)))
-    problem = Problem(model, someone, shown, Normal(), ALL_TERMS, None, "exact", Jacobi(tolerance=1e-13), tempering=0.7)
+    problem = Problem(model, someone, shown, Normal(), ALL_TERMS, SolveOptions(solver=Jacobi(tolerance=1e-13)), 0.7)
     objective = Objective(problem, MEMORY)
     point, back = ravel_pytree(problem.parameters)
     starts = objective.cold_starts()

@@ -12,9 +12,8 @@ from sidestep.errors import InputError
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
-from sidestep.tabular.solve import solve
+from sidestep.tabular.solve import SolveOptions, default_solver, solve
 from sidestep.tabular.solvers.base import neg_inf
-from sidestep.tabular.solvers.choice import default_solver
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import reach, stack_tasks
@@ -32,7 +31,9 @@ def values_and_slopes(model, wanted, people, start=None, solver=SOLVER):
 
     def total(parameters, adjoint):
         begin = start._replace(adjoint=adjoint)
-        found = solve(model.with_parameters(parameters), wanted, people, solver=solver, start=begin)
+        found = solve(
+            model.with_parameters(parameters), wanted, people, options=SolveOptions(solver=solver), start=begin
+        )
         weights = jnp.cos(jnp.arange(found.values.size)).astype(found.values.dtype)
         return jnp.sum(weights * found.values), found
 
@@ -98,8 +99,8 @@ def test_a_start_that_another_solver_left():
     """Jacobi leaves no order."""
     model = some_map(4, 5)
     wanted, behavior = reach(model.graph, 5), people("Boltzmann")
-    start = solve(model, wanted, behavior, solver=Jacobi()).start
-    found = solve(model, wanted, behavior, solver=SOLVER, start=start)
+    start = solve(model, wanted, behavior, options=SolveOptions(solver=Jacobi())).start
+    found = solve(model, wanted, behavior, options=SolveOptions(solver=SOLVER), start=start)
     assert found.converged
     assert found.start.order.tolist()[0] == 5
 
@@ -111,7 +112,9 @@ def test_traces_of_an_earlier_adjoint_are_forgotten():
     start = SOLVER.cold_start(420, jnp.dtype(jnp.float64))
 
     def of_one_state(adjoint):
-        return solve(model, wanted, behavior, solver=SOLVER, start=start._replace(adjoint=adjoint)).values[8]
+        return solve(
+            model, wanted, behavior, options=SolveOptions(solver=SOLVER), start=start._replace(adjoint=adjoint)
+        ).values[8]
 
     cold, traces = (jax.grad(of_one_state)(jnp.full(420, size)) for size in (0.0, 1e-30))
     assert 0 < jnp.count_nonzero(cold) < 420
@@ -125,8 +128,8 @@ def test_traces_of_an_earlier_adjoint_are_forgotten():
 def test_states_are_counted_from_either_end_and_there_are_no_others(solver):
     model, wanted = some_map(), reach(Grid.unknown(20, 21), 5, discount=0.99)
     visited = jnp.asarray([3, -1, -420, 419, 1_000])
-    found = solve(model, wanted, people("Boltzmann"), solver=solver, visited=visited)
-    every = solve(model, wanted, people("Boltzmann"), solver=solver)
+    found = solve(model, wanted, people("Boltzmann"), options=SolveOptions(solver=solver), visited=visited)
+    every = solve(model, wanted, people("Boltzmann"), options=SolveOptions(solver=solver))
     np.testing.assert_array_equal(found.action_values, every.action_values[jnp.asarray([3, 419, 0, 419, 419])])
 
 
@@ -142,7 +145,13 @@ def test_nested_batches_and_loops():
     def of(parameters, beta, wanted):
         def total(parameters, beta):
             behavior = Behavior(BoltzmannAverage(), beta)
-            return jnp.sum(jnp.sin(solve(model.with_parameters(parameters), wanted, behavior, solver=SOLVER).values))
+            return jnp.sum(
+                jnp.sin(
+                    solve(
+                        model.with_parameters(parameters), wanted, behavior, options=SolveOptions(solver=SOLVER)
+                    ).values
+                )
+            )
 
         return jax.value_and_grad(total, (0, 1))(parameters, beta)
 
@@ -217,7 +226,12 @@ def test_values_that_move_each_other_come_to_rest():
     walls, closed = random.random((60, 60)) < 0.3, random.random((60, 60)) < 0.1
     grid = Grid(np.where(closed, -1, walls.astype(int)))
     goal = reach(grid, int(np.flatnonzero(grid.known == 0)[0]), discount=1.0, step_cost=1.0)
-    found = solve(ObstacleGrid(grid, 8.0), goal, Behavior(LogSumExp(), 5.0), solver=GaussSeidel(max_sweeps=600))
+    found = solve(
+        ObstacleGrid(grid, 8.0),
+        goal,
+        Behavior(LogSumExp(), 5.0),
+        options=SolveOptions(solver=GaussSeidel(max_sweeps=600)),
+    )
     assert found.converged
 
 
@@ -233,9 +247,9 @@ def test_a_start_that_leads_astray_costs_no_more_than_it_was_trusted(seed, toler
     closed_model, open_model = (ObstacleGrid(truth.forget(), jnp.asarray(made)) for made in (logits, opened))
     goal = reach(truth.forget(), int(random.choice(np.flatnonzero(~wall))), discount=1.0, step_cost=1.0)
     walkers, solver = Behavior(LogSumExp(), 5.0), GaussSeidel(tolerance=tolerance)
-    start = solve(closed_model, goal, walkers, solver=solver).start
-    cold = solve(open_model, goal, walkers, solver=solver)
-    warm = solve(open_model, goal, walkers, solver=solver, start=start)
+    start = solve(closed_model, goal, walkers, options=SolveOptions(solver=solver)).start
+    cold = solve(open_model, goal, walkers, options=SolveOptions(solver=solver))
+    warm = solve(open_model, goal, walkers, options=SolveOptions(solver=solver), start=start)
     assert warm.sweeps <= cold.sweeps + trusted + 1
     np.testing.assert_allclose(warm.values, cold.values, rtol=10 * tolerance)
 
@@ -247,8 +261,10 @@ def test_a_start_nearby_is_not_given_up_though_it_takes_many_rounds():
     model, nearby = (ObstacleGrid(truth.forget(), jnp.asarray(share * logits)) for share in (1.0, 1.02))
     goal = reach(truth.forget(), int(np.flatnonzero(~wall)[0]), discount=1.0, step_cost=1.0)
     walkers, solver = Behavior(LogSumExp(), 5.0), GaussSeidel(tolerance=1e-5)
-    start = solve(model, goal, walkers, solver=solver).start
-    cold, warm = (solve(nearby, goal, walkers, solver=solver, start=each) for each in (None, start))
+    start = solve(model, goal, walkers, options=SolveOptions(solver=solver)).start
+    cold, warm = (
+        solve(nearby, goal, walkers, options=SolveOptions(solver=solver), start=each) for each in (None, start)
+    )
     assert warm.sweeps < cold.sweeps
     np.testing.assert_allclose(warm.values, cold.values, rtol=1e-4)
 
@@ -256,15 +272,21 @@ def test_a_start_nearby_is_not_given_up_though_it_takes_many_rounds():
 def test_a_start_is_trusted_for_a_while_even_if_no_tolerance_is_left():
     model = some_map()
     goal = reach(model.graph, 5, discount=0.99)
-    first = solve(model, goal, people("Boltzmann"), solver=SOLVER)
-    again = solve(model, goal, people("Boltzmann"), solver=GaussSeidel(tolerance=0.0, max_sweeps=50), start=first.start)
+    first = solve(model, goal, people("Boltzmann"), options=SolveOptions(solver=SOLVER))
+    again = solve(
+        model,
+        goal,
+        people("Boltzmann"),
+        options=SolveOptions(solver=GaussSeidel(tolerance=0.0, max_sweeps=50)),
+        start=first.start,
+    )
     np.testing.assert_allclose(again.values, first.values, rtol=1e-9)
 
 
 def test_backups_without_machine_code_are_refused():
     model = some_map(4, 5)
     with pytest.raises(InputError, match="Jacobi"):
-        solve(model, reach(model.graph, 0), Behavior(Sharper(), 5.0), solver=GaussSeidel())
+        solve(model, reach(model.graph, 0), Behavior(Sharper(), 5.0), options=SolveOptions(solver=GaussSeidel()))
 
 
 def test_the_choice_of_a_solver():

@@ -29,7 +29,7 @@ from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import ObstacleGrid
-from sidestep.tabular.solve import solve
+from sidestep.tabular.solve import SolveOptions, solve
 from sidestep.tabular.tasks import Task, reach, stack_tasks
 
 BETA = 4.0
@@ -62,7 +62,9 @@ def solved(graph: str, name: str, horizon, gradient, inputs) -> tuple:
     problem = PROBLEMS[graph]
     task = Task(inputs["reward"], inputs["final"], jnp.arange(problem.states) == problem.goal, inputs["discount"])
     model = problem.model.with_parameters(inputs["parameters"])
-    found = solve(model, task, Behavior(BACKUPS[name], inputs["beta"]), horizon=horizon, gradient=gradient)
+    found = solve(
+        model, task, Behavior(BACKUPS[name], inputs["beta"]), options=SolveOptions(horizon=horizon, gradient=gradient)
+    )
     return found.values, found.action_values
 
 
@@ -168,7 +170,9 @@ def check_log_likelihood(graph, name, horizon):
     @jax.jit
     @jax.value_and_grad
     def ours(parameters):
-        return log_likelihood(model.with_parameters(parameters), demos, people, horizon=horizon).total
+        return log_likelihood(
+            model.with_parameters(parameters), demos, people, options=SolveOptions(horizon=horizon)
+        ).total
 
     plain = partial(unrolled_log_likelihood(graph), NAMES.index(name), horizon or ENOUGH)
     (value, found), (expected_value, expected) = ours(model.parameters), plain(model.parameters)
@@ -225,7 +229,12 @@ def fixed_policy_jacobian(graph: str, name: str, horizon):
     model, people = PROBLEMS[graph].model, Behavior(BACKUPS[name], BETA)
 
     def values(parameters, task):
-        found = solve(model.with_parameters(parameters), task, people, horizon=horizon, gradient="fixed_policy")
+        found = solve(
+            model.with_parameters(parameters),
+            task,
+            people,
+            options=SolveOptions(horizon=horizon, gradient="fixed_policy"),
+        )
         return found.values, found.action_values
 
     return jax.jit(jax.jacrev(values))
@@ -254,7 +263,7 @@ def test_hard_max_shares_its_gradient_among_ties(connectivity, horizon):
     @jax.jacrev
     def jacobian(parameters):
         moved = model.with_parameters(parameters)
-        return solve(moved, task, Behavior(BACKUPS["hard max"], BETA), horizon=horizon).values
+        return solve(moved, task, Behavior(BACKUPS["hard max"], BETA), options=SolveOptions(horizon=horizon)).values
 
     found = jacobian(model.parameters)
     dense = partial(dense_obstacles, rows=3, columns=3, connectivity=connectivity)
@@ -283,7 +292,9 @@ def test_fixed_policy_likelihood_has_the_gradient_of_equation_6(name):
 
     def ours(parameters):
         model = problem.model.with_parameters(parameters)
-        return log_likelihood(model, demos, Behavior(BACKUPS[name], BETA), gradient="fixed_policy").total
+        return log_likelihood(
+            model, demos, Behavior(BACKUPS[name], BETA), options=SolveOptions(gradient="fixed_policy")
+        ).total
 
     def log_transition(parameters):
         return jnp.log(problem.dense(parameters)[demos.states, demos.actions, demos.next_states])
@@ -308,7 +319,7 @@ def test_a_stack_of_tasks_is_each_task_by_itself(name, gradient):
     @jax.value_and_grad
     def both(parameters, task):
         model = problem.model.with_parameters(parameters)
-        values = solve(model, task, Behavior(BACKUPS[name], BETA), gradient=gradient).values
+        values = solve(model, task, Behavior(BACKUPS[name], BETA), options=SolveOptions(gradient=gradient)).values
         return jnp.sum(jnp.cos(values))
 
     together = both(problem.model.parameters, stack_tasks(tasks))

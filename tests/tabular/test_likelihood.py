@@ -17,7 +17,7 @@ from sidestep.tabular.likelihood import (
     transition_log_likelihood,
 )
 from sidestep.tabular.models import ObstacleGrid, TabularModel
-from sidestep.tabular.solve import solve
+from sidestep.tabular.solve import SolveOptions, solve
 from sidestep.tabular.tasks import reach
 
 # In a corridor of three cells, each blocked with p = 1/4, at γ = 1/2, a walker at 0 tries left, right, right;
@@ -64,7 +64,7 @@ def test_one_action_ahead_only_the_cell_before_the_goal_is_worth_something():
     stay_1, left_1, right_1 = 0.5 * v, 0.5 * v / 4, 0.5 * (3 / 4 + v / 4)
     at_1 = np.log(2 * np.exp(BETA * stay_1) + np.exp(BETA * left_1) + np.exp(BETA * right_1))
     expected = BETA * (stay + 2 * right + right_1) - 3 * at_0 - at_1
-    found = corridor_likelihood(terms=("actions",), horizon=1)
+    found = corridor_likelihood(terms=("actions",), options=SolveOptions(horizon=1))
     assert float(found.actions) == pytest.approx(expected, rel=1e-12)
 
 

@@ -14,7 +14,7 @@ from helpers.numbered_worlds import numbered_world, order_of
 from sidestep.tabular.backups import BACKUPS, Behavior
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
-from sidestep.tabular.solve import solve
+from sidestep.tabular.solve import SolveOptions, solve
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.native import at_once, cores
 from sidestep.tabular.solvers.pairs import one_behind_the_other
@@ -133,10 +133,10 @@ def test_a_task_is_solved_alike_alone_and_in_a_batch(name):
     model = half_learned(office(200, 200, 3), np.random.default_rng(0))
     wanted = [reach(model.graph, goal, discount=0.999, step_cost=1.0) for goal in (20_100, 5_050)]
     people, solver = Behavior(BACKUPS[name](), 5.0), GaussSeidel(tolerance=1e-9)
-    batch = solve(model, stack_tasks(wanted), people, solver=solver)
+    batch = solve(model, stack_tasks(wanted), people, options=SolveOptions(solver=solver))
     assert batch.converged.all()
     for index, task in enumerate(wanted):
-        alone = solve(model, task, people, solver=solver)
+        alone = solve(model, task, people, options=SolveOptions(solver=solver))
         for one, several in zip(jax.tree.leaves(alone), jax.tree.leaves(batch), strict=True):
             np.testing.assert_array_equal(one, several[index])
 
@@ -150,7 +150,9 @@ def test_a_gradient_is_found_alike_alone_and_in_a_batch(name):
     before = solver.cold_start(40_000, jnp.dtype(jnp.float64))._replace(adjoint=jnp.ones(40_000))
 
     def total(parameters, task):
-        found = solve(model.with_parameters(parameters), task, people, solver=solver, start=before)
+        found = solve(
+            model.with_parameters(parameters), task, people, options=SolveOptions(solver=solver), start=before
+        )
         return jnp.sum(jnp.cos(jnp.arange(40_000)) * found.values)
 
     slope = jax.grad(total)

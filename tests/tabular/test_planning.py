@@ -11,6 +11,7 @@ from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid, TabularModel, true_model
 from sidestep.tabular.planning import plan, roll_out
+from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import reach
 
@@ -90,7 +91,7 @@ def test_plans_without_values_are_refused():
     with pytest.raises(ImproperTask):
         plan(true_model(OPEN), reach(OPEN, 0, discount=1.0, step_cost=0.1), Behavior(LogSumExp(), 1.0))
     with pytest.raises(NotConverged, match="sweep 1"):
-        plan(true_model(OPEN), reach(OPEN, 0), solver=Jacobi(max_sweeps=1))
+        plan(true_model(OPEN), reach(OPEN, 0), options=SolveOptions(solver=Jacobi(max_sweeps=1)))
 
 
 def test_a_plan_bumps_for_ever_into_a_wall_that_it_does_not_know():

@@ -9,7 +9,7 @@ import pytest
 from helpers.problems import BACKUPS, generic_task, obstacle_problem, relative_error
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.models import ObstacleGrid
-from sidestep.tabular.solve import solve
+from sidestep.tabular.solve import SolveOptions, solve
 from sidestep.tabular.solvers import adjoint as inwards
 from sidestep.tabular.solvers.base import DecisionProcess, Solver, WarmStart
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
@@ -118,7 +118,9 @@ def test_what_leaving_a_state_out_costs(name):
     problem, backup, beta = obstacle_problem(4), BACKUPS[name], jnp.asarray(5.0)
     wanted, weights = generic_task(problem, 0.9), jnp.cos(jnp.arange(12))
     left, moved = int(np.flatnonzero(~np.asarray(wanted.terminal))[3]), 1e-4
-    right = solve(problem.model, wanted, Behavior(backup, beta), solver=GaussSeidel(tolerance=1e-12)).values
+    right = solve(
+        problem.model, wanted, Behavior(backup, beta), options=SolveOptions(solver=GaussSeidel(tolerance=1e-12))
+    ).values
 
     def backed_up(values):
         expected = jnp.einsum("sat,t->sa", problem.dense(problem.model.parameters), values)
@@ -180,7 +182,7 @@ def test_tasks_of_a_batch_have_regions_of_their_own(gradient, dtype):
 
     cold = solver.cold_start(TRUTH.size, jnp.dtype(dtype))
     start = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), cold)
-    start = solve(model, tasks, people, solver=solver, gradient=gradient, start=start).start
+    start = solve(model, tasks, people, options=SolveOptions(solver=solver, gradient=gradient), start=start).start
     adjoint = jax.grad(total)(start.adjoint, tasks, visited, start, jnp.ones_like(start.region))
     start = start._replace(adjoint=adjoint)
     assert 0 < start.region[0].mean() < 0.7

@@ -20,7 +20,7 @@ from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import ObstacleGrid, TabularModel, true_model
-from sidestep.tabular.solve import check_proper, solve
+from sidestep.tabular.solve import SolveOptions, check_proper, solve
 from sidestep.tabular.solvers.base import neg_inf
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
@@ -154,7 +154,7 @@ def test_finite_horizon_sums_over_action_sequences():
     reward = np.random.default_rng(2).normal(size=(4, 4))
     wanted = task(reward, gamma, np.arange(4) == 3)
     successors = np.asarray(true_model(grid).graph.successors)[:, :, 0]
-    found = solve_jit(true_model(grid), wanted, people("hard max", beta), horizon=horizon)
+    found = solve_jit(true_model(grid), wanted, people("hard max", beta), options=SolveOptions(horizon=horizon))
 
     def best(state: int) -> float:
         returns = []
@@ -264,10 +264,12 @@ def test_a_solve_that_did_not_converge_is_never_used(solver):
     @jax.jit
     @jax.value_and_grad
     def likelihood(theta):
-        return log_likelihood(ObstacleGrid(grid, theta), demos, people("Boltzmann"), solver=solver).total
+        return log_likelihood(
+            ObstacleGrid(grid, theta), demos, people("Boltzmann"), options=SolveOptions(solver=solver)
+        ).total
 
     value, slope = likelihood(jnp.zeros(12))
-    found = solve_jit(ObstacleGrid(grid, 0.0), demos.tasks, people("Boltzmann"), solver=solver)
+    found = solve_jit(ObstacleGrid(grid, 0.0), demos.tasks, people("Boltzmann"), options=SolveOptions(solver=solver))
     stopped = solver is not None
     assert bool(found.converged.all()) is not stopped
     assert bool(jnp.isnan(value)) is stopped
@@ -282,7 +284,7 @@ def test_an_adjoint_that_did_not_converge_gives_nan():
     @jax.jit
     @partial(jax.grad, has_aux=True)
     def slope_and_converged(theta):
-        found = solve(corridor(12, theta), wanted, people("hard max"), solver=solver)
+        found = solve(corridor(12, theta), wanted, people("hard max"), options=SolveOptions(solver=solver))
         return found.values.sum(), found.converged
 
     slope, converged = slope_and_converged(jnp.zeros(12))
@@ -361,7 +363,7 @@ def test_discount_1_needs_an_end_and_a_cost():
 def test_horizon_must_be_an_action_at_least():
     grid = Grid.unknown(2, 2)
     with pytest.raises(InputError, match="horizon"):
-        solve(ObstacleGrid(grid), reach(grid, 0), people("hard max"), horizon=0)
+        solve(ObstacleGrid(grid), reach(grid, 0), people("hard max"), options=SolveOptions(horizon=0))
 
 
 # Any model
@@ -396,7 +398,9 @@ def test_values_that_swing_come_to_rest(dtype, close):
     wanted = reach(grid, goal, discount=1.0, step_cost=1.0)
 
     def total(logits, solver):
-        found = solve(ObstacleGrid(grid, logits), wanted, people("Boltzmann", beta), solver=solver)
+        found = solve(
+            ObstacleGrid(grid, logits), wanted, people("Boltzmann", beta), options=SolveOptions(solver=solver)
+        )
         return found.values.sum(), found
 
     (_, found), slope = jax.value_and_grad(total, has_aux=True)(logits, Jacobi())
@@ -411,7 +415,12 @@ def test_values_that_swing_come_to_rest(dtype, close):
 def test_a_long_way_takes_no_more_sweeps_than_steps(name):
     """News of the goal takes its time; that nothing seems to get better meanwhile is no reason to begin anew."""
     grid = Grid.unknown(3, 1_500)
-    found = solve(ObstacleGrid(grid), reach(grid, 0, discount=1.0, step_cost=1.0), people(name, 5.0), solver=Jacobi())
+    found = solve(
+        ObstacleGrid(grid),
+        reach(grid, 0, discount=1.0, step_cost=1.0),
+        people(name, 5.0),
+        options=SolveOptions(solver=Jacobi()),
+    )
     assert found.converged
     assert found.sweeps < 1_700
 
@@ -425,8 +434,8 @@ def test_values_that_were_far_too_high_come_down(name, solver):
     cheap, dear = (
         with_state_costs(reach(grid, 0), share * costs, model.graph.successors[..., 0]) for share in (0.2, 0.8)
     )
-    before = solve(model, cheap, people(name, 7.0), solver=solver)
-    warm = solve(model, dear, people(name, 7.0), solver=solver, start=before.start)
-    cold = solve(model, dear, people(name, 7.0), solver=solver)
+    before = solve(model, cheap, people(name, 7.0), options=SolveOptions(solver=solver))
+    warm = solve(model, dear, people(name, 7.0), options=SolveOptions(solver=solver), start=before.start)
+    cold = solve(model, dear, people(name, 7.0), options=SolveOptions(solver=solver))
     assert warm.converged
     np.testing.assert_allclose(warm.values, cold.values, rtol=1e-6, atol=1e-8)

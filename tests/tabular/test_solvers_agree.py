@@ -14,7 +14,7 @@ from sidestep.tabular.backups import Behavior, Gradient
 from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, TabularModel
-from sidestep.tabular.solve import solve
+from sidestep.tabular.solve import SolveOptions, solve
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import Task, reach, stack_tasks
@@ -32,7 +32,9 @@ def solved(model, tasks, people, solver, gradient: Gradient = "exact"):
         parameters, reward, final, discount, beta = inputs
         wanted = Task(reward, final, terminal, discount)
         behavior = Behavior(people.backup, beta)
-        found = solve(model.with_parameters(parameters), wanted, behavior, solver=solver, gradient=gradient)
+        found = solve(
+            model.with_parameters(parameters), wanted, behavior, options=SolveOptions(solver=solver, gradient=gradient)
+        )
         weights = jnp.asarray(np.random.default_rng(1).normal(size=found.values.shape))
         return jnp.sum(weights * jnp.where(found.values > -1e100, found.values, 0)), found
 

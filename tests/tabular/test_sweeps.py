@@ -15,7 +15,7 @@ from helpers.problems import BACKUPS, generic_task, random_problem
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
-from sidestep.tabular.solve import solve
+from sidestep.tabular.solve import SolveOptions, solve
 from sidestep.tabular.solvers.adjoint_kernels import Weighing, weigh
 from sidestep.tabular.solvers.base import neg_inf
 from sidestep.tabular.solvers.compiled import compiled
@@ -164,7 +164,9 @@ def settled_rounds():
     """Rounds that have come to rest, and the values that they were at."""
     model, one = some_map(), np.float64(1)
     wanted = reach(model.graph, 5, discount=0.99)
-    found = solve(model, wanted, Behavior(BoltzmannAverage(), 1.0), solver=GaussSeidel(tolerance=1e-11))
+    found = solve(
+        model, wanted, Behavior(BoltzmannAverage(), 1.0), options=SolveOptions(solver=GaussSeidel(tolerance=1e-11))
+    )
     order = np.asarray(found.start.order)
     world = numbered_world(model, wanted, order)
     values = np.asarray(found.values)[order]

@@ -31,6 +31,7 @@ from sidestep.tabular.demonstrations import Demonstrations, gather
 from sidestep.tabular.likelihood import ALL_TERMS, Term
 from sidestep.tabular.models import ObstacleGrid, true_model
 from sidestep.tabular.simulation import simulate
+from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.tasks import Reward
 from sidestep.worlds.grids import WORLDS, World
 
@@ -103,7 +104,7 @@ def _learn(world: World, demonstrations: Demonstrations, variant: Variant) -> Fi
         Behavior(BoltzmannAverage(), BETA),
         prior=Normal(PRIOR_MEAN, PRIOR_VARIANCE),
         terms=variant.terms,
-        gradient=variant.gradient,
+        options=SolveOptions(gradient=variant.gradient),
         optimizer=variant.optimizer,
     )
 

@@ -29,7 +29,7 @@ from sidestep.tabular.backups import Behavior
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import visited_action_values
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.solve import solve
+from sidestep.tabular.solve import SolveOptions, solve
 
 
 class Scores(NamedTuple):
@@ -42,13 +42,17 @@ class Scores(NamedTuple):
 
 
 def scores(
-    model: TransitionModel, demonstrations: Demonstrations, behavior: Behavior, horizon: int | None = None
+    model: TransitionModel,
+    demonstrations: Demonstrations,
+    behavior: Behavior,
+    *,
+    options: SolveOptions | None = None,
 ) -> Scores:
     """The scores of the moves whose weight is not 0, under a model that should not have been learned from them.
 
-    `horizon`: how many actions people look ahead, as in `solve`. Raises `NotConverged` if values are not found.
+    `options`: as for `solve`. Raises `NotConverged` if values are not found.
     """
-    solution = solve(model, demonstrations.tasks, behavior, horizon=horizon)
+    solution = solve(model, demonstrations.tasks, behavior, options=options)
     if not bool(solution.converged.all()):
         raise NotConverged("the values of a task were not found: a smaller β may help")
     q = visited_action_values(model, demonstrations.tasks, solution.values, demonstrations.task, demonstrations.states)

@@ -30,9 +30,7 @@ from sidestep.tabular.behavior_model import BehaviorModel, behavior_model
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import ALL_TERMS, Term, arrivals_of, transition_probabilities
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.solve import check_proper
-from sidestep.tabular.solvers.base import Solver
-from sidestep.tabular.solvers.choice import default_solver
+from sidestep.tabular.solve import SolveOptions, check_proper
 
 Model = TypeVar("Model", bound=TransitionModel)
 
@@ -70,10 +68,8 @@ def fit(
     prior: Prior | None = None,
     tempering: float = 1.0,
     terms: tuple[Term, ...] = ALL_TERMS,
-    gradient: Gradient = "exact",
-    horizon: int | None = None,
+    options: SolveOptions | None = None,
     optimizer: Optimizer | None = None,
-    solver: Solver | None = None,
     memory: float = MEMORY,
     mesh: Mesh | None = None,
     report: Callable[[Progress], None] | None = None,
@@ -86,7 +82,7 @@ def fit(
     - `prior`: over the model's parameters; by default `Normal()`, the paper's.
     - `tempering`: κ in (0, 1], how much the actions' log-likelihood counts; below 1 where steps depend on each other.
     - `terms`: which parts of the likelihood count, "actions", "transitions" or both.
-    - `gradient`, `horizon`, `solver`: as for `solve`. On large maps, solves are only as exact as the optimiser needs
+    - `options`: as for `solve`. On large maps, solves are only as exact as the optimiser needs
       until it has converged, and exact from then on; a solver with a tolerance of its own keeps to that.
     - `optimizer`: `LBFGS()` by default, or `Adam()`, or `Rprop()` (for large maps with people who avoid walls).
     - `memory`: about how many bytes the arrays may take on a device; tasks are solved in batches that fit.
@@ -103,13 +99,14 @@ def fit(
     """
     optimizer = optimizer or LBFGS()
     someone = behavior_model(behavior) if isinstance(behavior, Behavior) else behavior
-    _check_settings(terms, gradient, someone.behavior, optimizer)
-    horizon = None if horizon is None else int(horizon)
+    options = options or SolveOptions()
+    _check_settings(terms, options.gradient, someone.behavior, optimizer)
     if not 0 < tempering <= 1:
         raise InputError(f"expected a share above 0 and at most 1, found {tempering}", field="tempering")
-    check_proper(someone.tasks_of(demonstrations.tasks), someone.behavior_of(), model.graph.actions, horizon)
-    solver = solver or default_solver(someone.behavior.backup, model.graph.states)
-    problem = Problem(model, someone, demonstrations, prior or Normal(), terms, horizon, gradient, solver, tempering)
+    check_proper(someone.tasks_of(demonstrations.tasks), someone.behavior_of(), model.graph.actions, options.horizon)
+    solver = options.solver_for(someone.behavior.backup, model.graph.states)
+    options = SolveOptions(options.gradient, options.horizon, solver)
+    problem = Problem(model, someone, demonstrations, prior or Normal(), terms, options, tempering)
     _check_moves(problem)
     saver = Saver(checkpoint, fingerprint((problem, optimizer.key)) if checkpoint is not None else "")
     climb = Climb(Objective(problem, memory, mesh, optimizer.looks_roughly), optimizer, saver)
@@ -143,13 +140,11 @@ def _of_all_tasks(parts: list[Solved], tasks: int) -> Solved:
 def _check_settings(terms: tuple[Term, ...], gradient: Gradient, behavior: Behavior, optimizer: Optimizer) -> None:
     if not terms or not set(terms) <= set(ALL_TERMS):
         raise InputError(f"expected one or both of {ALL_TERMS}, found {terms}", field="terms")
-    if gradient not in ("exact", "fixed_policy"):
-        raise InputError(f"expected 'exact' or 'fixed_policy', found {gradient!r}", field="gradient")
     searches = not isinstance(optimizer, Adam)
     if gradient == "fixed_policy" and searches and isinstance(behavior.backup, BoltzmannAverage):
         raise InputError(
             "the fixed-policy gradient of the Boltzmann average is not the gradient of any function, so there is "
-            "nothing for a search to go along: expected Ascent() as the optimiser, or gradient='exact'",
+            "nothing for a search to go along: expected Ascent() as the optimiser, or SolveOptions('exact')",
             field="gradient",
         )
 

@@ -33,7 +33,6 @@ from sidestep.errors import InputError
 from sidestep.inference.batching import Batch, batches_of, planned
 from sidestep.inference.checkpoints import fingerprint
 from sidestep.inference.priors import Prior
-from sidestep.tabular.backups import Gradient
 from sidestep.tabular.behavior_model import BehaviorModel, BehaviorParameters
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import (
@@ -45,6 +44,7 @@ from sidestep.tabular.likelihood import (
     choice_log_likelihood,
 )
 from sidestep.tabular.models import TransitionModel
+from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.solvers.base import Solver, WarmStart, is_reachable
 from sidestep.tabular.tasks import Task
 
@@ -69,10 +69,13 @@ class Problem(eqx.Module):
     demonstrations: Demonstrations
     prior: Prior
     terms: tuple[Term, ...] = eqx.field(static=True)
-    horizon: int | None = eqx.field(static=True)
-    gradient: Gradient = eqx.field(static=True)
-    solver: Solver
+    options: SolveOptions
     tempering: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
+
+    @property
+    def solver(self) -> Solver:
+        """Return the solver of the options."""
+        return self.options.solver_for(self.people.behavior.backup, self.model.graph.states)
 
     @property
     def parameters(self) -> Parameters:
@@ -295,9 +298,7 @@ def _share(
             choices,
             people.behavior_of(person),
             start,
-            horizon=problem.horizon,
-            gradient=problem.gradient,
-            solver=problem.solver,
+            options=problem.options,
             region=region,
         )
         stuck = (choices.counts > 0) & ~is_reachable(found.values[choices.states])
@@ -383,5 +384,8 @@ def _with_tolerance(problem: Problem, tolerance: float | Array | None) -> Proble
     if tolerance is None:
         return problem
     return eqx.tree_at(
-        lambda problem: problem.solver.tolerance, problem, jnp.asarray(tolerance), is_leaf=lambda leaf: leaf is None
+        lambda problem: problem.options.solver.tolerance,
+        problem,
+        jnp.asarray(tolerance),
+        is_leaf=lambda leaf: leaf is None,
     )

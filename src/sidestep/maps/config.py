@@ -22,6 +22,7 @@ from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Cell, Connectivity
 from sidestep.tabular.likelihood import Term
 from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.solve import SolveOptions
 
 Terms = Literal["both", "actions", "transitions"]
 TERMS: dict[Terms, tuple[Term, ...]] = {
@@ -118,8 +119,7 @@ def fit_map(
         prior=prior,
         tempering=settings.tempering,
         terms=TERMS[settings.terms],
-        gradient=settings.gradient,
-        horizon=settings.horizon,
+        options=SolveOptions(gradient=settings.gradient, horizon=settings.horizon),
         optimizer=optimizer,
         memory=settings.memory * 2**30,
         report=report,

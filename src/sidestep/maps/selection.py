@@ -32,6 +32,7 @@ from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import transition_probabilities
 from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.solve import SolveOptions
 
 FOLDS = 3
 """Into how many parts the walks are cut."""
@@ -179,7 +180,7 @@ def _tried(
         report(f"choosing: {kind}, β = {settings.beta:g}, part {fold + 1} of {part.max() + 1}")
         found = fit_map(model, shown.with_only(part != fold), settings, each=prior)
         others, people = shown.with_only(part == fold), found.people.behavior_of()
-        of_fold = scores(found.model, others, people, settings.horizon)
+        of_fold = scores(found.model, others, people, options=SolveOptions(horizon=settings.horizon))
         held_out.append(of_fold)
         lapses.append(0.0 if people.lapse is None else float(people.lapse))
         arrived = np.log(np.asarray(transition_probabilities(found.model, others)))[np.asarray(others.weights) > 0]

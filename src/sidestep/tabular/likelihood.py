@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.tabular.backups import Behavior, Gradient
+from sidestep.tabular.backups import Behavior
 from sidestep.tabular.demonstrations import Demonstrations, next_power_of_two
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.solve import Solution, solve
-from sidestep.tabular.solvers.base import Solver, WarmStart, action_values
+from sidestep.tabular.solve import Solution, SolveOptions, solve
+from sidestep.tabular.solvers.base import WarmStart, action_values
 from sidestep.tabular.tasks import Task
 
 Term = Literal["actions", "transitions"]
@@ -42,9 +42,7 @@ def log_likelihood(
     behavior: Behavior,
     *,
     terms: tuple[Term, ...] = ALL_TERMS,
-    horizon: int | None = None,
-    gradient: Gradient = "exact",
-    solver: Solver | None = None,
+    options: SolveOptions | None = None,
 ) -> LogLikelihood:
     """log L(θ) of `demonstrations` by people who behave as `behavior` says and know `model`.
 
@@ -53,9 +51,7 @@ def log_likelihood(
     """
     actions = transitions = jnp.zeros((), model.probabilities().dtype)
     if "actions" in terms:
-        actions = action_log_likelihood(
-            model, demonstrations, behavior, horizon=horizon, gradient=gradient, solver=solver
-        )
+        actions = action_log_likelihood(model, demonstrations, behavior, options=options)
     if "transitions" in terms:
         transitions = transition_log_likelihood(model, demonstrations)
     return LogLikelihood(actions, transitions)
@@ -66,12 +62,10 @@ def action_log_likelihood(
     demonstrations: Demonstrations,
     behavior: Behavior,
     *,
-    horizon: int | None = None,
-    gradient: Gradient = "exact",
-    solver: Solver | None = None,
+    options: SolveOptions | None = None,
 ) -> Float[Array, ""]:
     """Σ log π_θ(a | s) over all moves; NaN if a task's values did not converge."""
-    each = log_policies(model, demonstrations, behavior, horizon=horizon, gradient=gradient, solver=solver)
+    each = log_policies(model, demonstrations, behavior, options=options)
     return _weighted(demonstrations, each)
 
 
@@ -80,13 +74,10 @@ def log_policies(
     demonstrations: Demonstrations,
     behavior: Behavior,
     *,
-    horizon: int | None = None,
-    gradient: Gradient = "exact",
-    solver: Solver | None = None,
+    options: SolveOptions | None = None,
 ) -> Float[Array, " moves"]:
     """log π_θ(a | s) of every move; NaN if a task's values did not converge."""
-    horizon = None if horizon is None else int(horizon)
-    return _log_policies(model, demonstrations, behavior, horizon, gradient, solver)
+    return _log_policies(model, demonstrations, behavior, options)
 
 
 @eqx.filter_jit
@@ -94,12 +85,10 @@ def _log_policies(
     model: TransitionModel,
     demonstrations: Demonstrations,
     behavior: Behavior,
-    horizon: int | None,
-    gradient: Gradient,
-    solver: Solver | None,
+    options: SolveOptions | None,
 ) -> Float[Array, " moves"]:
     tasks, task, states = demonstrations.tasks, demonstrations.task, demonstrations.states
-    solution = solve(model, tasks, behavior, horizon=horizon, gradient=gradient, solver=solver)
+    solution = solve(model, tasks, behavior, options=options)
     q = visited_action_values(model, tasks, solution.values, task, states)
     # a factor, so that the gradient is NaN too
     return _log_policy(behavior, q, demonstrations.actions) * _nan_unless(solution.converged.all())
@@ -124,9 +113,7 @@ def choice_log_likelihood(
     behavior: Behavior,
     start: WarmStart,
     *,
-    horizon: int | None = None,
-    gradient: Gradient = "exact",
-    solver: Solver | None = None,
+    options: SolveOptions | None = None,
     region: Bool[Array, " states"] | None = None,
 ) -> tuple[Float[Array, ""], Solution]:
     """Σ log π_θ(a | s) over the choices made in pursuit of one task, and the task's solution (from `start`).
@@ -138,9 +125,7 @@ def choice_log_likelihood(
         model,
         task,
         behavior,
-        horizon=horizon,
-        gradient=gradient,
-        solver=solver,
+        options=options,
         start=start,
         visited=choices.states,
         region=region,

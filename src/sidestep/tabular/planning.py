@@ -15,8 +15,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from sidestep.errors import InputError, NotConverged
 from sidestep.tabular.backups import Behavior, HardMax
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.solve import Solution, check_proper, solve
-from sidestep.tabular.solvers.base import Solver, is_reachable
+from sidestep.tabular.solve import Solution, SolveOptions, check_proper, solve
+from sidestep.tabular.solvers.base import is_reachable
 from sidestep.tabular.tasks import Task
 
 
@@ -70,7 +70,9 @@ def _followed(
     return np.asarray(path)
 
 
-def plan(model: TransitionModel, task: Task, behavior: Behavior | None = None, solver: Solver | None = None) -> Plan:
+def plan(
+    model: TransitionModel, task: Task, behavior: Behavior | None = None, *, options: SolveOptions | None = None
+) -> Plan:
     """The optimal plan for a task under a model; with `behavior`, how such people would act (∝ exp βQ).
 
     Raises `ImproperTask` for a task without values and `NotConverged` if they are not found.
@@ -83,8 +85,9 @@ def plan(model: TransitionModel, task: Task, behavior: Behavior | None = None, s
     [0, 1, 2, 3]
     """
     people = behavior or Behavior(HardMax())
-    check_proper(task, people, model.graph.actions)
-    made = _plan(model, task, people, behavior is None, solver)
+    options = options or SolveOptions()
+    check_proper(task, people, model.graph.actions, options.horizon)
+    made = _plan(model, task, people, behavior is None, options)
     if not bool(made.solution.converged):
         raise NotConverged(
             f"values still changed by {float(made.solution.residual):.2g} in sweep {int(made.solution.sweeps)}: "
@@ -94,8 +97,8 @@ def plan(model: TransitionModel, task: Task, behavior: Behavior | None = None, s
 
 
 @eqx.filter_jit
-def _plan(model: TransitionModel, task: Task, behavior: Behavior, optimal: bool, solver: Solver | None) -> Plan:
-    solution = solve(model, task, behavior, solver=solver)
+def _plan(model: TransitionModel, task: Task, behavior: Behavior, optimal: bool, options: SolveOptions) -> Plan:
+    solution = solve(model, task, behavior, options=options)
     q = solution.action_values
     policy = behavior.backup.fixed_policy_weights(q, behavior.beta) if optimal else jnp.exp(behavior.log_policy(q))
     states = jnp.arange(model.graph.states)

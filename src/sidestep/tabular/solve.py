@@ -29,8 +29,51 @@ from sidestep.tabular.solvers.base import (
     action_values,
     finite_horizon,
 )
-from sidestep.tabular.solvers.choice import default_solver
+from sidestep.tabular.solvers.gauss_seidel import KERNELS, GaussSeidel
+from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import Task
+
+SMALL_PROBLEM = 400
+"""The number of states below which `Jacobi` is at least as fast as `GaussSeidel` on a CPU (`benchmarks/scaling.py`)."""
+
+
+def default_solver(backup: Backup, states: int) -> Solver:
+    """Return `GaussSeidel` for larger problems on a CPU with a backup that has machine code, `Jacobi` otherwise."""
+    if jax.default_backend() == "cpu" and states >= SMALL_PROBLEM and type(backup) in KERNELS:
+        return GaussSeidel()
+    return Jacobi()
+
+
+class SolveOptions(eqx.Module):
+    """How values are computed and what their derivatives mean; shared by `solve`, `log_likelihood`, `plan` and `fit`.
+
+    Attributes:
+        gradient: "exact", or "fixed_policy" for the derivative of the average under the policy held fixed (eqs. 9, 10).
+        horizon: the number of actions that agents look ahead, at least 1; None for the fixed point of the Bellman
+            equation.
+        solver: computes the fixed point; None for the one that `default_solver` chooses.
+
+    Raises:
+        InputError: for another gradient, or a horizon below 1.
+
+    Example:
+        >>> SolveOptions(gradient="fixed_policy").horizon is None
+        True
+    """
+
+    gradient: Gradient = eqx.field(static=True, default="exact")
+    horizon: int | None = eqx.field(static=True, default=None, converter=lambda n: None if n is None else int(n))
+    solver: Solver | None = None
+
+    def __check_init__(self):
+        if self.gradient not in ("exact", "fixed_policy"):
+            raise InputError(f"expected 'exact' or 'fixed_policy', found {self.gradient!r}", field="gradient")
+        if self.horizon is not None and self.horizon < 1:
+            raise InputError(f"expected at least one action, found {self.horizon}", field="horizon")
+
+    def solver_for(self, backup: Backup, states: int) -> Solver:
+        """Return `solver`, or without one the default for a problem of so many states."""
+        return self.solver or default_solver(backup, states)
 
 
 class Solution(eqx.Module):
@@ -55,18 +98,14 @@ def solve(
     task: Task,
     behavior: Behavior,
     *,
-    horizon: int | None = None,
-    gradient: Gradient = "exact",
-    solver: Solver | None = None,
+    options: SolveOptions | None = None,
     start: WarmStart | None = None,
     visited: Int[Array, "*tasks visited"] | None = None,
     region: Bool[Array, "*tasks states"] | None = None,
 ) -> Solution:
     """The values of one task, or of a stack of tasks, for people who behave as `behavior` says under `model`.
 
-    - `horizon`: how many actions people look ahead; None for the fixed point of the Bellman equation.
-    - `gradient`: what derivatives of the solution mean, "exact" or "fixed_policy" (eqs. 9, 10).
-    - `solver`: how the fixed point is found; by default as `default_solver` chooses.
+    - `options`: how the values are computed; by default `SolveOptions()`.
     - `start`: what an earlier solution of the same task or tasks left; without it, the solve starts from nothing. The
       solution (in the region) does not depend on it beyond the tolerance. Differentiating with respect to
       `start.adjoint` yields the new adjoint λ, for the next solve to start from.
@@ -81,11 +120,7 @@ def solve(
     The numbers have the dtype of the model's probabilities. May be used under `jit`, `vmap` and `grad`. Look at
     `converged` before you use the numbers; `check_proper` tells beforehand whether values exist.
     """
-    if horizon is not None and horizon < 1:
-        raise InputError(f"expected at least one action, found {horizon}", field="horizon")
-    solver = solver or default_solver(behavior.backup, model.graph.states)
-    horizon = None if horizon is None else int(horizon)
-    return _solve(model, task, behavior, horizon, gradient, solver, start, visited, region)
+    return _solve(model, task, behavior, options or SolveOptions(), start, visited, region)
 
 
 # Compiled as a whole, or else the loops of a solver would be compiled anew with every call.
@@ -94,14 +129,16 @@ def _solve(
     model: TransitionModel,
     task: Task,
     behavior: Behavior,
-    horizon: int | None,
-    gradient: Gradient,
-    solver: Solver,
+    options: SolveOptions,
     start: WarmStart | None,
     visited: Int[Array, "*tasks visited"] | None,
     region: Bool[Array, "*tasks states"] | None,
 ) -> Solution:
-    """`solve`, with the solver that was chosen."""
+    solver, gradient, horizon = (
+        options.solver_for(behavior.backup, model.graph.states),
+        options.gradient,
+        options.horizon,
+    )
     probabilities = model.probabilities()
     dtype = probabilities.dtype
     behavior = eqx.tree_at(lambda people: people.beta, behavior, behavior.beta.astype(dtype))
