@@ -52,7 +52,7 @@ def corners_in_metres(image: AxesImage, axes: Axes) -> np.ndarray:
     return to_metres.transform([[left, top], [right, bottom]])
 
 
-def test_a_map_is_drawn_in_metres_with_row_0_at_the_top(axes):
+def test_draw_map_has_axes_in_metres_and_row_0_at_the_top(axes):
     image = plotting.draw_map(axes, GRID)
     np.testing.assert_array_equal(image.get_array(), KNOWN)
     assert image.origin == "upper"
@@ -63,13 +63,13 @@ def test_a_map_is_drawn_in_metres_with_row_0_at_the_top(axes):
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (m)", "y (m)")
 
 
-def test_the_colours_of_a_map_tell_free_from_unknown_from_occupied(axes):
+def test_draw_map_orders_free_unknown_occupied_by_lightness(axes):
     image = plotting.draw_map(axes, GRID)
     unknown, free, occupied = image.to_rgba(np.array([-1, 0, 1]))[:, 0]
     assert free == 1 > unknown > 0.7 > 0.3 > occupied
 
 
-def test_the_top_row_is_seen_at_the_top():
+def test_draw_map_shows_the_top_row_at_the_top():
     """Pixels of the finished picture: the only occupied cell of the map is at its upper left."""
     figure = Figure(figsize=(2, 2), dpi=50)
     axes = figure.add_axes((0, 0, 1, 1))
@@ -81,7 +81,7 @@ def test_the_top_row_is_seen_at_the_top():
     assert dark.tolist() == [True, False, False, False]
 
 
-def test_a_turned_map_lies_where_its_origin_says(axes):
+def test_draw_map_with_yaw_places_corners_by_the_origin(axes):
     turned = Grid(KNOWN, origin=(1.0, 2.0, np.pi / 2))
     image = plotting.draw_map(axes, turned)
     # a quarter turn to the left: the map's right is up, its up is left; top left (0, 2) → (1 − 2, 2 + 0)
@@ -90,7 +90,7 @@ def test_a_turned_map_lies_where_its_origin_says(axes):
     np.testing.assert_allclose(axes.get_ylim(), (2, 5))
 
 
-def test_probabilities_are_drawn_from_0_to_1(axes):
+def test_draw_blocked_colors_probabilities_from_0_to_1(axes):
     image = plotting.draw_blocked(axes, BLOCKED, GRID)
     np.testing.assert_array_equal(image.get_array(), BLOCKED)
     assert image.get_clim() == (0, 1)
@@ -99,7 +99,7 @@ def test_probabilities_are_drawn_from_0_to_1(axes):
     assert (np.diff(luminance) < 0).all()
 
 
-def test_true_obstacles_are_outlined(axes):
+def test_draw_blocked_outlines_true_obstacles(axes):
     plotting.draw_blocked(axes, BLOCKED, GRID.forget(), truth=GRID)
     sides = {frozenset(map(tuple, side.tolist())) for side in segments(axes, "true obstacle")}
     # the cell in the middle of the top row
@@ -112,13 +112,13 @@ def test_true_obstacles_are_outlined(axes):
     }
 
 
-def test_the_outline_leaves_out_the_sides_between_obstacles(axes):
+def test_draw_blocked_outlines_no_sides_between_obstacles(axes):
     truth = Grid(np.array([[1, 1, 0]]))
     plotting.draw_blocked(axes, np.zeros((1, 3)), truth, truth)
     assert len(segments(axes, "true obstacle")) == 6
 
 
-def test_cells_are_told_apart_on_small_maps_only(axes):
+def test_draw_map_separates_cells_on_small_maps_only(axes):
     plotting.draw_map(axes, GRID)
     drawn = [np.asarray(side).tolist() for side in cast(LineCollection, axes.collections[0]).get_segments()]
     upright = [[[x, -2.0], [x, -1.0]] for x in (10.0, 10.5, 11.0, 11.5)]
@@ -128,7 +128,7 @@ def test_cells_are_told_apart_on_small_maps_only(axes):
     assert not large.collections
 
 
-def test_lines_are_thinner_on_larger_maps():
+def test_draw_blocked_outlines_thinner_on_larger_maps():
     def width(grid):
         axes = Figure().subplots()
         plotting.draw_blocked(axes, np.zeros(grid.shape), grid, grid)
@@ -137,7 +137,7 @@ def test_lines_are_thinner_on_larger_maps():
     assert width(block().truth) > width(office(60, 60, seed=0)) > width(office(150, 200, seed=0))
 
 
-def test_walks_are_shifted_a_little_each(axes):
+def test_draw_walks_shifts_each_walk_a_little(axes):
     paths = [np.array([3, 4, 5])] * 4
     plotting.draw_walks(axes, paths, GRID)
     drawn = np.array(segments(axes, "walk"))
@@ -148,14 +148,14 @@ def test_walks_are_shifted_a_little_each(axes):
     assert len(np.unique(shifts[:, 0].round(6), axis=0)) == 4
 
 
-def test_walks_that_are_not_there(axes):
+def test_draw_walks_and_places_without_any_draw_nothing(axes):
     plotting.draw_walks(axes, [], GRID)
     plotting.draw_places(axes, [], [], GRID)
     assert not axes.collections
     assert not axes.lines
 
 
-def test_a_path_has_a_start_and_a_goal(axes):
+def test_draw_path_marks_start_and_goal(axes):
     plotting.draw_path(axes, np.array([0, 3, 4]), GRID)
     np.testing.assert_allclose(points(axes, "path"), [[10.25, -1.25], [10.25, -1.75], [10.75, -1.75]])
     np.testing.assert_allclose(points(axes, "start"), [[10.25, -1.25]])
@@ -163,7 +163,7 @@ def test_a_path_has_a_start_and_a_goal(axes):
     assert (line(axes, "start").get_marker(), line(axes, "goal").get_marker()) == ("s", "*")
 
 
-def test_places_differ_by_shape_and_colour(axes):
+def test_draw_places_differ_by_shape_and_color(axes):
     plotting.draw_places(axes, (0,), (3, 5), GRID)
     start, goal = line(axes, "start"), line(axes, "goal")
     np.testing.assert_allclose(points(axes, "start"), [[10.25, -1.25]])
@@ -172,7 +172,7 @@ def test_places_differ_by_shape_and_colour(axes):
     assert start.get_color() != goal.get_color()
 
 
-def test_the_figure_of_environments():
+def test_figure_environments_shows_true_maps_without_a_color_bar():
     worlds = [block(), wall()]
     figure = plotting.figure_environments(worlds)
     assert [axes.get_title() for axes in figure.axes] == ["block", "wall"]  # and no colour bar
@@ -182,7 +182,7 @@ def test_the_figure_of_environments():
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["start", "goal"]
 
 
-def test_the_figure_of_learned_maps_has_one_colour_bar():
+def test_figure_learned_has_one_color_bar_and_rows_of_panels():
     panels = [
         plotting.Panel(str(index), GRID.forget(), BLOCKED, GRID, [np.array([0, 3, 4])], (0,), (4,))
         for index in range(3)
@@ -201,7 +201,7 @@ def test_the_figure_of_learned_maps_has_one_colour_bar():
     assert third.x0 == pytest.approx(first.x0)
 
 
-def test_the_figure_of_a_fit():
+def test_figure_fit_shows_walks_map_and_objective():
     objective = np.array([-9.0, -4.0, -3.0])
     figure = plotting.figure_fit(GRID.forget(), [np.array([0, 3])], BLOCKED, objective)
     before, after, progress, bar = figure.axes
@@ -212,7 +212,7 @@ def test_the_figure_of_a_fit():
     assert bar.get_ylabel() == "P(blocked)"
 
 
-def test_the_figure_of_a_plan():
+def test_figure_plan_shows_map_and_path():
     figure = plotting.figure_plan(GRID, BLOCKED, np.array([0, 3, 4]))
     axes, bar = figure.axes
     np.testing.assert_array_equal(axes.images[0].get_array(), BLOCKED)
@@ -220,7 +220,7 @@ def test_the_figure_of_a_plan():
     assert bar.get_ylabel() == "P(blocked)"
 
 
-def test_a_figure_is_saved_as_png(tmp_path):
+def test_save_writes_a_png(tmp_path):
     path = tmp_path / "new folder" / "plan.png"
     plotting.save(plotting.figure_plan(GRID, BLOCKED, np.array([0, 3, 4])), path)
     with Image.open(path) as image:
@@ -229,7 +229,7 @@ def test_a_figure_is_saved_as_png(tmp_path):
     assert [file.name for file in path.parent.iterdir()] == ["plan.png"]
 
 
-def test_a_figure_that_cannot_be_drawn_leaves_the_old_one(tmp_path):
+def test_save_that_fails_keeps_the_old_file(tmp_path):
     path = tmp_path / "old.png"
     path.write_bytes(b"old")
     broken = Figure()
@@ -241,7 +241,7 @@ def test_a_figure_that_cannot_be_drawn_leaves_the_old_one(tmp_path):
         plotting.save(Figure(), tmp_path)
 
 
-def test_large_maps_can_be_drawn(tmp_path):
+def test_figure_fit_of_a_large_map_is_saved(tmp_path):
     grid = office(150, 300, seed=0)
     figure = plotting.figure_fit(grid, [np.flatnonzero(grid.known == 0)[:20]], np.zeros(grid.shape), np.zeros(2))
     plotting.save(figure, tmp_path / "large.png")

@@ -1,4 +1,4 @@
-"""Pictures of physical systems: what they did over time, and how a belief about them was found."""
+"""Pictures of physical systems: their motion over time, and a learned belief about their physics."""
 
 from collections.abc import Sequence
 
@@ -6,33 +6,36 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-_WALK, _BELIEVED, _REAL = "#0072b2", "#d62728", "0.35"
+from sidestep.plotting import palette
 
 
 def figure_belief(
     angles: Sequence[Float[np.ndarray, " moves"]],
     time_step: float,
-    way: Float[np.ndarray, " iterations"],
-    mark_visited_free: float,
-    real: float,
+    estimates: Float[np.ndarray, " iterations"],
+    believed: float,
+    true: float,
 ) -> Figure:
-    """A figure of pendulums over time (radians, seconds), and of the gravity learned, iteration by iteration.
+    """Return a figure of pendulums over time, and of the learned gravity in every iteration.
 
-    `mark_visited_free` and `real` are drawn as lines of their own.
+    Args:
+        angles: of each pendulum from upright, in radians, one per time step.
+        time_step: seconds.
+        estimates: the gravity (m/s²) after each iteration.
+        believed: the gravity that the agents believe in, a dashed line.
+        true: the gravity of the pendulums, a dotted line.
     """
     figure = Figure(figsize=(9.5, 3.6), layout="constrained")
     swings, learned = figure.subplots(1, 2)
     for angle in angles:
-        swings.plot(time_step * np.arange(len(angle)), angle, color=_WALK, linewidth=0.8, alpha=0.6)
+        swings.plot(time_step * np.arange(len(angle)), angle, color=palette.BLUE, linewidth=0.8, alpha=0.6)
     swings.axhline(np.pi, color="0.6", linewidth=0.8, linestyle=":")
-    swings.set(
-        title=f"{len(angles)} people bring a pendulum to rest", xlabel="time (s)", ylabel="angle from upright (rad)"
-    )
-    learned.plot(np.arange(len(way)), way, color=_WALK, label="learned from actions")
-    learned.axhline(mark_visited_free, color=_BELIEVED, linestyle="--", label="what people believe")
-    learned.axhline(real, color=_REAL, linestyle=":", label="what is so")
-    learned.set(title="Gravity", xlabel="iteration", ylabel="m/s²")
-    learned.set_ylim(0.6 * min(real, mark_visited_free, way.min()), 1.15 * max(real, mark_visited_free, way.max()))
+    swings.set(title=f"{len(angles)} agents stop a pendulum", xlabel="time (s)", ylabel="angle from upright (rad)")
+    learned.plot(np.arange(len(estimates)), estimates, color=palette.BLUE, label="learned from actions")
+    learned.axhline(believed, color=palette.RED, linestyle="--", label="believed by the agents")
+    learned.axhline(true, color="0.35", linestyle=":", label="true")
+    low, high = np.percentile([believed, true, *estimates], [0, 100])
+    learned.set(title="Gravity", xlabel="iteration", ylabel="m/s²", ylim=(0.6 * low, 1.15 * high))
     learned.legend(frameon=False, loc="lower right")
     for axes in (swings, learned):
         axes.grid(color="0.92")

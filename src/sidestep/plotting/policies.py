@@ -1,4 +1,4 @@
-"""Pictures of what robots do that plan with what was learned: policies on maps, and shares over the stakes."""
+"""Pictures of robots that plan with a learned model: policies on maps, and fractions of outcomes over the stakes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,23 +9,28 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.patheffects import Normal, Stroke
 
-from sidestep.plotting.maps import COLOURS, Places, draw_cells, draw_outlines, draw_places, draw_walks
+from sidestep.plotting import palette
+from sidestep.plotting.maps import Places, draw_cells, draw_outlines, draw_places, draw_walks
 from sidestep.tabular.grid import Cell, Grid
 
-_LINES = (("#d62728", "--", "o"), ("#0072b2", "-", "s"), ("0.4", ":", "^"))
 _HALO = (Stroke(linewidth=2.2, foreground="white"), Normal())
 
 
 @dataclass(frozen=True, eq=False)
 class PolicyPanel:
-    """A map and what a robot does in it.
+    """A map and a policy of a robot on it.
 
-    - `values`: of each cell, drawn as colours from 0 to `most`; `label` says what they are.
-    - `truth`: the true map, whose obstacles are outlined.
-    - `goal`: the state that the robot is to reach, if there is one.
-    - `starts`, `intended`, `stays`: where it may stand, where its next move is to lead from there, and whether it stays
-      put instead.
-    - `walks`: what people did.
+    Attributes:
+        title: the text above the map.
+        values: of each cell, drawn as colors.
+        label: the name of the values.
+        most: the value of the last color; the first color is that of 0.
+        truth: the true map; its obstacles are outlined.
+        goal: the state that the robot has to reach, if there is one.
+        starts: the states from which the policy is drawn.
+        intended: the state that the next move from each start should reach.
+        stays: whether the robot stays at each start instead.
+        walks: the places along each demonstrated walk.
     """
 
     title: str
@@ -42,15 +47,21 @@ class PolicyPanel:
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """Shares over the stakes: a title, and of each method the shares of each outcome."""
+    """How often each outcome happens, over the stakes.
+
+    Attributes:
+        title: the text above the curves.
+        stakes: what a success pays, in units of a failure's cost.
+        fractions: by method and outcome, one fraction of starts for each of the stakes.
+    """
 
     title: str
     stakes: Sequence[float]
-    shares: Mapping[str, Mapping[str, Sequence[float]]]
+    fractions: Mapping[str, Mapping[str, Sequence[float]]]
 
 
 def figure_policies(panels: Sequence[PolicyPanel], curves: Sequence[Curves]) -> Figure:
-    """A figure of maps in a row, and below a row of shares over the stakes for each set of curves."""
+    """Return a figure of maps in a row, and below it a row of plots for each set of curves."""
     figure = Figure(figsize=(2.9 * len(panels), 2.7 + 2.5 * len(curves)), layout="constrained")
     rows = figure.add_gridspec(1 + len(curves), 1, height_ratios=[2.7, *[2.5] * len(curves)])
     parts = [figure.add_subfigure(row) for row in rows]
@@ -62,22 +73,22 @@ def figure_policies(panels: Sequence[PolicyPanel], curves: Sequence[Curves]) -> 
 
 
 def draw_policy(axes: Axes, panel: PolicyPanel) -> None:
-    """Draw an arrow where a robot goes on, a ring where it stays put, and a cross on every wall that it bumps into."""
+    """Draw an arrow where a robot moves, a ring where it stays, and a cross on every wall that it bumps into."""
     if panel.starts is None or panel.intended is None or panel.stays is None:
         return
     here, there = panel.truth.centres(panel.starts), panel.truth.centres(panel.intended)
-    goes = ~panel.stays
+    moves = ~panel.stays
     shape = {"arrowstyle": "->", "linewidth": 0.9, "shrinkA": 0, "shrinkB": 0, "path_effects": _HALO}
-    for place, way in zip(here[goes], 0.4 * (there - here)[goes], strict=True):
-        axes.annotate("", tuple(place + way), tuple(place - way), arrowprops=shape)
+    for place, step in zip(here[moves], 0.4 * (there - here)[moves], strict=True):
+        axes.annotate("", tuple(place + step), tuple(place - step), arrowprops=shape)
     axes.plot(*here[panel.stays].T, "o", markerfacecolor="white", markeredgecolor="black", markersize=3.5)
-    into = np.unique(panel.intended[goes])
-    walls = into[panel.truth.known.ravel()[into] == Cell.OCCUPIED]
+    targets = np.unique(panel.intended[moves])
+    walls = targets[panel.truth.known.ravel()[targets] == Cell.OCCUPIED]
     axes.plot(*panel.truth.centres(walls).T, "X", color="white", markeredgecolor="black", markersize=6.5, zorder=5)
 
 
 def _draw_panel(figure: SubFigure, axes: Axes, panel: PolicyPanel) -> None:
-    image = draw_cells(axes, panel.values, panel.truth, COLOURS, (0.0, panel.most))
+    image = draw_cells(axes, panel.values, panel.truth, palette.BLOCKED, (0.0, panel.most))
     figure.colorbar(image, ax=axes, label=panel.label, location="bottom", shrink=0.8, aspect=25)
     draw_outlines(axes, panel.truth)
     draw_walks(axes, panel.walks, panel.truth)
@@ -90,13 +101,13 @@ def _draw_panel(figure: SubFigure, axes: Axes, panel: PolicyPanel) -> None:
 
 def _draw_curves(figure: SubFigure, curves: Curves) -> None:
     figure.suptitle(curves.title, fontsize=11)
-    outcomes = next(iter(curves.shares.values()))
+    outcomes = next(iter(curves.fractions.values()))
     for axes, outcome in zip(figure.subplots(1, len(outcomes), sharey=True), outcomes, strict=True):
-        for (method, shares), (colour, style, marker) in zip(curves.shares.items(), _LINES, strict=False):
-            axes.plot(curves.stakes, shares[outcome], style, color=colour, marker=marker, markersize=4, label=method)
+        for (method, fractions), (color, style, marker) in zip(curves.fractions.items(), palette.SERIES, strict=False):
+            axes.plot(curves.stakes, fractions[outcome], style, color=color, marker=marker, markersize=4, label=method)
         axes.set(xscale="log", xlabel="stakes", title=outcome.replace("_", " "), ylim=(-0.04, 1.04))
         axes.set_xticks(curves.stakes, [f"{each:g}" for each in curves.stakes])
         axes.minorticks_off()
         axes.grid(color="0.9")
-    figure.axes[0].set_ylabel("share of starts")
+    figure.axes[0].set_ylabel("fraction of starts")
     figure.axes[-1].legend(frameon=False, fontsize=9, loc="upper left")
