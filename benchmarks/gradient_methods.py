@@ -8,12 +8,12 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from scaling import SOLVERS, Problem, take
 from sidestep.tabular.backups import BACKUPS, Behavior
+from sidestep.tabular.forward_gradients import forward_gradient
 from sidestep.tabular.likelihood import choices_of
 from sidestep.tabular.models import TabularModel, TransitionModel
 from sidestep.tabular.solve import SolveOptions, solve
@@ -139,40 +139,15 @@ def by_optimistix(problem: Problem, parameters: Parameters) -> Found:
 
 
 def forward(problem: Problem, parameters: Parameters) -> Found:
-    """The gradient by the paper's dynamic programme, and how many times it was iterated.
-
-    At the values V, iterates dV/dθ = ∂F/∂θ + Σ_a w(a) γ Σ_k P(·, a, k) dV/dθ(succ(·, a, k)), the weights w being
-    π(1 + β(Q − V)) (eq. 8) or π (eq. 9); dQ/dθ (eq. 7) is put in.
-    """
-    solved = values(problem, parameters)[0]
-    process, backup, beta = process_of(problem, parameters), problem.behavior.backup, problem.behavior.beta
-    q = process.action_values(solved)
-    weights = backup.weights(q, beta) if problem.gradient == "exact" else backup.fixed_policy_weights(q, beta)
-    weights = jnp.where(process.terminal[:, None], 0, weights)
+    """The gradient by the paper's dynamic program, and how many sweeps it took."""
+    model = problem.model.with_parameters(parameters)
+    task = jax.tree.map(lambda leaf: leaf[0], problem.demonstrations.tasks)
+    solver, gradient = problem.solver, problem.gradient
+    result = forward_gradient(model, task, problem.behavior, gradient=gradient, solver=solver, max_sweeps=MOST_SWEEPS)
     flat, unravel = ravel_pytree(parameters)
-
-    def direct(direction: Array) -> Array:
-        """The change of one backup with θ, V held."""
-        change = jax.jvp(lambda x: process_of(problem, unravel(x)).action_values(solved), (flat,), (direction,))[1]
-        return jnp.sum(weights * change, axis=-1)
-
-    own = jax.lax.map(lambda index: direct(jnp.zeros_like(flat).at[index].set(1)), jnp.arange(len(flat))).T
-    leads = process.discount * weights[..., None] * process.probabilities
-    tolerance = problem.solver.tolerance_for(flat.dtype)
-
-    def unfinished(state: tuple[Array, Array, Array]) -> Array:
-        return (state[1] > tolerance) & (state[2] < MOST_SWEEPS)
-
-    def sweep(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        old, _, count = state
-        new = own
-        for action, outcome in np.ndindex(*leads.shape[1:]):
-            new = new + leads[:, action, outcome, None] * old[process.successors[:, action, outcome]]
-        return new, jnp.abs(new - old).max() / jnp.abs(new).max(), count + 1
-
-    slopes, _, count = jax.lax.while_loop(unfinished, sweep, (own, jnp.asarray(jnp.inf), jnp.asarray(1)))
-    by_parameters, by_values = jax.grad(lambda x, v: chosen(problem, unravel(x), v), argnums=(0, 1))(flat, solved)
-    return unravel(by_parameters + by_values @ slopes), count
+    likelihood = jax.grad(lambda x, v: chosen(problem, unravel(x), v), argnums=(0, 1))
+    by_parameters, by_values = likelihood(flat, result.solution.values)
+    return unravel(by_parameters + by_values @ result.value_gradient), result.sweeps
 
 
 GRADIENTS: Mapping[str, Callable[..., Found]] = {
