@@ -142,8 +142,8 @@ def forward(problem: Problem, parameters: Parameters) -> Found:
     """The gradient by the paper's dynamic program, and how many sweeps it took."""
     model = problem.model.with_parameters(parameters)
     task = jax.tree.map(lambda leaf: leaf[0], problem.demonstrations.tasks)
-    solver, gradient = problem.solver, problem.gradient
-    result = forward_gradient(model, task, problem.behavior, gradient=gradient, solver=solver, max_sweeps=MOST_SWEEPS)
+    options = SolveOptions(gradient=problem.gradient, solver=problem.solver)
+    result = forward_gradient(model, task, problem.behavior, options=options, max_sweeps=MOST_SWEEPS)
     flat, unravel = ravel_pytree(parameters)
     likelihood = jax.grad(lambda x, v: chosen(problem, unravel(x), v), argnums=(0, 1))
     by_parameters, by_values = likelihood(flat, result.solution.values)

@@ -16,11 +16,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.tabular.backups import Behavior, Gradient
+from sidestep.errors import InputError
+from sidestep.tabular.backups import Behavior
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.solve import Solution, solve
-from sidestep.tabular.solvers.base import DecisionProcess, Solver
-from sidestep.tabular.solvers.choice import default_solver
+from sidestep.tabular.solve import Solution, SolveOptions, solve
+from sidestep.tabular.solvers.base import DecisionProcess
 from sidestep.tabular.tasks import Task
 
 
@@ -47,8 +47,7 @@ def forward_gradient(
     task: Task,
     behavior: Behavior,
     *,
-    gradient: Gradient = "exact",
-    solver: Solver | None = None,
+    options: SolveOptions | None = None,
     max_sweeps: int = 5_000,
 ) -> ForwardGradient:
     """Compute ∂V/∂θ and ∂Q/∂θ of one task by the paper's dynamic program.
@@ -60,12 +59,15 @@ def forward_gradient(
         model: The transition model T_θ.
         task: A single task.
         behavior: How the agent values states.
-        gradient: "exact" (eq. 8) or "fixed_policy" (eqs. 9 and 10).
-        solver: Finds the values; its tolerance is also the relative change at which the iteration stops.
+        options: `gradient` is "exact" (eq. 8) or "fixed_policy" (eqs. 9 and 10); `solver` computes the values, and its
+            tolerance is also the relative change at which the iteration stops; a horizon is not supported.
         max_sweeps: The number of sweeps after which the iteration gives up.
 
     Returns:
         The gradients, and whether they converged.
+
+    Raises:
+        InputError: If `options` have a horizon.
 
     Example:
         >>> import sidestep as ss
@@ -79,8 +81,11 @@ def forward_gradient(
     References:
         "Towards Behavior-Aware Model Learning from Human-Generated Trajectories", eqs. 7 to 10.
     """
-    solver = solver or default_solver(behavior.backup, model.graph.states)
-    solution = solve(model, task, behavior, solver=solver)
+    options = options or SolveOptions()
+    if options.horizon is not None:
+        raise InputError(f"expected no horizon, found {options.horizon}", field="options")
+    solver = options.solver_for(behavior.backup, model.graph.states)
+    solution = solve(model, task, behavior, options=SolveOptions(solver=solver))
     values = jax.lax.stop_gradient(solution.values)
     parameters, unravel = ravel_pytree(model.parameters)
 
@@ -97,7 +102,9 @@ def forward_gradient(
     now = process(parameters)
     q, beta = now.action_values(values), behavior.beta.astype(values.dtype)
     backup = behavior.backup
-    weights = backup.weights(q, beta) if gradient == "exact" else backup.fixed_policy_weights(q, beta)  # eq. 8, 9, 10
+    weights = (
+        backup.weights(q, beta) if options.gradient == "exact" else backup.fixed_policy_weights(q, beta)
+    )  # eq. 8, 9, 10
     weights = jnp.where(now.terminal[:, None], 0, weights)
     next_state = now.discount * now.probabilities  # γ T_θ(s, a, s′) of the first term of eq. 7
     own = jax.lax.map(
