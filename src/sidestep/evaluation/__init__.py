@@ -1,1 +1,1 @@
-"""How good a learned map is: scores of cells and of planned paths against the true map."""
+"""Evaluation of learned maps and of planned paths against the true map."""

@@ -1,11 +1,11 @@
-"""How good a learned map is: its cells and the paths planned in it, against the truth.
+"""The evaluation of a learned map: its cells, and the paths that a robot plans and executes, against the true map.
 
-`scoring` compares arrays and paths; here the paths are planned, between all pairs of free cells where the map is
-small and between sampled ones where it is large. What has no map, but says what to do, is scored by its paths alone.
+On small maps paths are planned between all pairs of free cells, on large maps between a random sample. A method without
+a map is evaluated by its paths only, a method without a planner by its cells only.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,50 +14,71 @@ from scipy.sparse import csr_array
 
 from sidestep.evaluation.metrics import (
     MapScores,
+    PathScores,
     path_lengths,
-    relevant_obstacles,
     score_lengths,
     score_map,
     shortest_lengths,
 )
+from sidestep.evaluation.relevance import relevant_obstacles
 from sidestep.robots.planners import Planner
-from sidestep.robots.replanning import world_of
+from sidestep.robots.replanning import grid_environment
 from sidestep.tabular.graph import walkable_graph
 from sidestep.tabular.grid import Cell, Grid
 
-MOST_PLACES = 150
-"""The most starts, and the most goals, that paths are planned between; on larger maps they are drawn at random."""
-MOST_FOLLOWED = 200
-"""The most paths with bumps that are followed to the end for the regret."""
-MOST_CELLS = 40_000_000
-"""The most cells, of all goals' plans together: on maps of more than 200,000 cells fewer paths are planned."""
-FEWEST = 10
-"""The fewest goals, and the fewest paths with bumps, whatever the map."""
+MAX_PLACES = 150
+"""The most starts, and the most goals, of planned paths."""
+MAX_EXECUTED = 200
+"""The most paths that are executed for the regret."""
+MAX_CELLS = 40_000_000
+"""The most cells of all plans together, one plan per goal: maps above 200,000 cells have fewer goals."""
+MIN_PLANS = 10
+"""The fewest goals, and the fewest executed paths, on any map."""
 
-Report = Callable[[str, int, int], None]
-"""Is told what is being done, how much of it is done, and how much there is to do."""
+StageCallback = Callable[[str, int, int], None]
+"""Called with the name of a stage, the number of steps that are done, and their total number."""
 
 
-class Sample(NamedTuple):
-    """How many starts and goals paths are planned between, and how many paths with bumps are followed, at most."""
+class SampleSizes(NamedTuple):
+    """The most starts and goals of planned paths, and the most executed paths."""
 
     starts: int
     goals: int
-    followed: int
+    executed: int
 
 
-def sample_for(cells: int) -> Sample:
-    """How many on a map of so many cells: a plan takes time in proportion to them, a start hardly any.
+def sample_sizes(cells: int) -> SampleSizes:
+    """Return the sample sizes for a map: the time of a plan grows with the number of cells.
 
-    >>> sample_for(10_000)
-    Sample(starts=150, goals=150, followed=200)
+    >>> sample_sizes(10_000)
+    SampleSizes(starts=150, goals=150, executed=200)
     """
-    plans = max(FEWEST, MOST_CELLS // cells)
-    return Sample(MOST_PLACES, min(MOST_PLACES, plans), min(MOST_FOLLOWED, plans))
+    plans = max(MIN_PLANS, MAX_CELLS // cells)
+    return SampleSizes(MAX_PLACES, min(MAX_PLACES, plans), min(MAX_EXECUTED, plans))
+
+
+@dataclass(frozen=True)
+class Evaluation(PathScores, MapScores):
+    """All scores of a learned map and its planner; None where a mean has nothing to average.
+
+    Attributes:
+        regret: The mean length of executed paths less that of the shortest paths, in cell sides. None also if a robot
+            does not arrive: it has a false known obstacle, or moves in a cycle.
+        arriving_fraction: The fraction of executed paths that arrive.
+
+    `MapScores` and `PathScores` describe the other attributes.
+    """
+
+    regret: float | None = None
+    arriving_fraction: float | None = None
+
+    def to_dict(self) -> dict[str, float | None]:
+        """Return the scores by name."""
+        return asdict(self)
 
 
 class _Pairs(NamedTuple):
-    """Starts and goals (states) with a way between them, by ascending goal, and the length of the shortest one."""
+    """Starts and goals (states) with a path between them, by ascending goal, and the length of the shortest path."""
 
     starts: Int[np.ndarray, " pairs"]
     goals: Int[np.ndarray, " pairs"]
@@ -65,121 +86,140 @@ class _Pairs(NamedTuple):
 
 
 def evaluate(
-    planner: Planner,
+    planner: Planner | None,
     ranking: Float[np.ndarray, "rows columns"] | None,
     truth: Grid,
     scored: Bool[np.ndarray, "rows columns"],
     visited: Int[np.ndarray, "visits 2"],
     seed: int = 0,
-    report: Report = lambda *_: None,
+    callback: StageCallback = lambda *_: None,
     goals: Int[np.ndarray, " goals"] | None = None,
-) -> Mapping[str, float | None]:
-    """All scores, by name: those of `scoring.MapScores` and `scoring.PathScores`, `regret` and `arriving_share`.
+    sample: SampleSizes | None = None,
+) -> Evaluation:
+    """Evaluate a learned map and the paths planned in it against the true map.
 
-    - `ranking`: what cells are ranked by, higher for obstacles: P(blocked), where there is such a thing; None where
-      cells are not ranked.
-    - `scored`: the cells that had to be learned.
-    - `visited`: (state, goal) of what people passed (`Demonstrations.visited_state_goals`); they tell which obstacles
-      matter.
-    - `seed` draws starts and goals of paths on maps too large for all pairs (see `sample_for`).
-    - `goals`: the states that paths lead to, where these are not all free cells.
+    A robot that bumps into an obstacle stays in place at the cost of the move, remembers the obstacle and goes on by
+    its planner.
 
-    The regret is by how much a robot goes farther than the shortest way, on average and in cell sides: where it bumps
-    into something it stays, having gone the length of the move, notes the obstacle and goes on as its planner has it.
-    `arriving_share` is the share of pairs between which it arrives. Values are `None` where there is nothing to
-    average; the regret also where a robot never arrives: for it is so wrong about cells that it takes for known, or
-    goes round in circles.
+    Args:
+        planner: The robot's planner; None to score cells only.
+        ranking: P(blocked), or any numbers that are higher for obstacles; None to score paths only.
+        truth: The true map.
+        scored: The cells to score: those that had to be learned.
+        visited: The (state, goal) pairs of the walks (`Demonstrations.visited_state_goals`). They decide which
+            obstacles are relevant.
+        seed: The seed that draws starts, goals and executed paths where there are more than `sample` allows.
+        callback: The progress callback.
+        goals: The goals of paths; by default all free cells.
+        sample: The sample sizes; by default `sample_sizes` of the map.
+
+    Returns:
+        The scores.
+
+    Raises:
+        InputError: For arrays that do not fit the map.
+        NotConverged: If the values of a plan do not converge.
+
+    Example:
+        >>> truth = Grid(np.array([[0, 1, 0], [0, 0, 0]]))
+        >>> blocked = np.array([[0.1, 0.9, 0.2], [0.1, 0.1, 0.1]])
+        >>> everywhere, visited = np.ones((2, 3), dtype=bool), np.array([[0, 2]])
+        >>> evaluate(None, blocked, truth, everywhere, visited).auc_relevant
+        1.0
     """
-    report("finding the obstacles that matter", 0, 1)
+    callback("relevant obstacles", 0, 1)
     relevant = relevant_obstacles(truth, visited[:, 0], visited[:, 1])
-    report("finding the obstacles that matter", 1, 1)
-    # nobody can plan to where the learned map is known to be occupied, whatever the truth says
-    free = np.flatnonzero((truth.known == Cell.FREE) & planner.possible())
-    random, sample = np.random.default_rng(seed), sample_for(truth.size)
+    callback("relevant obstacles", 1, 1)
+    scores = {} if ranking is None else asdict(score_map(ranking, truth, scored, relevant))
+    if planner is None:
+        return Evaluation(**scores)
+    # no path is planned to a cell that the learned map knows to be occupied
+    free = np.flatnonzero((truth.known == Cell.FREE) & planner.goal_mask())
+    random, sample = np.random.default_rng(seed), sample or sample_sizes(truth.size)
     graph = walkable_graph(truth)
-    starts, ends = _some(free, sample.starts, random), free if goals is None else np.intersect1d(free, goals)
-    pairs = _pairs_with_a_way(starts, _some(ends, sample.goals, random), graph)
-    lengths = _planned_lengths(planner, pairs, graph, report)
-    cells = MapScores() if ranking is None else score_map(ranking, truth, scored, relevant)
-    bumps = _followed_with_bumps(planner, pairs, lengths, truth, sample.followed, random, report)
-    return {**asdict(cells), **asdict(score_lengths(lengths, pairs.shortest)), **bumps}
-
-
-def _some(states: Int[np.ndarray, " states"], most: int, random: np.random.Generator) -> Int[np.ndarray, " some"]:
-    return np.sort(random.choice(states, most, replace=False)) if len(states) > most else states
-
-
-def _pairs_with_a_way(starts: Int[np.ndarray, " starts"], goals: Int[np.ndarray, " goals"], graph: csr_array) -> _Pairs:
-    """All pairs of a start and another place as the goal that the graph has a way between."""
-    own_starts, own_goals = np.tile(starts, len(goals)), np.repeat(goals, len(starts))
-    shortest = shortest_lengths(graph, own_starts, own_goals)
-    kept = np.isfinite(shortest) & (own_starts != own_goals)
-    return _Pairs(own_starts[kept], own_goals[kept], shortest[kept])
-
-
-def _planned_lengths(planner: Planner, pairs: _Pairs, graph: csr_array, report: Report) -> Float[np.ndarray, " pairs"]:
-    """The lengths of the paths planned between pairs, infinite for those that are not legal.
-
-    Only the paths to one goal are held at a time: all together may take gigabytes.
-    """
-    lengths, goals = np.full(len(pairs.goals), np.inf), np.unique(pairs.goals)
-    for done, goal in enumerate(goals):
-        report(_PLANNING, done, len(goals))
-        own = pairs.goals == goal
-        lengths[own] = path_lengths(graph, planner.plan_to(int(goal)).follow(pairs.starts[own]), pairs.goals[own])
-    report(_PLANNING, len(goals), len(goals))
-    return lengths
-
-
-_PLANNING, _FOLLOWING = "planning to goals", "following paths that bump"
-
-
-def _followed_with_bumps(
-    planner: Planner,
-    pairs: _Pairs,
-    lengths: Float[np.ndarray, " pairs"],
-    truth: Grid,
-    most: int,
-    random: np.random.Generator,
-    report: Report,
-) -> dict[str, float | None]:
-    """The regret and the share that arrives, over all pairs; of paths that are not legal, a sample is followed."""
+    starts, ends = _draw(free, sample.starts, random), free if goals is None else np.intersect1d(free, goals)
+    pairs = _connected_pairs(starts, _draw(ends, sample.goals, random), graph)
+    lengths = _planned_lengths(planner, pairs, graph, callback)
+    scores |= asdict(score_lengths(lengths, pairs.shortest))
     if not len(lengths):
-        return {"regret": None, "arriving_share": None}
+        return Evaluation(**scores)
+    # the execution of a legal path is the path itself; of the others a sample is executed
     legal = np.isfinite(lengths)
     bumping = np.flatnonzero(~legal)
-    followed = _some(bumping, most, random)
-    excess = _followed_lengths(planner, pairs, followed, truth, report) - pairs.shortest[followed]
+    executed = _draw(bumping, sample.executed, random)
+    excess = _executed_lengths(planner, pairs, executed, truth, callback) - pairs.shortest[executed]
     arriving = legal.sum() + (len(bumping) * np.isfinite(excess).mean() if len(excess) else 0.0)
     total = np.sum(lengths[legal] - pairs.shortest[legal]) + (len(bumping) * excess.mean() if len(excess) else 0.0)
     regret = float(total / len(lengths)) if np.isfinite(total) else None
-    return {"regret": regret, "arriving_share": float(arriving / len(lengths))}
-
-
-def _followed_lengths(
-    planner: Planner, pairs: _Pairs, followed: Int[np.ndarray, " followed"], truth: Grid, report: Report
-) -> Float[np.ndarray, " followed"]:
-    """How far a robot goes between some of the pairs; those to the same goal share the plan that it sets out with."""
-    world, lengths, goals = world_of(truth), np.zeros(len(followed)), pairs.goals[followed]
-    for goal in np.unique(goals):
-        report(_FOLLOWING, int((goals < goal).sum()), len(followed))
-        own = goals == goal
-        lengths[own] = planner.plan_to(int(goal)).lengths_with_bumps(world, pairs.starts[followed][own])
-    report(_FOLLOWING, len(followed), len(followed))
-    return lengths
+    return Evaluation(**scores, regret=regret, arriving_fraction=float(arriving / len(lengths)))
 
 
 def plan_paths(
     planner: Planner, starts: Int[np.ndarray, " starts"], goals: Int[np.ndarray, " goals"]
 ) -> tuple[Sequence[Int[np.ndarray, " _"]], Int[np.ndarray, " paths"]]:
-    """The paths that a robot means to take from every start to every other goal, and the goal of each.
+    """Return the intended paths of a robot from every start to every other goal, and the goal of each path.
 
-    A path that never arrives ends before the first state that would repeat. Raises `NotConverged` if a plan's values
-    did not converge.
+    Args:
+        planner: The robot's planner.
+        starts: The start states.
+        goals: The goal states.
+
+    Returns:
+        The states along each path, and the goals. A path that never arrives ends before the first repeated state.
+
+    Raises:
+        NotConverged: If the values of a plan do not converge.
+
+    Example:
+        >>> from sidestep.robots.planners import PolicyPlanner
+        >>> always_right = np.tile([0.0, 0.0, 0.0, 1.0], (3, 1))
+        >>> planner = PolicyPlanner(Grid.unknown(rows=1, columns=3), lambda goal: always_right)
+        >>> paths, goals = plan_paths(planner, np.array([0, 1]), np.array([2]))
+        >>> [path.tolist() for path in paths]
+        [[0, 1, 2], [1, 2]]
     """
     paths, path_goals = [], []
     for goal in goals:
         others = starts[starts != goal]
-        paths += planner.plan_to(int(goal)).follow(others)
+        paths += planner.plan_to(int(goal)).paths_from(others)
         path_goals += [int(goal)] * len(others)
     return paths, np.asarray(path_goals, dtype=np.int64)
+
+
+def _draw(states: Int[np.ndarray, " states"], most: int, random: np.random.Generator) -> Int[np.ndarray, " drawn"]:
+    return np.sort(random.choice(states, most, replace=False)) if len(states) > most else states
+
+
+def _connected_pairs(starts: Int[np.ndarray, " starts"], goals: Int[np.ndarray, " goals"], graph: csr_array) -> _Pairs:
+    """Return all pairs of a start and another state as the goal that a path connects."""
+    all_starts, all_goals = np.tile(starts, len(goals)), np.repeat(goals, len(starts))
+    shortest = shortest_lengths(graph, all_starts, all_goals)
+    kept = np.isfinite(shortest) & (all_starts != all_goals)
+    return _Pairs(all_starts[kept], all_goals[kept], shortest[kept])
+
+
+def _planned_lengths(
+    planner: Planner, pairs: _Pairs, graph: csr_array, callback: StageCallback
+) -> Float[np.ndarray, " pairs"]:
+    """Return the lengths of the planned paths, infinite if not legal; only the paths to one goal are in memory."""
+    lengths, goals, stage = np.full(len(pairs.goals), np.inf), np.unique(pairs.goals), "planned paths"
+    for done, goal in enumerate(goals):
+        callback(stage, done, len(goals))
+        own = pairs.goals == goal
+        lengths[own] = path_lengths(graph, planner.plan_to(int(goal)).paths_from(pairs.starts[own]), pairs.goals[own])
+    callback(stage, len(goals), len(goals))
+    return lengths
+
+
+def _executed_lengths(
+    planner: Planner, pairs: _Pairs, executed: Int[np.ndarray, " executed"], truth: Grid, callback: StageCallback
+) -> Float[np.ndarray, " executed"]:
+    """Return the lengths of the executed paths of some pairs; pairs with the same goal share the first plan."""
+    environment, lengths, goals = grid_environment(truth), np.zeros(len(executed)), pairs.goals[executed]
+    stage = "executed paths"
+    for goal in np.unique(goals):
+        callback(stage, int((goals < goal).sum()), len(executed))
+        own = goals == goal
+        lengths[own] = planner.plan_to(int(goal)).executed_lengths(environment, pairs.starts[executed][own])
+    callback(stage, len(executed), len(executed))
+    return lengths

@@ -1,17 +1,16 @@
-"""What a robot makes of a learned map: what it takes for known, and what it pursues.
+"""A risk-averse robot: the cells that it takes to be free, and the task that it solves in a learned map.
 
-A learned map says how probable a move is to fail, each time anew. A robot may assume more: obstacles stay where they
-are. Then a cell through which somebody walked is free, and what failed once fails again, so that a bump costs the way
-back and around. Who only counted tries would expect two at a wall with P(blocked) = ½, and think little of it.
+In a learned map each move fails with a probability, independently each time. The robot knows more: obstacles do not
+move. So a cell that a walk passed is free, and a move that failed fails again. A bump therefore costs the way back and
+around, and not only the expected number of repeated moves (two at P(blocked) = 1/2).
 
-But who has bumped into a wall tries the next piece of it, and that is near. So a robot plans as if behind every
-obstacle there were another one to try, as probably blocked: P/(1 − P) bumps until it gets through, at least one with
-probability P. The first costs `bump_cost`, each further one a fifth of that. This comes out, together with the lengths
-of the tries, if it pursues
+After a bump the robot tries another part of the wall, which is near. So it plans as if behind each obstacle there were
+another one with the same P(blocked): P/(1 − P) expected bumps until it passes, at least one with probability P. The
+first bump costs `bump_cost`, each further one a fifth of that. With the lengths of the moves, this is the value of
 
-    R(s, a) = −length(a) − bump_cost · P · (1 − P + P/5),        P = P(a leads nowhere from s),        γ = 1,
+    R(s, a) = −length(a) − bump_cost · P · (1 − P + P/5),        P = P(a fails in s),        γ = 1,
 
-in the model in which cells that people walked through are known to be free. Every doubtful move is charged by itself.
+in the model in which all visited cells are free. The moves are charged independently of each other.
 """
 
 from collections.abc import Sequence
@@ -29,37 +28,48 @@ from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.tasks import Task, reach
 
 BUMP_COST = 40.0
-"""What the first bump at a place costs beside the move itself, in cell sides: a long way around."""
-_FURTHER = 0.2
-"""The share of it that every further bump costs: the way to the next piece of a wall."""
+"""The cost of the first bump at a place beside that of the move, in cell sides: a long detour."""
+_FURTHER_BUMPS = 0.2
+"""The cost of each further bump as a fraction of the first: the way to the next part of a wall."""
 
 
 def risk_averse_robot(
-    model: ObstacleGrid, walked: Int[np.ndarray, " visits"] | Sequence[int], bump_cost: float = BUMP_COST
+    model: ObstacleGrid, visited: Int[np.ndarray, " visits"] | Sequence[int], bump_cost: float = BUMP_COST
 ) -> ModelPlanner:
-    """Who plans so in a learned map, where people walked through some cells (states)."""
-    known = mark_visited_free(model, walked)
+    """Return a planner that avoids bumps in a learned map.
+
+    Args:
+        model: The learned map.
+        visited: The cells (states) that walks passed.
+        bump_cost: The cost of the first bump at a place in cell sides, at least 0.
+    """
+    known = mark_visited_free(model, visited)
     return ModelPlanner(known, partial(risk_averse_task, known, bump_cost=bump_cost))
 
 
-def mark_visited_free(model: ObstacleGrid, walked: Int[np.ndarray, " visits"] | Sequence[int]) -> ObstacleGrid:
-    """The model, with the unknown cells (states) that people walked through known to be free."""
+def mark_visited_free(model: ObstacleGrid, visited: Int[np.ndarray, " visits"] | Sequence[int]) -> ObstacleGrid:
+    """Return the model in which unknown cells (states) that walks passed are known to be free."""
     known = np.array(model.known).reshape(-1)
-    seen = np.asarray(walked, dtype=np.int64)
-    known[seen[known[seen] == Cell.UNKNOWN]] = Cell.FREE
+    visited = np.asarray(visited, dtype=np.int64)
+    known[visited[known[visited] == Cell.UNKNOWN]] = Cell.FREE
     return eqx.tree_at(lambda model: model.known, model, jnp.asarray(known.reshape(model.known.shape)))
 
 
 def risk_averse_task(model: ObstacleGrid, goal: int, bump_cost: float = BUMP_COST) -> Task:
-    """The task of reaching a state soon, and of bumping into little on the way.
+    """Return the task of reaching a state by a short path with few bumps.
 
-    - `bump_cost`: in cell sides, 0 or more. Raises `InputError` for another, or a goal that is not a state.
+    Args:
+        model: The map in which the robot plans.
+        goal: The goal state; it may lie in an obstacle of the model.
+        bump_cost: The cost of the first bump at a place in cell sides, at least 0.
+
+    Raises:
+        InputError: For a cost out of range or a goal that is not a state.
     """
     if not (np.isfinite(bump_cost) and bump_cost >= 0):
         raise InputError(f"expected a number of at least 0, found {bump_cost}", field="bump_cost")
-    # what the model takes for an obstacle may be a goal all the same
     task = reach(model.blank, goal, discount=1.0, step_cost=1.0)
     states = jnp.arange(model.graph.states)[:, None, None]
-    nowhere = jnp.sum(jnp.where(model.graph.successors == states, model.probabilities(), 0), axis=-1)
-    bumps = bump_cost * nowhere * (1 - nowhere + _FURTHER * nowhere)
+    fails = jnp.sum(jnp.where(model.graph.successors == states, model.probabilities(), 0), axis=-1)
+    bumps = bump_cost * fails * (1 - fails + _FURTHER_BUMPS * fails)
     return Task(task.reward - bumps, task.terminal_reward, task.terminal, task.discount)
