@@ -22,7 +22,8 @@ import numpy as np
 
 from measuring import argument_parser, main, note, number, peak_bytes, print_table, write_records
 from sidestep.cli.simulate import Walkers, walk
-from sidestep.evaluation.metrics import relevant_obstacles, score_map, visit_ranking
+from sidestep.evaluation.metrics import score_map, visit_ranking
+from sidestep.evaluation.relevance import relevant_obstacles
 from sidestep.inference.maximize import Progress
 from sidestep.io.maps import read_map
 from sidestep.maps.config import Settings, fit_map

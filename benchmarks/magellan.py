@@ -31,7 +31,8 @@ from measuring import argument_parser, complain, main, note, number, print_table
 from real_people import SCORES, Maze, draws
 from settings import add_set_option, changed, described
 from sidestep.errors import InputError
-from sidestep.evaluation.metrics import relevant_obstacles, score_map, visit_ranking
+from sidestep.evaluation.metrics import score_map, visit_ranking
+from sidestep.evaluation.relevance import relevant_obstacles
 from sidestep.io.demonstrations import demonstrations_from_walks
 from sidestep.io.maps import read_map
 from sidestep.io.walks import Walks, read_walks

@@ -29,7 +29,8 @@ import measuring
 from settings import add_set_option, changed, described
 from sidestep._files import write_json
 from sidestep.errors import InputError
-from sidestep.evaluation.metrics import relevant_obstacles, score_map, visit_ranking
+from sidestep.evaluation.metrics import score_map, visit_ranking
+from sidestep.evaluation.relevance import relevant_obstacles
 from sidestep.io.demonstrations import demonstrations_from_walks
 from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map

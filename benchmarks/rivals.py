@@ -33,11 +33,11 @@ import measuring
 from real_people import DATA, Maze, read_maze
 from settings import add_set_option, changed, described
 from sidestep._files import write_json
-from sidestep.baselines.interface import mean_log_likelihood
 from sidestep.cli.compare import METHODS
 from sidestep.cli.simulate import Walkers, walk
 from sidestep.errors import ImproperTask, InputError, NotConverged
 from sidestep.evaluation.evaluate import evaluate
+from sidestep.evaluation.study import mean_log_likelihood
 from sidestep.io.demonstrations import demonstrations_from_walks
 from sidestep.io.gridding import grid_walks
 from sidestep.io.trajectories import walks_of_trajectories
@@ -57,9 +57,9 @@ SCORES = {
     "average_precision": "average\nprecision",
     "auc": "AUC",
     "heldout_log_likelihood": "held-out\nnats a move",
-    "legal_share": "legal",
+    "legal_fraction": "legal",
     "regret": "regret",
-    "arriving_share": "arriving",
+    "arriving_fraction": "arriving",
 }
 
 
@@ -132,7 +132,8 @@ def score(problem: Problem, settings: Settings, auto: bool, methods: Sequence[st
         if not learned.converged:
             Console(stderr=True).print(f"{problem.name}, {name}: did not converge")
         scores[name] = {
-            key: {**found, "heldout_log_likelihood": mean_log_likelihood(learned, others)}[key] for key in SCORES
+            key: {**found.to_dict(), "heldout_log_likelihood": mean_log_likelihood(learned, others)}[key]
+            for key in SCORES
         }
     return scores
 

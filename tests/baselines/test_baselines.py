@@ -8,9 +8,10 @@ import pytest
 from sidestep.baselines import behavior_cloning as cloning
 from sidestep.baselines.behavior_cloning import behavior_cloning
 from sidestep.baselines.constraint_inference import constraint_inference
-from sidestep.baselines.interface import behavior_aware, known_map, mean_log_likelihood, transitions_only, visit_counts
+from sidestep.baselines.interface import behavior_aware, known_map, transitions_only, visit_counts
 from sidestep.baselines.joint import joint_estimation
 from sidestep.baselines.maxent_irl import CostlyReward, maxent_irl
+from sidestep.evaluation.study import mean_log_likelihood
 from sidestep.maps.config import Settings
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
 from sidestep.tabular.demonstrations import Trajectory, gather
@@ -116,7 +117,7 @@ def test_joint_tells_a_costly_floor_from_a_wall():
     # people pay what was learned: 4 moves around the end of the carpet rather than 2 across it; robots go across
     path = plan(learned.model, learned.reward.reach(BLANK, 18)).path_from(16)
     assert path.tolist() == [16, 21, 22, 23, 18]
-    assert learned.planner.plan_to(18).follow(np.array([16]))[0].tolist() == [16, 17, 18]
+    assert learned.planner.plan_to(18).paths_from(np.array([16]))[0].tolist() == [16, 17, 18]
 
 
 def walk(*states):
@@ -134,9 +135,9 @@ def test_cloning_does_what_was_demonstrated_in_a_corridor():
     assert policy[:3, 3].min() > 0.5
     assert policy.min() > 0
     np.testing.assert_allclose(policy.sum(axis=1), 1)
-    assert [path.tolist() for path in learned.planner.plan_to(3).follow(np.array([0, 2]))] == [[0, 1, 2, 3], [2, 3]]
-    assert learned.planner.plan_to(4).follow(np.array([3]))[0].tolist() == [3, 2]
-    assert learned.planner.possible().tolist() == [[True, True, True, True, False]]
+    assert [path.tolist() for path in learned.planner.plan_to(3).paths_from(np.array([0, 2]))] == [[0, 1, 2, 3], [2, 3]]
+    assert learned.planner.plan_to(4).paths_from(np.array([3]))[0].tolist() == [3, 2]
+    assert learned.planner.goal_mask().tolist() == [[True, True, True, True, False]]
 
 
 def test_cloning_generalises_to_goals_that_nobody_had():
@@ -150,7 +151,7 @@ def test_cloning_generalises_to_goals_that_nobody_had():
     for goal in (10, 20, 33, 45):
         others = np.delete(np.arange(49), goal)
         shortest = [abs(start // 7 - goal // 7) + abs(start % 7 - goal % 7) for start in others]
-        paths = learned.planner.plan_to(goal).follow(others)
+        paths = learned.planner.plan_to(goal).paths_from(others)
         assert [path[-1] for path in paths] == [goal] * 48
         assert [len(path) - 1 for path in paths] == shortest
 
@@ -171,8 +172,8 @@ def test_cloning_is_particular_to_places():
     straight, around = walk(5, 6, 7, 8, 9), walk(15, 10, 11, 12, 13, 14, 19)._replace(task=1)
     shown = gather([straight, around] * 5, [reach(BLANK, goal) for goal in (9, 19)])
     learned = behavior_cloning(BLANK, shown, Settings())
-    assert learned.planner.plan_to(9).follow(np.array([5]))[0].tolist() == straight.states.tolist()
-    assert learned.planner.plan_to(19).follow(np.array([15]))[0].tolist() == around.states.tolist()
+    assert learned.planner.plan_to(9).paths_from(np.array([5]))[0].tolist() == straight.states.tolist()
+    assert learned.planner.plan_to(19).paths_from(np.array([15]))[0].tolist() == around.states.tolist()
 
 
 def test_cloning_takes_actions_to_be_as_probable_as_its_policy_says(walks):

@@ -48,11 +48,11 @@ def compared(office, compared_table):
 def test_every_method_has_every_score(office, compared):
     assert set(compared["methods"]) == set(METHODS)
     for name, scores in compared["methods"].items():
-        for key in ("legal_share", "arriving_share", "heldout_log_likelihood", "seconds"):
+        for key in ("legal_fraction", "arriving_fraction", "heldout_log_likelihood", "seconds"):
             assert np.isfinite(scores[key])
-        assert scores["arriving_share"] >= scores["legal_share"]
+        assert scores["arriving_fraction"] >= scores["legal_fraction"]
         assert scores["converged"] is True
-        assert (scores["regret"] is None) == (scores["arriving_share"] < 1)
+        assert (scores["regret"] is None) == (scores["arriving_fraction"] < 1)
         for key in ("auc", "average_precision"):
             assert scores[key] is None if name == "cloning" else np.isfinite(scores[key])
     assert compared["data"]["walks"] == 64
@@ -116,7 +116,7 @@ def test_a_truth_of_another_place_is_refused(office, tmp_path, capsys):
 def test_behavior_sees_walls_and_transitions_alone_do_not(compared):
     methods = compared["methods"]
     assert methods["behavior"]["mean_obstacle"] > methods["transitions"]["mean_obstacle"] + 0.1
-    assert methods["behavior"]["legal_share"] >= methods["transitions"]["legal_share"]
+    assert methods["behavior"]["legal_fraction"] >= methods["transitions"]["legal_fraction"]
     assert methods["behavior"]["heldout_log_likelihood"] > methods["transitions"]["heldout_log_likelihood"]
 
 

@@ -18,7 +18,7 @@ from sidestep.maps.learned_map import read_learned_map
 from sidestep.tabular.grid import Cell
 
 SCORES = (
-    "auc", "average_precision", "auc_relevant", "mean_obstacle", "mean_free", "max_probability", "legal_share",
+    "auc", "average_precision", "auc_relevant", "mean_obstacle", "mean_free", "max_probability", "legal_fraction",
     "excess_length",
 )  # fmt: skip
 LEARNED = ["blocked.npy", "learned.png", "map.pgm", "map.yaml", "summary.json", "visited.npy"]
@@ -109,9 +109,9 @@ def test_evaluating_adds_the_scores_to_the_summary(office, learned, tmp_path, ca
     assert {key: together[key] for key in before} == before
     for key in SCORES:
         assert split_by_person[key] == together[key]
-    assert set(together["planned_at_most"]) == {"starts", "goals", "followed"}
+    assert set(together["planned_at_most"]) == {"starts", "goals", "executed"}
     assert together["auc"] == 1
-    assert together["legal_share"] == 1
+    assert together["legal_fraction"] == 1
     assert together["mean_obstacle"] > 0.5 > 0.2 > together["mean_free"]
     assert "1.000" in capsys.readouterr().out
     assert written(learned) == LEARNED

@@ -1,4 +1,4 @@
-"""Scores of learned maps and planned paths: worked cases, and brute force that really opens each obstacle."""
+"""Scores of learned maps and planned paths: worked cases, scikit-learn, and brute force that opens each obstacle."""
 
 from dataclasses import replace
 
@@ -7,7 +7,8 @@ import pytest
 from scipy.sparse.csgraph import dijkstra
 
 from sidestep.errors import InputError
-from sidestep.evaluation.metrics import relevant_obstacles, score_map, score_paths, visit_ranking
+from sidestep.evaluation.metrics import ranking_scores, score_map, score_paths, visit_ranking
+from sidestep.evaluation.relevance import relevant_obstacles
 from sidestep.tabular.graph import walkable_graph
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 
@@ -25,26 +26,20 @@ def array(*states):
     return np.array(states, dtype=np.int64)
 
 
-# the walkable graph
-
-
-def test_the_graph_of_a_corner_4_connected():
+def test_walkable_graph_with_4_moves_has_no_diagonals():
     graph = walkable_graph(grid_of("..", ".#")).toarray()
     np.testing.assert_array_equal(graph, [[0, 1, 1, 0], [1, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0]])
 
 
-def test_diagonals_are_longer_and_do_not_cut_corners():
+def test_walkable_graph_with_8_moves_does_not_cut_corners():
     open_square = walkable_graph(grid_of("..", "..", connectivity=8)).toarray()
     assert open_square[0, 3] == open_square[2, 1] == pytest.approx(ROOT_TWO)
     corner = walkable_graph(grid_of("..", ".#", connectivity=8)).toarray()
     assert corner[1, 2] == corner[2, 1] == 0
 
 
-def test_unknown_cells_are_not_walkable():
+def test_walkable_graph_leaves_out_unknown_cells():
     assert walkable_graph(grid_of(".?.")).nnz == 0
-
-
-# which obstacles matter
 
 
 @pytest.mark.parametrize(
@@ -54,21 +49,16 @@ def test_unknown_cells_are_not_walkable():
         (["...", ".#.", "..."], 4, 0, 8, []),  # around is as short as through
         (["...", ".#.", "..."], 8, 0, 8, [4]),  # 4 around (corners are not cut), 2√2 through
         ([".#", ".."], 8, 0, 3, [1]),  # frees the diagonal past it
-        (
-            [".....#", "....#.", "......"],
-            8,
-            11,
-            7,
-            [10],
-        ),  # opening 5 is no gain: 10 still prevents the diagonal
+        # opening 5 is no gain: 10 still prevents the diagonal
+        ([".....#", "....#.", "......"], 8, 11, 7, [10]),
         ([".#.", ".#.", ".#."], 4, 3, 5, [1, 4, 7]),  # nothing else connects the two sides
         ([".##."], 4, 0, 3, []),  # opening one of two is not enough
         ([".?.", "..."], 4, 0, 2, []),  # unknown is no obstacle
-        ([".#."], 4, 1, 2, [1]),  # somebody stood in it
+        ([".#."], 4, 1, 2, [1]),  # the visited state is in it
         (["..#"], 4, 0, 2, [2]),  # the goal lies in it
     ],
 )
-def test_relevant_obstacles_by_hand(drawing, connectivity, visited, goal, expected):
+def test_relevant_obstacles_in_a_drawing_are_those_worked_out(drawing, connectivity, visited, goal, expected):
     truth = grid_of(*drawing, connectivity=connectivity)
     relevant = relevant_obstacles(truth, array(visited), array(goal))
     assert relevant.shape == truth.shape
@@ -76,7 +66,7 @@ def test_relevant_obstacles_by_hand(drawing, connectivity, visited, goal, expect
 
 
 def relevant_by_force(truth, visited, goals):
-    """Open every obstacle in turn and measure all ways again."""
+    """Open every obstacle in turn and measure all paths again."""
     before = dijkstra(walkable_graph(truth))[visited, goals]
     relevant = np.zeros(truth.size, dtype=bool)
     for cell in np.flatnonzero(truth.known == Cell.OCCUPIED):
@@ -89,29 +79,39 @@ def relevant_by_force(truth, visited, goals):
 
 @pytest.mark.parametrize("connectivity", [4, 8])
 @pytest.mark.parametrize("obstacles", [0.15, 0.35, 0.6])
-def test_relevant_obstacles_agree_with_opening_each(connectivity, obstacles):
+def test_relevant_obstacles_on_random_maps_equal_those_by_force(connectivity, obstacles):
     random = np.random.default_rng(7)
-    found = 0
-    for _ in range(60):
+    total = 0
+    for _ in range(30):
         shape = tuple(random.integers(1, 8, size=2))
-        shares = [0.05, 0.95 - obstacles, obstacles]
-        known = random.choice([Cell.UNKNOWN, Cell.FREE, Cell.OCCUPIED], size=shape, p=shares).astype(np.int64)
+        fractions = [0.05, 0.95 - obstacles, obstacles]
+        known = random.choice([Cell.UNKNOWN, Cell.FREE, Cell.OCCUPIED], size=shape, p=fractions).astype(np.int64)
         truth = Grid(known, connectivity=connectivity)
         visited, goals = random.integers(0, truth.size, size=(2, random.integers(1, 6)))
         expected = relevant_by_force(truth, visited, goals)
         np.testing.assert_array_equal(relevant_obstacles(truth, visited, goals), expected, str(known))
-        found += expected.sum()
-    assert found > 20
+        total += expected.sum()
+    assert total > 10
 
 
-def test_no_visits_make_nothing_relevant():
+@pytest.mark.parametrize("digits", [1, 12])
+def test_ranking_scores_of_random_scores_equal_those_of_scikit_learn(digits):
+    from sklearn.metrics import average_precision_score, roc_auc_score
+
+    random = np.random.default_rng(0)
+    for _ in range(50):
+        positives, negatives = (random.normal(size=random.integers(1, 60)).round(digits) for _ in range(2))
+        label = np.repeat([1, 0], [len(positives), len(negatives)])
+        score = np.concatenate([positives, negatives])
+        expected = roc_auc_score(label, score), average_precision_score(label, score)
+        np.testing.assert_allclose(ranking_scores(positives, negatives), expected, rtol=1e-12)
+
+
+def test_relevant_obstacles_without_visits_are_none():
     assert not relevant_obstacles(grid_of(".#."), array(), array()).any()
 
 
-# scores of a map
-
-
-def test_map_scores_by_hand():
+def test_score_map_equals_scores_worked_out():
     truth = grid_of("##..", "?#..")
     blocked = np.array([[0.9, 0.3, 0.6, 0.1], [1.0, 0.5, 0.2, 0.99]])
     scored = np.array([[True, True, True, True], [True, True, True, False]])
@@ -130,7 +130,7 @@ def test_map_scores_by_hand():
     assert scores.max_probability == 0.9  # neither the unknown cell nor the one that is not scored
 
 
-def test_what_has_nothing_to_average_is_none():
+def test_score_map_without_cells_to_average_is_none():
     nothing = np.zeros((1, 2), dtype=bool)
     no_obstacle = score_map(np.array([[0.2, 0.4]]), grid_of(".."), ~nothing, nothing)
     assert (no_obstacle.auc, no_obstacle.average_precision, no_obstacle.recall) == (None, None, None)
@@ -143,7 +143,7 @@ def test_what_has_nothing_to_average_is_none():
     assert set(vars(unscored).values()) == {None}
 
 
-def test_map_scores_refuse_other_shapes_and_nan():
+def test_score_map_with_another_shape_or_nan_raises():
     flags = np.ones((2, 2), dtype=bool)
     with pytest.raises(InputError, match=r"'blocked': expected the map's shape \(1, 2\), found \(2, 2\)"):
         score_map(np.zeros((2, 2)), grid_of(".."), flags, flags)
@@ -152,10 +152,7 @@ def test_map_scores_refuse_other_shapes_and_nan():
         score_map(np.array([[0.0, np.nan]]), grid_of(".."), flags, flags)
 
 
-# scores of paths
-
-
-def test_path_scores_by_hand():
+def test_score_paths_equals_scores_worked_out():
     truth = grid_of("...", ".#.", "...", "###", "...")
     paths = [
         array(0, 1, 2),  # shortest
@@ -169,31 +166,28 @@ def test_path_scores_by_hand():
         array(0, 12),  # cannot get there: left out
     ]
     scores = score_paths(paths, [2, 2, 5, 2, 2, 2, 5, 7, 12], truth)
-    assert scores.legal_share == pytest.approx(3 / 8)
+    assert scores.legal_fraction == pytest.approx(3 / 8)
     assert scores.excess_length == pytest.approx(4 / 3)
 
 
-def test_diagonal_paths():
+def test_score_paths_with_diagonals_forbids_cut_corners():
     truth = grid_of("...", "..#", "...", connectivity=8)
     scores = score_paths([array(0, 1, 4, 8), array(1, 4, 7, 8), array(0, 4, 7)], [8, 8, 7], truth)
-    assert scores.legal_share == pytest.approx(2 / 3)  # 4 → 8 cuts the corner at 5
+    assert scores.legal_fraction == pytest.approx(2 / 3)  # 4 → 8 cuts the corner at 5
     assert scores.excess_length == pytest.approx(0)
     longer = score_paths([array(0, 1, 4)], np.array([4]), truth)
     assert longer.excess_length == pytest.approx(2 - ROOT_TWO)
 
 
-def test_a_path_within_an_obstacle_is_left_out():
+def test_score_paths_leaves_out_paths_within_obstacles():
     scores = score_paths([array(1), array(0, 1)], [1, 1], grid_of(".#"))
-    assert (scores.legal_share, scores.excess_length) == (None, None)
+    assert (scores.legal_fraction, scores.excess_length) == (None, None)
 
 
-def test_no_legal_path_has_no_excess():
+def test_score_paths_without_legal_paths_has_no_excess_length():
     scores = score_paths([array(0, 2)], [2], grid_of("..."))
-    assert (scores.legal_share, scores.excess_length) == (0.0, None)
-    assert score_paths([], [], grid_of(".")).legal_share is None
-
-
-# refusals and the baseline
+    assert (scores.legal_fraction, scores.excess_length) == (0.0, None)
+    assert score_paths([], [], grid_of(".")).legal_fraction is None
 
 
 @pytest.mark.parametrize(
@@ -214,12 +208,12 @@ def test_no_legal_path_has_no_excess():
         (lambda grid: visit_ranking(array(-1), grid), "'visited': expected states in 0…2"),
     ],
 )
-def test_refusals(call, message):
+def test_metrics_with_invalid_arguments_raise(call, message):
     with pytest.raises(InputError) as caught:
         call(grid_of("..."))
     assert message in str(caught.value)
 
 
-def test_cells_rarely_visited_rank_highest():
+def test_visit_ranking_is_minus_the_number_of_visits():
     ranking = visit_ranking(array(0, 2, 2), grid_of("..", ".#"))
     np.testing.assert_array_equal(ranking, [[-1, 0], [-2, 0]])

@@ -14,7 +14,7 @@ from sidestep.tabular.graph import walkable_graph
 from sidestep.worlds.grids import WORLDS, block
 
 SCORES = {
-    "auc", "average_precision", "auc_relevant", "mean_obstacle", "mean_free", "max_probability", "legal_share",
+    "auc", "average_precision", "auc_relevant", "mean_obstacle", "mean_free", "max_probability", "legal_fraction",
     "excess_length",
 }  # fmt: skip
 
@@ -65,8 +65,8 @@ def test_the_block_is_found_by_those_who_watch_actions(reproduced):
         assert scores["auc"] >= 0.95
         assert scores["mean_obstacle"] >= 0.4
         assert scores["mean_free"] <= 0.1
-        assert scores["legal_share"] >= 0.97
-        assert scores["legal_share"] > transitions["legal_share"]
+        assert scores["legal_fraction"] >= 0.97
+        assert scores["legal_fraction"] > transitions["legal_fraction"]
     assert transitions["max_probability"] < 0.2
     assert actions["mean_free"] > bam["mean_free"]
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from sidestep.cli.simulate import Walkers, walk
-from sidestep.evaluation.metrics import relevant_obstacles, score_map, visit_ranking
+from sidestep.evaluation.metrics import score_map, visit_ranking
+from sidestep.evaluation.relevance import relevant_obstacles
 from sidestep.inference import batching, maximize, objective
 from sidestep.inference.fit import fit
 from sidestep.inference.optimizers import LBFGS, Adam, Rprop

@@ -95,12 +95,6 @@ class ModelResult(NamedTuple):
         return np.asarray(log_policies(self.model, shown, self.behavior))[: len(demonstrations)]
 
 
-def mean_log_likelihood(lesson: BaselineResult, others: Demonstrations) -> float | None:
-    """How probable other people's actions are taken to be, in nats a move; None if that is not found for all."""
-    nats = float(np.mean(lesson.log_policies(others)))
-    return nats if np.isfinite(nats) else None
-
-
 Method = Callable[[Grid, Demonstrations, Settings], BaselineResult]
 
 

@@ -284,9 +284,9 @@ def compare_command(
         "auc": "AUC",
         "average_precision": "average\nprecision",
         "average_precision_relevant": "of those\nthat matter",
-        "legal_share": "legal\npaths",
+        "legal_fraction": "legal\npaths",
         "regret": "regret",
-        "arriving_share": "arrive",
+        "arriving_fraction": "arrive",
         "heldout_log_likelihood": "held-out\nnats a move",
         "seconds": "seconds",
     }

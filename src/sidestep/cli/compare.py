@@ -16,7 +16,6 @@ from sidestep.baselines.interface import (
     BaselineResult,
     Method,
     behavior_aware,
-    mean_log_likelihood,
     transitions_only,
     visit_counts,
 )
@@ -24,6 +23,7 @@ from sidestep.baselines.joint import joint_estimation
 from sidestep.baselines.maxent_irl import maxent_irl
 from sidestep.errors import ImproperTask, InputError, NotConverged
 from sidestep.evaluation.evaluate import evaluate
+from sidestep.evaluation.study import mean_log_likelihood
 from sidestep.io.demonstrations import demonstrations_from_moves
 from sidestep.io.gridding import Moves, grid_walks
 from sidestep.io.maps import read_map
@@ -47,7 +47,7 @@ METHODS: Mapping[str, Method] = MappingProxyType(
     }
 )
 """The methods by name: behavior-aware modeling first, then its rivals."""
-_SCORES = ("auc", "average_precision", "legal_share", "regret", "heldout_log_likelihood", "seconds", "converged")
+_SCORES = ("auc", "average_precision", "legal_fraction", "regret", "heldout_log_likelihood", "seconds", "converged")
 """What is told of every method, null where it failed."""
 
 
@@ -103,7 +103,7 @@ def compare(
             continue
         heldout = mean_log_likelihood(learned, others)
         methods[name] = {
-            **scores,
+            **scores.to_dict(),
             "heldout_log_likelihood": heldout,
             "seconds": round(seconds, 3),
             "converged": learned.converged,
@@ -138,6 +138,6 @@ def _panel(name: str, learned: BaselineResult, given: Grid, truth: Grid, shown: 
     paths = [
         path
         for goal in np.unique(ends[1])
-        for path in learned.planner.plan_to(int(goal)).follow(ends[0, ends[1] == goal])
+        for path in learned.planner.plan_to(int(goal)).paths_from(ends[0, ends[1] == goal])
     ]
     return Panel(f"{name}: its {len(paths)} ways", truth, paths=paths)

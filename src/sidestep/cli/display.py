@@ -90,7 +90,7 @@ def print_scores(rows: Mapping[str, Mapping[str, Any]]) -> None:
         "mean_obstacle": "mean on\nobstacles",
         "mean_free": "mean on\nfree cells",
         "max_probability": "highest",
-        "legal_share": "legal\npaths",
+        "legal_fraction": "legal\npaths",
         "excess_length": "excess\nlength",
         "regret": "regret",
     }

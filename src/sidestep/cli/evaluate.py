@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sidestep.evaluation.evaluate import Report, evaluate, sample_for
+from sidestep.evaluation.evaluate import StageCallback, evaluate, sample_sizes
 from sidestep.io.true_map import read_truth
 from sidestep.maps.learned_map import add_to_summary, read_learned_map
 from sidestep.robots.robot import BUMP_COST
@@ -15,7 +15,7 @@ def evaluate_map(
     truth_file: Path,
     out: Path | None = None,
     seed: int = 0,
-    report: Report = lambda *_: None,
+    report: StageCallback = lambda *_: None,
     bump_cost: float = BUMP_COST,
 ) -> Mapping[str, Any]:
     """Scores the learned map of `folder` against a true map and returns the scores (see `sidestep.evaluation.metrics`).
@@ -30,7 +30,7 @@ def evaluate_map(
     learned = read_learned_map(folder)
     truth = read_truth(truth_file, learned.grid)
     robot = learned.robot(bump_cost)
-    scores = evaluate(robot, learned.blocked, truth, learned.unknown, learned.visited, seed, report)
-    limits = {"planned_at_most": sample_for(truth.size)._asdict(), "bump_cost": bump_cost}
+    scores = evaluate(robot, learned.blocked, truth, learned.unknown, learned.visited, seed, report).to_dict()
+    limits = {"planned_at_most": sample_sizes(truth.size)._asdict(), "bump_cost": bump_cost}
     add_to_summary(folder, out or folder, None, {"truth": str(truth_file), **limits, **scores})
     return scores

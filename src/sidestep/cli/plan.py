@@ -25,7 +25,7 @@ def plan_path(folder: Path, start: Position, goal: Position, out: Path, bump_cos
     """
     learned = read_learned_map(folder)
     first, last = (_state(learned.grid, position, name) for name, position in (("start", start), ("goal", goal)))
-    path = learned.robot(bump_cost).plan_to(last).follow(np.array([first]))[0]
+    path = learned.robot(bump_cost).plan_to(last).paths_from(np.array([first]))[0]
     if path[-1] != last:
         raise InputError(f"no way from {start} to {goal} in the learned map", source=folder)
     chances = learned.blocked.reshape(-1)[path]

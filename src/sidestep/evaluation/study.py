@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -52,7 +52,7 @@ class Problem:
         grid: The known map. Its unknown cells are scored.
         truth: The true map.
         demonstrations: The demonstrations to learn from.
-        held_out: Demonstrations for the predictive log-likelihood; None to leave it out.
+        heldout: Demonstrations for the predictive log-likelihood; None to leave it out.
         goals: The goals of evaluated paths (states); None for all free cells.
     """
 
@@ -60,7 +60,7 @@ class Problem:
     grid: Grid
     truth: Grid
     demonstrations: Demonstrations
-    held_out: Demonstrations | None = None
+    heldout: Demonstrations | None = None
     goals: Int[np.ndarray, " goals"] | None = None
 
 
@@ -72,7 +72,7 @@ class Record:
         problem: The problem's name.
         method: The method's name.
         evaluation: The scores; all None if the method failed.
-        held_out_log_likelihood: The mean log π(a | s) of held-out moves in nats; None without held-out moves and if a
+        heldout_log_likelihood: The mean log π(a | s) of held-out moves in nats; None without held-out moves and if a
             value does not converge.
         seconds: The time of learning; None if the method failed.
         converged: As in `MethodResult`; None if the method failed.
@@ -82,8 +82,8 @@ class Record:
 
     problem: str
     method: str
-    evaluation: Evaluation = Evaluation()
-    held_out_log_likelihood: float | None = None
+    evaluation: Evaluation = field(default_factory=Evaluation)
+    heldout_log_likelihood: float | None = None
     seconds: float | None = None
     converged: bool | None = None
     failure: str | None = None
@@ -149,8 +149,8 @@ def run_method(
         scores = evaluate(planner, result.ranking, problem.truth, scored, visited, seed, goals=problem.goals)
     except (ImproperTask, NotConverged) as error:
         return Record(problem.name, name, failure=str(error))
-    held_out = None if problem.held_out is None else mean_log_likelihood(result, problem.held_out)
-    return Record(problem.name, name, scores, held_out, seconds, result.converged, result=result)
+    heldout = None if problem.heldout is None else mean_log_likelihood(result, problem.heldout)
+    return Record(problem.name, name, scores, heldout, seconds, result.converged, result=result)
 
 
 def mean_log_likelihood(result: MethodResult, demonstrations: Demonstrations) -> float | None:

@@ -75,7 +75,7 @@ def demo(folder: Path, seed: int = 0, report: Callable[[str], None] = lambda _: 
         "objective": found.final.objective,
         "converged": found.converged,
         "message": found.message,
-        "scores": scores,
+        "scores": scores.to_dict(),
     }
     write_learned_map(folder / "learned", learned, summary)
     write_json(folder / "summary.json", summary)

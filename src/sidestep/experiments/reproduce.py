@@ -115,7 +115,7 @@ def _scores(world: World, demonstrations: Demonstrations, found: Fit[ObstacleGri
         _planner(found), np.asarray(found.model.blocked), world.truth, scored, demonstrations.visited_state_goals()
     )
     return {
-        **scores,
+        **scores.to_dict(),
         "objective": found.final.objective,
         "converged": found.converged,
         "message": found.message,
