@@ -211,7 +211,7 @@ def print_table(title: str, records: Sequence[Record], columns: Mapping[str, str
         table.add_column(name, justify="left" if text else "right", no_wrap=True)
     for record in records:
         table.add_row(*(_cell(record, column) for column in columns.values()))
-    Console(width=None if sys.stdout.isatty() else 180, highlight=False, markup=False).print(title, table)
+    Console(width=None if sys.stdout.isatty() else 250, highlight=False, markup=False).print(title, table)
 
 
 def _cell(record: Record, column: str) -> str:

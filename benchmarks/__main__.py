@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import MISSING, asdict, fields
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType, NoneType
+from types import NoneType
 from typing import Any, get_args, get_type_hints
 
 from benchmarks import Record, note
@@ -17,6 +17,10 @@ from sidestep.errors import SidestepError
 
 BENCHMARKS = {
     "startup": "whole processes of the command line, in units of one that imports JAX",
+    "scaling": "the cost of a gradient against the size of the map",
+    "gradients": "a gradient by the adjoint, beside other ways to it",
+    "planning": "plans and soft values, beside other planners",
+    "rollouts": "roll-outs of continuous worlds: speed, and the noise of gradient estimators",
 }
 
 
@@ -34,6 +38,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(f"{first.prog} {chosen.name}", description=module.__doc__, formatter_class=raw)
     for key, how in _arguments(module):
         parser.add_argument(key, **how)
+    if parser.parse_args(chosen.options).quick:
+        parser.set_defaults(
+            **{each.name: quick for each in fields(module.Options) if (quick := each.metadata["quick"])}
+        )
     try:
         return run(module, parser.parse_args(chosen.options), parser)
     except SidestepError as error:
@@ -41,12 +49,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
 
 
-def run(module: ModuleType, parsed: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
+def run(module: Any, parsed: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
     """Measure (or read records), print, draw and write what is asked for."""
     values = vars(parsed)
     for each in fields(module.Options):
-        if values["quick"] and each.metadata["quick"] is not None:
-            values[each.name] = each.metadata["quick"]
         numbers = values[each.name] if isinstance(values[each.name], list) else [values[each.name]]
         if any(type(number) is int and number < each.metadata["least"] for number in numbers):
             parser.error(f"--{each.name.replace('_', '-')}: expected at least {each.metadata['least']}")
@@ -69,7 +75,7 @@ def run(module: ModuleType, parsed: argparse.Namespace, parser: argparse.Argumen
     return 0
 
 
-def _arguments(module: ModuleType) -> list[tuple[str, dict[str, Any]]]:
+def _arguments(module: Any) -> list[tuple[str, dict[str, Any]]]:
     """Return the options that all benchmarks have, and those of a module's `Options`."""
     arguments: list[tuple[str, dict[str, Any]]] = [
         ("--json", {"type": Path, "metavar": "FILE", "help": "write the records"}),

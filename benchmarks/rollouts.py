@@ -1,172 +1,406 @@
 """Roll-outs: how fast they are, what an update of a model takes, and how noisy the estimators of eq. 11 are.
 
-    python benchmarks/rollouts.py
-    python benchmarks/rollouts.py --part noise --horizons 5 10 20 40 80 --problems "pendulum, upright"
-    python benchmarks/rollouts.py --quick
+    python -m benchmarks rollouts --part noise --horizons 5 10 20 40 80 --problems "pendulum, upright"
 
-**Speed.** The room and the pendulum of `sidestep experiment`, with the experiments' own planners and batches; the
-demonstrations are made up, for what they say makes no difference here. An *update* is an iteration of `fit`, from
-one report to the next: one step of the model, the policy and its critic. Its parts are compiled and timed by
-themselves: the roll-outs; the model's gradient (`value_gradient` with its surprises, less the roll-outs); the policy's;
-the critic's. What the whole shares among them it computes once, so the parts need not add up to it. Steps are those of
-single roll-outs.
+Speed. The room and the pendulum of `sidestep experiment`, with the experiments' own planners and batches; the walks are
+made up, since their content does not change the time. An *update* is an iteration of `fit`, from one report to the
+next: one step of the model, the policy and its critic. Its parts are compiled and timed by themselves: the roll-outs;
+the model's gradient (`value_gradient`, less the roll-outs); the policy's; the critic's. The whole computes once what
+the parts share, so the parts need not add up to it. Steps are those of single roll-outs. With `--quick` the compiler
+hardly optimizes, so times mean nothing.
 
-**Noise.** One roll-out gives one estimate of ∇_θ Q^π(s, a): by score, by score with a critic, along the path (with a
-critic for the draws of the policy, as in a fit). Told are the standard deviation of one such estimate (a norm over
-parameters, the root of the mean square over 16 places), what it is relative to the pathwise one, how many roll-outs it
-takes until the standard deviation of their mean is a tenth of the gradient's norm, the time for one, and how far the
-mean over all lies from that of the least noisy estimator, in standard errors (the largest of the parameters): all are
-unbiased, so this should hardly be above 3, unless a few rare roll-outs make up the mean. The problems stand in
-`rollout_noise.py`: linear dynamics that turn by 0.3 and shrink to 0.9 or grow to 1.05 a move, with a Gaussian policy
-(∇ by six parameters); a pendulum held where it hangs, or upright, with five torques (∇ by the logarithm of gravity).
+Noise. One roll-out gives one estimate of ∇_θ Q^π(s, a): by score, by score with a critic, along the path (with a critic
+for the draws of the policy, as in a fit). Shown are the standard deviation of one estimate (a norm over parameters, the
+root of the mean square over 16 places), its ratio to the pathwise one, how many roll-outs bring the standard deviation
+of their mean to a tenth of the gradient's norm, the time for one, and how far the mean of all is from that of the least
+noisy estimator, in standard errors (the largest over parameters). All are unbiased, so that is hardly above 3, unless
+few rare roll-outs make up the mean. Problems: linear dynamics that turn by 0.3 and shrink to 0.9 or grow to 1.05 a
+move, with a Gaussian policy (six parameters); a pendulum held where it hangs, or upright, with five torques (the
+logarithm of gravity). The policy is that of agents who look as far ahead as the longest roll-outs, so it is the same
+for all lengths; each length has a critic of its own for it.
 
-Everything is compiled before it is timed, takes turns in one process, and medians are told. With `--quick` the compiler
-hardly optimises, so its times say nothing.
-
-Records (`--json`): for speed `part`, `name`, `estimator`, `roll_outs` (a batch), `horizon`, `steps_per_second`,
-`update_seconds`, `roll_outs_seconds`, `model_seconds`, `policy_seconds`, `critic_seconds`; for noise `part`, `name`,
-`problem`, `horizon`, `deviation`, `relative`, `gradient`, `roll_outs_needed`, `seconds`, `split_by_person`.
+Records: `part`, `name`, `horizon`; for speed `estimator`, `roll_outs` (a batch), `steps_per_second`, and `..._seconds`
+of `update`, `roll_outs`, `model`, `policy`, `critic`; for noise `problem`, `deviation`, `relative`, `gradient`,
+`roll_outs_needed`, `seconds`, `errors_from_best`.
 """
 
-import argparse
-import sys
-from collections.abc import Sequence
-from typing import Any
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, PRNGKeyArray, PyTree
 
-from measuring import argument_parser, main, milliseconds, note, number, print_table, write_records
-from rollout_noise import PROBLEMS, Noise, measured, planned, problem_of
-from rollout_speed import CASES, timed
+from benchmarks import Record, in_turns, median, note, option, print_table, seconds_of
+from sidestep.continuous import (
+    ContinuousTask,
+    Critic,
+    Dynamics,
+    FinitePolicy,
+    Hold,
+    LinearGaussian,
+    ObstacleMotion,
+    Pendulum,
+    Planner,
+    Planning,
+    Policy,
+    QuadraticTask,
+    RollOut,
+    Schedule,
+    finite_policy,
+    fit,
+    gather,
+    gaussian_policy,
+    plan,
+    radial_field,
+    roll_outs,
+    stack,
+    value_gradient,
+)
+from sidestep.continuous.estimators import Estimator
+from sidestep.continuous.tasks import task_at
+from sidestep.experiments import pendulum as pendulum_experiment
+from sidestep.experiments import room as room_experiment
+from sidestep.tabular.backups import Behavior, LogSumExp
+from sidestep.tabular.demonstrations import Demonstrations, Trajectory
+from sidestep.worlds.continuous_room import room, starts
 
-Record = dict[str, Any]
+CASES = ("room, score", "pendulum, score", "pendulum, pathwise")
+WALKERS, WIDTH = 25, 48
+AGENTS, DISCOUNT = Behavior(LogSumExp(), 2.0), 0.95
+ESTIMATORS = ("score", "score and critic", "pathwise")
+PROBLEMS = ("linear, stable", "linear, unstable", "pendulum, hanging", "pendulum, upright")
+PLACES, STARTS, UNMOVED = 16, 128, 1e-30
+PLANNER = Planner(horizon=1, places=16, samples=2, options=4, learning_rate=0.02, critic_rate=0.01, critic_width=32)
 
 
-def noise_records(name: str, horizons: Sequence[int], arguments: argparse.Namespace) -> list[Record]:
-    """The records of one problem."""
-    problem, longest = problem_of(name), max(horizons)
-    note(f"{name}: finding a policy")
-    policy, critic = planned(problem, longest, arguments.steps)
+@dataclass
+class Options:
+    """The options of this benchmark."""
+
+    part: str = option("both", "one of the two only", choices=("both", "speed", "noise"))
+    cases: list[str] = option(list(CASES), "fits", quick=[CASES[-1]], choices=CASES)
+    iterations: int = option(20, "updates a turn", quick=1)
+    turns: int = option(5, "how often everything is timed", quick=1)
+    problems: list[str] = option(list(PROBLEMS), "problems of the noise", quick=[PROBLEMS[0]], choices=PROBLEMS)
+    horizons: list[int] = option([5, 10, 20, 40], "lengths of roll-outs", quick=[10])
+    samples: int = option(256, "roll-outs from each of 16 places, a turn", quick=64)
+    steps: int = option(300, "of the policy and the critic", quick=10)
+    hardly_optimized: bool = option(False, "compile fast", quick=True)
+
+
+def measure(options: Options) -> Iterator[Record]:
+    """Yield a record for each fit, and for each problem, horizon and estimator."""
+    if options.hardly_optimized:
+        jax.config.update("jax_disable_most_optimizations", True)
+    for name in options.cases if options.part != "noise" else ():
+        yield speed(name, options)
+    for name in options.problems if options.part != "speed" else ():
+        yield from noise(name, options)
+
+
+# ---------------------------------------------------------------------------------------------------- speed
+
+
+class Case(NamedTuple):
+    """A fit: its dynamics, demonstrations, agents, policy, planner, moves in a batch and estimator."""
+
+    dynamics: Dynamics
+    demonstrations: Demonstrations
+    behavior: Behavior
+    policy: FinitePolicy
+    planner: Planner
+    moves: int
+    estimator: Estimator
+
+
+class Batch(eqx.Module):
+    """What one update looks at."""
+
+    tasks: ContinuousTask
+    states: Array
+    chosen: Array
+    choices: Array
+    weights: Array
+
+
+def case_of(name: str) -> Case:
+    """Return the fit of that name."""
+    world, estimator = name.split(", ")
+    random, kind = np.random.default_rng(0), room_experiment if world == "room" else pendulum_experiment
+    if world == "room":
+        rooms, behavior = room(), room_experiment.people()
+        known, tasks, actions, begins = rooms.dynamics, rooms.tasks, rooms.actions, starts(rooms, WALKERS, random)
+        centers = (room_experiment.CENTRES, room_experiment.CENTRES)
+        field = radial_field(known.low, known.high, centers, room_experiment.PRIOR_MEAN)
+        dynamics = ObstacleMotion(field, known.low, known.high, known.noise)
+    else:
+        dynamics = Pendulum(noise=pendulum_experiment.NOISE)
+        behavior, goals = Behavior(LogSumExp(), pendulum_experiment.BETA), pendulum_experiment.GOALS
+        tasks = [Hold(jnp.asarray(goal), jnp.asarray(pendulum_experiment.DISCOUNT)) for goal in goals]
+        actions = jnp.asarray(pendulum_experiment.TORQUES)[:, None]
+        begins = [np.array([goal, 0.0]) + random.uniform(-1, 1, (WALKERS, 2)) for goal in goals]
+    states, task = jnp.asarray(np.concatenate(begins)), jnp.repeat(jnp.arange(len(tasks)), WALKERS)
+    seen = jax.vmap(lambda task, state: task.features(state))(task_at(stack(tasks), task), states)
+    policy = finite_policy(jax.random.key(0), actions, seen, width=WIDTH)
+    trajectories = [
+        Trajectory(np.stack([state, state + random.normal(0, 0.1, 2)]), random.integers(len(actions), size=1), index)
+        for state, index in zip(np.asarray(states), task.tolist(), strict=True)
+    ]
+    by: Estimator = "pathwise" if estimator == "pathwise" else "score"
+    return Case(dynamics, gather(trajectories, tasks), behavior, policy, kind.PLANNER, kind.SCHEDULE.moves, by)
+
+
+def speed(name: str, options: Options) -> Record:
+    """Return the record of one fit: medians over turns, in each of which a fit goes on for some iterations."""
+    case, key = case_of(name), jax.random.key(2)
+    planner, demos = case.planner, case.demonstrations
+    drawn = jax.random.choice(key, len(demos), (case.moves,), replace=False)
+    tasks, states = task_at(demos.tasks, demos.task[drawn]), demos.states[drawn]
+    note(f"{name}: compiling")
+    planning, _ = _fitted(case, options.iterations)
+    choices, weights = planner.tried(key, case.policy, tasks, states)
+    batch = Batch(tasks, states, demos.actions[drawn], choices, weights)
+    rolled = _roll(case, batch, key)
+
+    def timed(function: Callable, *given: object) -> Callable[[], float]:
+        return lambda: seconds_of(lambda: jax.block_until_ready(function(case, *given)))
+
+    calls = {
+        "update": lambda: _fitted(case, options.iterations)[1],
+        "roll_outs": timed(_roll, batch, key),
+        "both": timed(_model_gradient, planning, batch, key),
+        "policy": timed(_policy_step, planning, batch, rolled),
+        "critic": timed(_critic_step, planning, batch, rolled),
+    }
+    for part in ("both", "policy", "critic"):  # the others are compiled by now
+        calls[part]()
+    note(f"{name}: timing")
+    seconds = {part: median(taken) or 0.0 for part, taken in in_turns(calls, options.turns).items()}
+    seconds["model"] = seconds.pop("both") - seconds["roll_outs"]
+    return {
+        "part": "speed",
+        "name": name.split(", ")[0],
+        "estimator": case.estimator,
+        "roll_outs": int(np.prod(rolled.acting.shape[:-1])),
+        "horizon": planner.horizon,
+        "steps_per_second": rolled.acting.size / seconds["roll_outs"],
+        **{f"{part}_seconds": value for part, value in seconds.items()},
+    }
+
+
+def _fitted(case: Case, iterations: int) -> tuple[Planning[FinitePolicy], float]:
+    """Return what a fit knows in the end, and the median time between reports (the first comes after compiling)."""
+    reported: list[float] = []
+    result = fit(
+        case.dynamics,
+        case.demonstrations,
+        case.behavior,
+        case.policy,
+        case.planner,
+        estimator=case.estimator,
+        schedule=Schedule(iterations=1 + iterations, rehearsals=0, moves=case.moves),
+        report=lambda *_: reported.append(time.perf_counter()),
+    )
+    return result.planning, float(np.median(np.diff(reported)))
+
+
+@eqx.filter_jit
+def _roll(case: Case, batch: Batch, key: PRNGKeyArray) -> RollOut:
+    given = (case.dynamics, case.policy, batch.tasks, case.behavior, key, batch.states)
+    return roll_outs(*given, case.planner.horizon, batch.choices, case.planner.samples)
+
+
+@eqx.filter_jit
+def _model_gradient(case: Case, planning: Planning[FinitePolicy], batch: Batch, key: PRNGKeyArray) -> PyTree:
+    """Return ∇ of the actions' log-likelihood, with the roll-outs that it takes."""
+    behavior, planner = case.behavior, case.planner
+
+    def weigh(q: Array) -> Array:
+        return behavior.beta * (jax.nn.one_hot(batch.chosen, q.shape[1]) - jnp.exp(behavior.log_policy(q)))
+
+    given = (case.dynamics, planning.policy, batch.tasks, behavior, key, batch.states, batch.choices, weigh)
+    how = {"critic": planning.critic, "estimator": case.estimator}
+    return value_gradient(*given, horizon=planner.horizon, samples=planner.samples, **how)[0]
+
+
+@eqx.filter_jit
+def _policy_step(case: Case, planning: Planning, batch: Batch, rolled: RollOut) -> PyTree:
+    """Return the policy after a step; the compiler leaves out the critic's."""
+    return case.planner.improve(planning, batch.tasks, case.behavior, rolled, batch.weights)[0].policy
+
+
+@eqx.filter_jit
+def _critic_step(case: Case, planning: Planning, batch: Batch, rolled: RollOut) -> Critic:
+    """Return the critic after a step; the compiler leaves out the policy's."""
+    return case.planner.improve(planning, batch.tasks, case.behavior, rolled, batch.weights)[0].critic
+
+
+# ---------------------------------------------------------------------------------------------------- noise
+
+
+class Problem(eqx.Module):
+    """Dynamics with a gradient to estimate, a task in them, states where roll-outs may start, and a policy."""
+
+    dynamics: Dynamics
+    task: ContinuousTask
+    states: Array
+    policy: Policy
+
+
+class Noise(NamedTuple):
+    """What many estimates of the same gradients show.
+
+    Attributes:
+        mean: Over all of them, for each parameter.
+        error: Its standard error.
+        deviation: The standard deviation of one estimate, as a norm over parameters.
+        square: The squared norm of the gradient, the mean over places.
+        seconds: For one roll-out and its gradient, the median over turns.
+    """
+
+    mean: np.ndarray
+    error: np.ndarray
+    deviation: float
+    square: float
+    seconds: float
+
+    def errors_from(self, other: "Noise") -> float:
+        """Return how far two means differ, in standard errors, at most over parameters; 0 of a mean and itself."""
+        error = np.sqrt(self.error**2 + other.error**2)
+        return float(np.max(np.abs(self.mean - other.mean) / np.where(error > 0, error, 1.0)))
+
+
+def problem_of(name: str) -> Problem:
+    """Return the problem of that name, its policy as it begins."""
+    kind, place = name.split(", ")
+    random, discount = np.random.default_rng(0), jnp.asarray(DISCOUNT)
+    if kind == "linear":
+        growth = 0.9 if place == "stable" else 1.05
+        turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+        dynamics = LinearGaussian(jnp.asarray(growth * turn), jnp.array([[0.0], [0.5]]), jnp.full(2, 0.1))
+        task = QuadraticTask(jnp.zeros(2), jnp.eye(2), 0.1 * jnp.eye(1), discount)
+        states = jnp.asarray(random.uniform(-1, 1, (STARTS, 2)))
+        examples = jax.vmap(task.features)(states)
+        return Problem(dynamics, task, states, gaussian_policy(jax.random.key(1), 1, examples, spread=0.5, depth=0))
+    angle = np.pi if place == "hanging" else 0.0
+    task = Hold(jnp.asarray(angle), discount)
+    states = jnp.asarray(np.array([angle, 0.0]) + random.uniform(-0.4, 0.4, (STARTS, 2)))
+    examples, torques = jax.vmap(task.features)(states), jnp.linspace(-2.0, 2.0, 5)[:, None]
+    return Problem(Pendulum(), task, states, finite_policy(jax.random.key(1), torques, examples, width=32))
+
+
+def planned(problem: Problem, horizon: int, steps: int, *, moving: bool = True) -> tuple[Policy, Critic]:
+    """Return a policy for the problem and a critic for the policy; unless `moving`, the policy stays as it is."""
+    planner = replace(PLANNER, horizon=horizon, learning_rate=PLANNER.learning_rate if moving else UNMOVED)
+    tasks, task = stack([problem.task]), jnp.zeros(STARTS, jnp.int32)
+    result = plan(problem.dynamics, tasks, AGENTS, problem.policy, problem.states, task, planner, steps=steps)
+    return result.policy, result.planning.critic
+
+
+def noise(name: str, options: Options) -> Iterator[Record]:
+    """Yield the records of one problem."""
+    problem, longest = problem_of(name), max(options.horizons)
+    note(f"{name}: computing a policy")
+    policy, critic = planned(problem, longest, options.steps)
     problem = eqx.tree_at(lambda whole: whole.policy, problem, policy)
-    records = []
-    for horizon in horizons:
+    for horizon in options.horizons:
         note(f"{name}: horizon {horizon}")
-        own = critic if horizon == longest else planned(problem, horizon, arguments.steps, moving=False)[1]
-        records += records_of(name, horizon, measured(problem, own, horizon, arguments.samples, arguments.turns))
-    return records
+        own = critic if horizon == longest else planned(problem, horizon, options.steps, moving=False)[1]
+        yield from noise_records(name, horizon, measured(problem, own, horizon, options))
 
 
-def records_of(name: str, horizon: int, noise: dict[str, Noise]) -> list[Record]:
-    """The records of all estimators at one horizon; the gradient's norm is by the least noisy of them."""
+def noise_records(name: str, horizon: int, noise: dict[str, Noise]) -> Iterator[Record]:
+    """Yield the records of all estimators at one horizon; the gradient's norm is by the least noisy of them."""
     best = min(noise.values(), key=lambda each: each.deviation)
-    known = best.square > 0
-    return [
-        {
+    for estimator, own in noise.items():
+        yield {
             "part": "noise",
             "name": estimator,
             "problem": name,
             "horizon": horizon,
             "deviation": own.deviation,
             "relative": own.deviation / noise["pathwise"].deviation,
-            "gradient": float(np.sqrt(best.square)) if known else None,
-            "roll_outs_needed": 100 * own.deviation**2 / best.square if known else None,
+            "gradient": float(np.sqrt(best.square)) if best.square > 0 else None,
+            "roll_outs_needed": 100 * own.deviation**2 / best.square if best.square > 0 else None,
             "seconds": own.seconds,
-            "apart": split_by_person(own, best),
+            "errors_from_best": own.errors_from(best),
         }
-        for estimator, own in noise.items()
-    ]
 
 
-def split_by_person(one: Noise, other: Noise) -> float:
-    """How far two means differ, in standard errors, at most over parameters; 0 of a mean and itself."""
-    error = np.sqrt(one.error**2 + other.error**2)
-    return float(np.max(np.abs(one.mean - other.mean) / np.where(error > 0, error, 1.0)))
+def measured(problem: Problem, critic: Critic, horizon: int, options: Options) -> dict[str, Noise]:
+    """Return what each of the estimators shows, all with the same random numbers."""
+    gradients: dict[str, list[np.ndarray]] = {name: [] for name in ESTIMATORS}
+    keys = jax.random.key(2)
+    drawing = jax.random.split(jax.random.fold_in(keys, 0), PLACES)
+    choices = jax.vmap(problem.policy.sample)(drawing, jax.vmap(problem.task.features)(problem.states[:PLACES]))
+
+    def call(name: str) -> float:
+        key = jax.random.fold_in(keys, 1 + len(gradients[name]))
+        own, estimator = (None if name == "score" else critic), ("pathwise" if name == "pathwise" else "score")
+        started = time.perf_counter()
+        gradients[name].append(np.asarray(_estimates(problem, own, estimator, key, choices, horizon, options.samples)))
+        return (time.perf_counter() - started) / (options.samples * PLACES)
+
+    taken = in_turns({name: lambda name=name: call(name) for name in ESTIMATORS}, 1 + options.turns)
+    # the first call of each was compiled in
+    return {name: noise_of(np.concatenate(gradients[name], axis=1), median(taken[name][1:])) for name in ESTIMATORS}
 
 
-def print_speed(records: Sequence[Record]) -> None:
-    """The table of the first part."""
-    parts = ("update", "roll_outs", "model", "policy", "critic")
-    columns = ("fit", "estimator", "roll-outs", "horizon", "steps/s", "update", "rolling", "model", "policy", "critic")
-    print_table(
-        "Updates and their parts, each timed by itself; ms",
-        columns,
-        [
-            (
-                record["name"],
-                record["estimator"],
-                str(record["roll_outs"]),
-                str(record["horizon"]),
-                number(record["steps_per_second"], ",.0f"),
-                *(milliseconds(record[f"{part}_seconds"]) for part in parts),
-            )
-            for record in records
-        ],
-        left=("fit", "estimator"),
-    )
+@eqx.filter_jit
+def _estimates(
+    problem: Problem,
+    critic: Critic | None,
+    by: Estimator,
+    key: PRNGKeyArray,
+    choices: Array,
+    horizon: int,
+    samples: int,
+) -> Array:
+    """Return the gradient that each roll-out gives by itself: places × samples × parameters."""
+    tasks = stack([problem.task])
+
+    def one(state: Array, choice: Array, key: PRNGKeyArray) -> Array:
+        given = (problem.dynamics, problem.policy, tasks, AGENTS, key, state[None], choice[None, None], jnp.ones_like)
+        return ravel_pytree(value_gradient(*given, horizon=horizon, samples=1, critic=critic, estimator=by)[0])[0]
+
+    keys = jax.random.split(key, (PLACES, samples))
+    return jax.vmap(jax.vmap(one, (None, None, 0)))(problem.states[:PLACES], choices, keys)
 
 
-def print_noise(records: Sequence[Record]) -> None:
-    """The table of the second part, and where the pathwise estimator is the noisier one."""
-    print_table(
-        "One roll-out's gradient: standard deviation, and how many it takes for an error of 10 %",
-        ("problem", "horizon", "estimator", "deviation", "× pathwise", "‖gradient‖", "needed", "µs each", "apart"),
-        [
-            (
-                record["problem"],
-                str(record["horizon"]),
-                record["name"],
-                number(record["deviation"]),
-                number(record["relative"], ".3g"),
-                number(record["gradient"], ".3g"),
-                number(record["roll_outs_needed"], ",.0f"),
-                number(1e6 * record["seconds"], ".1f"),
-                number(record["apart"], ".1f"),
-            )
-            for record in records
-        ],
-        left=("problem", "estimator"),
-    )
-    worse = [
-        f"{record['problem']} at {record['horizon']}"
-        for record in records
-        if record["name"] == "score and critic" and record["relative"] < 1
-    ]
-    print("Noisier along the path than by score and critic: " + ("; ".join(worse) or "nowhere") + ".")
+def noise_of(gradients: np.ndarray, seconds: float | None) -> Noise:
+    """Return what estimates of the gradients of several places show (places × samples × parameters)."""
+    places, samples, _ = gradients.shape
+    means, variances = gradients.mean(axis=1), gradients.var(axis=1, ddof=1)
+    variance = float(variances.sum(axis=-1).mean())
+    # the squares of means hold a part of their variance
+    square = float((means**2).sum(axis=-1).mean()) - variance / samples
+    error = np.sqrt(variances.mean(axis=0) / (places * samples))
+    return Noise(means.mean(axis=0), error, float(np.sqrt(variance)), square, seconds or 0.0)
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Measures, prints and writes what the arguments ask for."""
-    if arguments.quick:
-        jax.config.update("jax_disable_most_optimizations", True)
-        arguments.cases, arguments.problems, arguments.horizons = CASES[-1:], PROBLEMS[:1], [10]
-        arguments.turns, arguments.iterations, arguments.steps, arguments.samples = 1, 1, 10, 64
-    records: list[Record] = []
-    if arguments.part != "noise":
-        speed = [timed(name, arguments.turns, arguments.iterations) for name in arguments.cases]
-        print_speed(speed)
-        records += speed
-    if arguments.part != "speed":
-        noise = [each for name in arguments.problems for each in noise_records(name, arguments.horizons, arguments)]
-        print_noise(noise)
-        records += noise
-    write_records(arguments, records)
+# ---------------------------------------------------------------------------------------------------- reporting
 
 
-def _arguments() -> argparse.Namespace:
-    parser = argument_parser("Roll-outs: speed, and the noise of the estimators.", "one fit, one problem, one horizon")
-    add = parser.add_argument
-    add("--part", choices=("speed", "noise"), help="one of the two only")
-    add("--cases", nargs="+", choices=CASES, default=list(CASES), metavar="FIT", help=f"of {CASES}")
-    add("--iterations", type=int, default=20, help="updates a turn")
-    add("--turns", type=int, default=5)
-    add("--problems", nargs="+", choices=PROBLEMS, default=list(PROBLEMS), metavar="PROBLEM", help=f"of {PROBLEMS}")
-    add("--horizons", type=int, nargs="+", default=[5, 10, 20, 40])
-    add("--samples", type=int, default=256, help="roll-outs from each of 16 places, a turn")
-    add("--steps", type=int, default=300, help="of the policy and the critic")
-    return parser.parse_args()
-
-
-if __name__ == "__main__":
-    sys.exit(main(run, _arguments()))
+def show(records: Sequence[Record], options: Options) -> None:
+    """Print a table for each part, and where the pathwise estimator is the noisier one."""
+    speeds, noises = ([r for r in records if r["part"] == part] for part in ("speed", "noise"))
+    if speeds:
+        columns = {"fit": "name", "estimator": "estimator", "roll-outs": "roll_outs", "horizon": "horizon"}
+        columns |= {"steps/s": "steps_per_second ,.0f"}
+        columns |= {part: f"{part}_seconds ms" for part in ("update", "roll_outs", "model", "policy", "critic")}
+        print_table("updates and their parts, each timed by itself; ms", speeds, columns)
+    if noises:
+        columns = {"problem": "problem", "horizon": "horizon", "estimator": "name", "deviation": "deviation .4g"}
+        columns |= {"× pathwise": "relative .3g", "‖gradient‖": "gradient .3g", "needed": "roll_outs_needed ,.0f"}
+        columns |= {"µs each": "seconds µs", "errors from best": "errors_from_best .1f"}
+        title = "one roll-out's gradient: standard deviation, and how many it takes for an error of 10 %"
+        print_table(title, noises, columns)
+        worse = [r for r in noises if r["name"] == "score and critic" and r["relative"] < 1]
+        names = "; ".join(f"{record['problem']} at {record['horizon']}" for record in worse)
+        print(f"noisier along the path than by score and critic: {names or 'none'} ({options.samples} samples)")

@@ -1,153 +1,223 @@
 """How the cost of a gradient grows with the map, in units of one shortest-path search on the same map.
 
-    python benchmarks/scaling.py
-    python benchmarks/scaling.py --sizes 256 1024 --backups boltzmann --tolerance 1e-8
+    python -m benchmarks scaling --sizes 256 1024 --backups boltzmann --tolerance 1e-8
 
-On offices of 64² to 2048² cells with rooms and doors, every cell's P(blocked) unknown to the learner and by now about
-.98 on walls and .02 elsewhere, ten walkers pursue one goal at a step cost of 1 (β = 5, γ = .9999). What is timed is the
-value and gradient of the walkers' action log-likelihood with respect to all cells' parameters, as a fit computes it:
+The map is an office of 64² to 2048² cells. The learner does not know any cell: by now P(blocked) is about .98 on walls
+and .02 elsewhere (logits ±3.9, with noise of .3), as after a fit to many walks. Ten walkers pursue one goal at a step
+cost of 1 (β = 5, γ = .9999). What is timed is the value and gradient of their action log-likelihood with respect to the
+parameters of all cells, as a fit computes it:
 
-- **cold**: starting from nothing;
-- **warm**: after a step of an optimiser, starting from what the solve before it left (values, order, adjoint). The step
-  is along the gradient, its largest component `--step` long; with `--step-by-sign` every component is that long;
-- **region**: the same, but that only the states are solved that mattered to the solve before (`GaussSeidel` alone
-  leaves
-  the others out), as a fit of a large map does where it tries a step that changes little;
-- **Dijkstra**: `scipy.sparse.csgraph.dijkstra` from the goal over the expected cost of every move, the matrix given.
+- cold: from nothing;
+- warm: after a step of an optimizer, from what the solve before left (values, order, adjoint). The step is along the
+  gradient, its largest component `--step` long; with `--step-by-sign` every component is that long;
+- region: the same, restricted to the states that mattered to the solve before (Gauss–Seidel only), as a fit of a
+  large map does where it tries a step that changes little;
+- Dijkstra: `scipy.sparse.csgraph.dijkstra` from the goal over the expected cost of every move, the matrix given.
 
-All of these take turns in one process and medians count. Peak memory is that of a process of its own that builds the
-problem and takes a gradient of each kind: the largest resident set of the whole process, imports and compiler
-included, and its excess over what was held after the imports.
+Memory is that of a process of its own that takes a gradient of each kind. The exponent is that of the power law through
+the times from 128² cells on, and the largest between two sizes in a row.
 
-The **exponent** is that of the power law through the times from 128² cells on, and the worst one between two sizes
-in a row. Sizes are timed one after another, so on a machine that others use too the exponents of the units tell more:
-they are by how much more than Dijkstra's a gradient's cost grows.
-
-Records (`--json`): `name` (solver), `backup`, `cells`, `tasks`, `cold_seconds`, `warm_seconds`, `region_seconds`,
-`dijkstra_seconds` (medians), `cold_units`, `warm_units`, `region_units` (medians over turns of the ratio to the same
-turn's Dijkstra), `best_...` (the fastest turn), `cold_sweeps`, `warm_sweeps`, `region_sweeps`, `region` (the share of
-the states that mattered), `region_error` (the largest difference between its gradient and the warm one, as a share of
-the largest component; null if other states were seen to matter), `converged`, `tolerance`, `step` (its largest
-component), `moves`, `turns`, `peak_bytes` (the whole process), `imports_bytes` (held after imports), `excess_bytes`
-(what the peak exceeds that by), `gradient_bytes` (peak while the gradients are taken, compilation included, less what
-was held before) and `building_bytes` (the peak before that). Beside them `exponents`: `name, backup, kind, fitted,
-worst`.
+Records: `name` (solver), `backup`, `cells`, `tasks`, `moves`, `tolerance`, `step`, `turns`; for each kind and Dijkstra
+`..._seconds` (median), `best_..._seconds`, `..._units` (median ratio to Dijkstra in the same turn), `..._sweeps`;
+`region` (fraction of states that mattered), `region_error` (largest difference between its gradient and the warm one,
+relative to the largest component; null if other states mattered by then), and the fields of `benchmarks.peak_memory`.
 """
 
-import argparse
-import json
-import sys
-import tempfile
-import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array
+from matplotlib.figure import Figure
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-import measuring
+from benchmarks import MEMORY, Record, groups, in_turns, median, median_ratio, note, option, peak_memory, print_table
+from benchmarks import seconds_of as seconds
 from sidestep.errors import NotConverged
-from sidestep.tabular.backups import BACKUPS, Behavior, Gradient
-from sidestep.tabular.demonstrations import Demonstrations
+from sidestep.tabular.backups import BACKUPS, Behavior
+from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
+from sidestep.tabular.graph import walkable_graph
+from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.likelihood import Choices, choice_log_likelihood, choices_of
-from sidestep.tabular.models import TransitionModel
+from sidestep.tabular.models import ObstacleGrid, TransitionModel
 from sidestep.tabular.solve import Solution, SolveOptions
-from sidestep.tabular.solvers.base import Solver, WarmStart
+from sidestep.tabular.solvers.base import WarmStart
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
-from sidestep.tabular.tasks import Task
-from worlds import World, expected_costs, half_learned_office, load
+from sidestep.tabular.tasks import Task, reach
+from sidestep.worlds.offices import connected_cells, office
 
-SOLVERS = {"ordered": GaussSeidel, "jacobi": Jacobi}
+SOLVERS = {"gauss-seidel": GaussSeidel, "jacobi": Jacobi}
+KINDS = ("cold", "warm", "region")
 FROM_CELLS = 128**2
-"""From how many cells on the exponent is fitted: below, what a call costs whatever the map shows."""
+"""From how many cells on the exponent is fitted; below, the overhead of a call counts."""
+SURE, NOISE = 3.9, 0.3
+MARKERS = "os^Dv<>PX*hpd8"
+
+
+@dataclass
+class GradientOptions:
+    """The options of what is differentiated."""
+
+    backups: list[str] = option(["boltzmann", "logsumexp"], "names of backups", choices=sorted(BACKUPS))
+    beta: float = option(5.0, "inverse temperature of the walkers")
+    discount: float = option(0.9999, "γ")
+    step_cost: float = option(1.0, "a cost for every move")
+    goal_pays: bool = option(False, "no cost for moves; the goal pays 1")
+    tolerance: float = option(1e-7, "relative change at which a solve stops")
+    step: float = option(0.1, "the optimizer's step before the warm gradient, in logits")
+    step_by_sign: bool = option(False, "the same step for every parameter, as Adam's first")
+    turns: int = option(7, "how often everything is timed", quick=3)
+    budget: float = option(8.0, "seconds after which a method takes no more than three turns", quick=1.0)
+    seed: int = option(0, "draws maps, walks and parameters", least=0)
+
+
+@dataclass
+class Options(GradientOptions):
+    """The options of this benchmark."""
+
+    sizes: list[int] = option([64, 128, 256, 512, 1024, 2048], "N × N cells", quick=[64, 128, 256])
+    solvers: list[str] = option(list(SOLVERS), "names of solvers", choices=SOLVERS)
+    jacobi_limit: int = option(128, "largest N for Jacobi's sweeps over all states")
+    tasks: int = option(1, "how many goals")
+    walks: int = option(10, "walks to each goal")
+    memory_from: int = option(0, "smallest N whose memory is measured", quick=256, least=0)
+
+
+# ---------------------------------------------------------------------------------------------------- the problem
+
+
+class World(NamedTuple):
+    """An office of size × size cells: logits of P(blocked), a goal (state) for each task, the states of each walk."""
+
+    size: int
+    logits: np.ndarray
+    goals: np.ndarray
+    walks: list[tuple[int, np.ndarray]]  # each with its task
+
+    @property
+    def model(self) -> ObstacleGrid:
+        """The half-learned model."""
+        return ObstacleGrid(Grid.unknown(self.size, self.size), self.logits)
+
+    def tasks(self, discount: float, step_cost: float | None) -> list[Task]:
+        """Return the tasks of reaching each goal."""
+        return [reach(self.model.blank, int(goal), discount=discount, step_cost=step_cost) for goal in self.goals]
+
+    def demonstrations(self, discount: float, step_cost: float | None) -> Demonstrations:
+        """Return the walks with their tasks."""
+        steps = {tuple(step): action for action, step in enumerate(self.model.blank.steps.tolist())}
+        trajectories = []
+        for task, states in self.walks:
+            changes = np.diff(np.stack(np.divmod(states, self.size), axis=-1), axis=0)
+            trajectories.append(
+                Trajectory(states, np.array([steps[tuple(change)] for change in changes.tolist()]), task)
+            )
+        return gather(trajectories, self.tasks(discount, step_cost))
+
+    def dijkstra(self) -> Callable[[], float]:
+        """Return a call that times the searches from the goals, over moves backwards at their expected costs 1/P."""
+        successors = np.asarray(self.model.graph.successors)[:, :, 0]
+        moves = successors != np.arange(len(successors))[:, None]
+        first = np.concatenate([[0], np.cumsum(moves.sum(axis=1))]).astype(np.int32)
+        costs = 1 / np.asarray(self.model.probabilities())[:, :, 0][moves]
+        backwards = csr_array((costs, successors[moves], first), shape=(len(successors),) * 2).T.tocsr()
+        return lambda: seconds(lambda: [dijkstra(backwards, indices=int(goal)) for goal in self.goals])
+
+
+def half_learned_office(size: int, seed: int, walks: int = 10, goals: int = 1) -> World:
+    """Return an office with `walks` shortest walks to each of some goals, from free cells at random."""
+    truth = office(size, size, seed)
+    random = np.random.default_rng(seed)
+    wall = truth.known.reshape(-1) == Cell.OCCUPIED
+    logits = np.where(wall, SURE, -SURE) + NOISE * random.normal(size=truth.size)
+    graph, free = walkable_graph(truth), connected_cells(truth)
+    ends, walked = random.choice(free, goals, replace=False), []
+    for task, goal in enumerate(ends.tolist()):
+        before = dijkstra(graph, indices=goal, return_predecessors=True)[1]
+        for start in random.choice(np.setdiff1d(free, [goal]), walks).tolist():
+            states = [start]
+            while states[-1] != goal:
+                states.append(int(before[states[-1]]))
+            walked.append((task, np.asarray(states)))
+    return World(size, logits, ends, walked)
 
 
 class Problem(eqx.Module):
-    """What to differentiate, and how it is solved."""
+    """What is differentiated, and how it is solved."""
 
     model: TransitionModel
     demonstrations: Demonstrations
     choices: Choices
     behavior: Behavior
-    solver: Solver
-    gradient: Gradient = eqx.field(static=True, default="exact")
+    solving: SolveOptions
 
     def cold_start(self) -> WarmStart:
-        """The start when nothing is known of any task."""
-        start = self.solver.cold_start(self.model.graph.states, jnp.zeros(0).dtype)
+        """Return the start from which nothing is known of any task."""
+        assert self.solving.solver is not None
+        start = self.solving.solver.cold_start(self.model.graph.states, jnp.zeros(0).dtype)
         tasks = len(self.demonstrations.tasks.terminal)
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (tasks, *leaf.shape)), start)
+
+
+def problem_of(world: World, backup: str, options: GradientOptions, solver: str = "gauss-seidel") -> Problem:
+    """Return the problem in a world."""
+    demos = world.demonstrations(options.discount, None if options.goal_pays else options.step_cost)
+    solving = SolveOptions(solver=SOLVERS[solver](tolerance=options.tolerance))
+    return Problem(world.model, demos, choices_of(demos), Behavior(BACKUPS[backup](), options.beta), solving)
 
 
 class Step(NamedTuple):
     """A value and gradient, and how the solve went."""
 
-    value: Float[Array, ""]
-    gradient: Float[Array, "..."]
+    value: Array
+    gradient: Array
     start: WarmStart
-    sweeps: Int[Array, " tasks"]
-    converged: Bool[Array, ""]
-
-
-KINDS = ("cold", "warm", "region")
-"""The kinds of gradients that are timed."""
-
-
-def problem_of(world: World, name: str, backup: str, arguments: argparse.Namespace) -> Problem:
-    """The problem in a world."""
-    demos = world.demonstrations(arguments.discount, arguments.step_cost)
-    solver = SOLVERS[name](tolerance=arguments.tolerance)
-    return Problem(world.model, demos, choices_of(demos), Behavior(BACKUPS[backup](), arguments.beta), solver)
+    sweeps: Array
+    converged: Array
 
 
 @eqx.filter_jit
-def take(
-    problem: Problem, parameters: Float[Array, "..."], start: WarmStart, region: Bool[Array, "tasks states"]
-) -> Step:
-    """The action log-likelihood and its gradient, from a start; the new start holds the new adjoint.
-
-    Only the states of the region need be solved.
-    """
+def take(problem: Problem, parameters: Array, start: WarmStart, region: Array) -> Step:
+    """Return the action log-likelihood and its gradient; of each task, only the states of the region are solved."""
 
     def objective(parameters: Array, adjoint: Array) -> tuple[Array, tuple]:
         model, begun = problem.model.with_parameters(parameters), start._replace(adjoint=adjoint)
 
         def one(task: Task, choices: Choices, begun: WarmStart, region: Array) -> tuple[Array, Solution]:
-            how = {"options": SolveOptions(problem.gradient, solver=problem.solver), "region": region}
+            how = {"options": problem.solving, "region": region}
             return choice_log_likelihood(model, task, choices, problem.behavior, begun, **how)
 
-        values, found = jax.vmap(one)(problem.demonstrations.tasks, problem.choices, begun, region)
-        return values.sum(), (found.start, found.sweeps, found.converged.all())
+        values, solution = jax.vmap(one)(problem.demonstrations.tasks, problem.choices, begun, region)
+        return values.sum(), (solution.start, solution.sweeps, solution.converged.all())
 
     differentiated = jax.value_and_grad(objective, argnums=(0, 1), has_aux=True)
     (value, (left, sweeps, converged)), (gradient, adjoint) = differentiated(parameters, start.adjoint)
     return Step(value, gradient, left._replace(adjoint=adjoint), sweeps, converged)
 
 
-def stepped(parameters: Array, gradient: Array, arguments: argparse.Namespace) -> Array:
-    """The parameters after a step uphill."""
+def stepped(parameters: Array, gradient: Array, options: GradientOptions) -> Array:
+    """Return the parameters after a step along the gradient."""
     largest = jnp.abs(gradient).max()
-    direction = jnp.sign(gradient) * (jnp.abs(gradient) > 1e-9 * largest) if arguments.step_by_sign else gradient
-    return parameters + arguments.step * direction / (1 if arguments.step_by_sign else largest)
+    if options.step_by_sign:
+        return parameters + options.step * jnp.sign(gradient) * (jnp.abs(gradient) > 1e-9 * largest)
+    return parameters + options.step * gradient / largest
 
 
-def of_all_kinds(problem: Problem, arguments: argparse.Namespace) -> Iterator[Step]:
-    """A gradient of each of `KINDS`, each when it is asked for."""
-    at = problem.model.parameters
-    start = problem.cold_start()
-    found = jax.block_until_ready(take(problem, at, start, start.region))
-    start = found.start
-    yield found
-    at = jax.block_until_ready(stepped(at, found.gradient, arguments))
-    # nothing is kept that a fit would not keep
-    del found
+def of_all_kinds(problem: Problem, options: GradientOptions) -> Iterator[Step]:
+    """Yield a gradient of each of `KINDS`."""
+    at, start = problem.model.parameters, problem.cold_start()
+    step = jax.block_until_ready(take(problem, at, start, start.region))
+    start = step.start
+    yield step
+    at = jax.block_until_ready(stepped(at, step.gradient, options))
+    del step  # a fit does not keep it either
     yield jax.block_until_ready(take(problem, at, start, jnp.ones_like(start.region)))
     yield jax.block_until_ready(take(problem, at, start, start.region))
 
@@ -155,224 +225,134 @@ def of_all_kinds(problem: Problem, arguments: argparse.Namespace) -> Iterator[St
 # ---------------------------------------------------------------------------------------------------- measuring
 
 
-def measure(
-    world: World, saved: Path, backup: str, names: Sequence[str], arguments: argparse.Namespace
-) -> list[dict[str, Any]]:
-    """The records of one map and backup, a record a solver; Dijkstra and all solvers take turns."""
-    problems = {name: problem_of(world, name, backup, arguments) for name in names}
-    steps = {name: list(of_all_kinds(problem, arguments)) for name, problem in problems.items()}
-    moves = expected_costs(world.model)
+def measure(options: Options) -> Iterator[Record]:
+    """Yield a record for each map, backup and solver."""
+    for size in sorted(options.sizes):
+        world = half_learned_office(size, options.seed, options.walks, options.tasks)
+        names = [name for name in options.solvers if name != "jacobi" or size <= options.jacobi_limit]
+        for backup in options.backups:
+            yield from _of_one_map(world, backup, names, options)
+            note(f"{size}² {backup} done")
 
-    def search() -> float:
-        return measuring.seconds_of(lambda: [dijkstra(moves, indices=int(goal)) for goal in world.goals])
 
-    def cold(name: str) -> float:
-        problem = problems[name]
-        start = jax.block_until_ready(problem.cold_start())
-        at, region = problem.model.parameters, jax.block_until_ready(start.region)
-        return measuring.seconds_of(lambda: jax.block_until_ready(take(problem, at, start, region)))
+def _of_one_map(world: World, backup: str, names: Sequence[str], options: Options) -> Iterator[Record]:
+    problems = {name: problem_of(world, backup, options, name) for name in names}
+    steps = {name: list(of_all_kinds(problem, options)) for name, problem in problems.items()}
 
-    def warm(name: str, within: bool = False) -> float:
+    def timed(name: str, kind: str) -> float:
         problem, first = problems[name], steps[name][0]
-        at = jax.block_until_ready(stepped(problem.model.parameters, first.gradient, arguments))
-        region = jax.block_until_ready(first.start.region if within else jnp.ones_like(first.start.region))
-        return measuring.seconds_of(lambda: jax.block_until_ready(take(problem, at, first.start, region)))
+        at, start = problem.model.parameters, problem.cold_start()
+        region = start.region
+        if kind != "cold":
+            at, start = stepped(at, first.gradient, options), first.start
+            region = start.region if kind == "region" else jnp.ones_like(start.region)
+        at, start, region = jax.block_until_ready((at, start, region))
+        return seconds(lambda: jax.block_until_ready(take(problem, at, start, region)))
 
-    calls = {"dijkstra": search}
+    calls = {"dijkstra": world.dijkstra()}
+    calls |= {f"{kind} {name}": partial(timed, name, kind) for name in names for kind in KINDS}
+    taken = in_turns(calls, options.turns, options.budget)
     for name in names:
-        calls |= {f"cold {name}": partial(cold, name), f"warm {name}": partial(warm, name)}
-        calls[f"region {name}"] = partial(warm, name, within=True)
-    taken = measuring.in_turns(calls, arguments.turns, arguments.budget)
-    return [
-        {
-            "name": name,
-            "backup": backup,
-            "cells": world.size**2,
-            "tasks": len(world.goals),
-            **_times(taken, name),
-            **_went(steps[name]),
-            "tolerance": arguments.tolerance,
-            "step": arguments.step,
-            "moves": len(world.walks) - len(world.ends),
-            **_memory(world.size, saved, name, backup, arguments),
-        }
-        for name in names
-    ]
+        record = {"name": name, "backup": backup, "cells": world.size**2, "tasks": len(world.goals)}
+        for kind in (*KINDS, "dijkstra"):
+            own = taken[kind if kind == "dijkstra" else f"{kind} {name}"]
+            record |= {f"{kind}_seconds": median(own), f"best_{kind}_seconds": min(own), "turns": len(own)}
+            record[f"{kind}_units"] = median_ratio(own, taken["dijkstra"])
+        moves = sum(len(states) - 1 for _, states in world.walks)
+        record |= {"tolerance": options.tolerance, "step": options.step, "moves": moves}
+        memory: Record = dict.fromkeys(MEMORY)
+        if world.size >= options.memory_from:
+            memory = peak_memory(gradients_of_all_kinds, world, backup, options, name)
+        yield {**record, **_solved(steps[name]), **memory}
 
 
-def _times(taken: Mapping[str, Sequence[float]], name: str) -> dict[str, Any]:
-    """Medians, in seconds and in units of the search in the same turn."""
-    searches = taken["dijkstra"]
-    found: dict[str, Any] = {"dijkstra_seconds": measuring.median(searches), "best_dijkstra_seconds": min(searches)}
-    for kind in KINDS:
-        own = taken[f"{kind} {name}"]
-        found[f"{kind}_seconds"] = measuring.median(own)
-        found[f"best_{kind}_seconds"] = min(own)
-        units = [mine / search for mine, search in zip(own, searches, strict=False)]
-        found[f"{kind}_units"] = measuring.median(units)
-        found["turns"] = len(own)
-    return found
-
-
-def _went(steps: Sequence[Step]) -> dict[str, Any]:
-    """The sweeps of the values, and whether values and adjoints all converged; they must."""
+def _solved(steps: Sequence[Step]) -> Record:
+    """Return the sweeps of the values; raises `NotConverged` unless values and adjoints all converged."""
     # an adjoint that did not converge leaves a gradient of NaN
     if not all(step.converged and jnp.isfinite(step.gradient).all() for step in steps[:2]) or not steps[2].converged:
         raise NotConverged("the values or the adjoint did not converge: try another tolerance or backup")
     cold, warm, region = steps
-    # NaN if other states were seen to matter
     error = jnp.abs(region.gradient - warm.gradient).max() / jnp.abs(warm.gradient).max()
     return {
         **{f"{kind}_sweeps": int(step.sweeps.max()) for kind, step in zip(KINDS, steps, strict=True)},
         "region": float(cold.start.region.mean()),
         "region_error": float(error) if jnp.isfinite(error) else None,
-        "converged": True,
     }
 
 
-def _memory(size: int, saved: Path, name: str, backup: str, arguments: argparse.Namespace) -> dict[str, Any]:
-    """The memory of a process of its own."""
-    nothing: dict[str, Any] = dict.fromkeys(("peak_bytes", "imports_bytes", "excess_bytes", "gradient_bytes"))
-    if arguments.quick and size < max(arguments.sizes):
-        return nothing
-    told = {key: value for key, value in vars(arguments).items() if isinstance(value, (int, float))}
-    asked = json.dumps({**told, "world": str(saved), "name": name, "backup": backup})
-    return measuring.in_own_process(__file__, "--measure-memory", asked) or nothing
-
-
-def measure_memory(asked: str, imports: int) -> None:
-    """Takes a gradient of each kind in this process and prints what it needed."""
-    given = json.loads(asked)
-    arguments = argparse.Namespace(**given)
-    problem = problem_of(load(Path(given["world"])), given["name"], given["backup"], arguments)
-    jax.block_until_ready(problem)
-    built, building = measuring.held_bytes(), measuring.peak_bytes()
-    known = measuring.reset_peak()
-    steps = of_all_kinds(problem, arguments)
-    # a gradient that is not kept, as in a fit
-    while next(steps, None) is not None:
-        pass
-    taking = measuring.peak_bytes()
-    peak = max(building, taking)
-    gradient = taking - built if known else None
-    found = {"peak_bytes": peak, "imports_bytes": imports, "excess_bytes": peak - imports, "gradient_bytes": gradient}
-    print(json.dumps({**found, "building_bytes": building}))
+def gradients_of_all_kinds(world: World, backup: str, options: Options, solver: str) -> Callable[[], object]:
+    """Return a call that takes a gradient of each kind and keeps none, for `peak_memory`."""
+    problem = jax.block_until_ready(problem_of(world, backup, options, solver))
+    return lambda: [None for _ in of_all_kinds(problem, options)]
 
 
 # ---------------------------------------------------------------------------------------------------- reporting
 
 
-def exponents(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The exponent of seconds ∝ cells^exponent for each solver, backup and kind of start."""
-    rows = []
-    for name, backup in dict.fromkeys((record["name"], record["backup"]) for record in records):
-        own = [r for r in records if (r["name"], r["backup"]) == (name, backup) and r["cells"] >= FROM_CELLS]
-        seconds = [f"{kind}_seconds" for kind in (*KINDS, "dijkstra")]
-        for kind in (*seconds, *(f"{kind}_units" for kind in KINDS)):
+def show(records: Sequence[Record], options: Options) -> None:
+    """Print the times, and the exponents of their growth."""
+    columns = {"cells": "cells", "solver": "name", "backup": "backup"}
+    columns |= {f"{kind} ms": f"{kind}_seconds ms" for kind in (*KINDS, "dijkstra")}
+    columns |= {f"{kind} units": f"{kind}_units .2f" for kind in KINDS} | {"sweeps": "cold_sweeps"}
+    columns |= {"mattered": "region .2f", "peak MiB": "peak_bytes MiB", "imports": "imports_bytes MiB"}
+    columns |= {"excess": "excess_bytes MiB", "gradients": "call_bytes MiB"}
+    step = f"{options.step:g} ({'every' if options.step_by_sign else 'largest'} component)"
+    print_table(f"a value and gradient, {described(options)}; warm after a step of {step}", records, columns)
+    columns = {"solver": "name", "backup": "backup", "time": "kind"}
+    columns |= {"exponent": "fitted .3f", "largest in a row": "largest .3f"}
+    print_table(f"time ∝ cells^exponent, from {FROM_CELLS} cells on", list(exponents(records)), columns)
+
+
+def described(options: GradientOptions) -> str:
+    """Return the settings of the problem, for a title."""
+    reward = "goal pays 1" if options.goal_pays else f"step cost {options.step_cost:g}"
+    return f"β={options.beta:g}, γ={options.discount:g}, {reward}, tolerance {options.tolerance:g}"
+
+
+def exponents(records: Sequence[Record]) -> Iterator[Record]:
+    """Yield the exponent of time ∝ cells^exponent for each solver, backup, kind of start and unit of time."""
+    for label, own in groups([record for record in records if record["cells"] >= FROM_CELLS], "name", "backup"):
+        for kind in [*(f"{kind}_seconds" for kind in (*KINDS, "dijkstra")), *(f"{kind}_units" for kind in KINDS)]:
             if len(own) > 1:
-                fitted, worst = power_law([r["cells"] for r in own], [r[kind] for r in own])
-                rows.append({"name": name, "backup": backup, "kind": kind, "fitted": fitted, "worst": worst})
-    return rows
+                fitted, largest = power_law([r["cells"] for r in own], [r[kind] for r in own])
+                yield {**label, "kind": kind.replace("_", " "), "fitted": fitted, "largest": largest}
 
 
 def power_law(sizes: Sequence[float], times: Sequence[float]) -> tuple[float, float]:
-    """The exponent fitted to times by sizes (both ascending by size), and the largest between two in a row."""
+    """Return the exponent fitted to times by sizes (both ascending by size), and the largest between two in a row."""
     x, y = np.log(sizes), np.log(times)
     return float(np.polyfit(x, y, 1)[0]), float((np.diff(y) / np.diff(x)).max())
 
 
-def print_records(records: Sequence[Mapping[str, Any]], arguments: argparse.Namespace) -> None:
-    """The tables."""
-    columns = ("map", "solver", "backup", *(f"{kind} ms" for kind in (*KINDS, "Dijkstra")))
-    columns += (*(f"{kind} units" for kind in KINDS), "sweeps", "matters", "peak MiB", "imports", "excess", "gradients")
-    rows = [
-        (
-            f"{round(record['cells'] ** 0.5)}²",
-            record["name"],
-            record["backup"],
-            *(measuring.milliseconds(record[f"{kind}_seconds"]) for kind in (*KINDS, "dijkstra")),
-            *(measuring.number(record[f"{kind}_units"], ".2f") for kind in KINDS),
-            ", ".join(str(record[f"{kind}_sweeps"]) for kind in KINDS),
-            measuring.number(record["region"], ".2f"),
-            *(measuring.mebibytes(record[f"{key}_bytes"]) for key in ("peak", "imports", "excess", "gradient")),
-        )
-        for record in records
-    ]
-    how = "every component" if arguments.step_by_sign else "largest component"
-    title = (
-        f"a value and gradient, {arguments.tasks} task(s), β={arguments.beta:g}, γ={arguments.discount:g}, "
-        f"step cost {arguments.step_cost:g}, tolerance {arguments.tolerance:g}; warm after a step of "
-        f"{arguments.step:g} ({how})"
-    )
-    measuring.print_table(title, columns, rows, left=("solver", "backup"))
-    fits = [
-        (
-            row["name"],
-            row["backup"],
-            row["kind"].replace("_", " "),
-            f"{row['fitted']:.3f}",
-            f"{row['worst']:.3f}",
-        )
-        for row in exponents(records)
-    ]
-    if fits:
-        columns = ("solver", "backup", "time", "exponent", "worst in a row")
-        measuring.print_table(
-            f"time ∝ cells^exponent, from {FROM_CELLS} cells on", columns, fits, left=("solver", "backup", "time")
-        )
+def draw(records: Sequence[Record], options: object = None) -> Figure:
+    """Return a picture of times (a panel for each backup) and peak memory against cells, a line for each method.
 
+    Lines are solid for cold times, dashed for warm ones, and dotted for one shortest-path search on the same map.
+    """
+    del options
+    backups, names = (list(dict.fromkeys(record[key] for record in records)) for key in ("backup", "name"))
+    picture = Figure(figsize=(4.2 * (len(backups) + 1), 5), layout="constrained")
+    panels = picture.subplots(1, len(backups) + 1)
 
-def _arguments() -> argparse.Namespace:
-    parser = measuring.argument_parser(
-        "The cost of a gradient by the size of the map.", "64² to 256², three turns, no memory below that"
-    )
-    add = parser.add_argument
-    add("--sizes", type=int, nargs="+", default=[64, 128, 256, 512, 1024, 2048], metavar="N", help="N × N cells")
-    add("--backups", nargs="+", choices=sorted(BACKUPS), default=["boltzmann", "logsumexp"])
-    add("--solvers", nargs="+", choices=list(SOLVERS), default=list(SOLVERS))
-    add("--jacobi-limit", type=int, default=128, metavar="N", help="largest N for sweeps over all states at once")
-    add("--beta", type=float, default=5.0, help="how sharply walkers choose")
-    add("--discount", type=float, default=0.9999)
-    add("--step-cost", type=float, default=1.0)
-    add("--tolerance", type=float, default=1e-7, help="relative change at which a solve stops")
-    add("--step", type=float, default=0.1, help="the optimiser's step before the warm gradient, in logits")
-    add("--step-by-sign", action="store_true", help="the same step for every cell, as Adam's first")
-    add("--tasks", type=int, default=1, help="how many goals")
-    add("--walks", type=int, default=10, help="how many walks to each goal")
-    add("--turns", type=int, default=7, help="how often everything is timed")
-    add("--budget", type=float, default=8.0, help="seconds after which a method takes no more than three turns")
-    add("--seed", type=int, default=0, help="draws maps, walks and parameters")
-    add("--measure-memory", help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    if arguments.quick:
-        arguments.sizes, arguments.turns, arguments.budget = [64, 128, 256], 3, 1.0
-    if min(arguments.turns, arguments.tasks, arguments.walks) < 1:
-        parser.error("--turns, --tasks and --walks: expected numbers above 0")
-    return arguments
+    def line(axes, own: Sequence[Record], key: str, factor: float = 1.0, **style: Any) -> None:
+        points = [(record["cells"], factor * record[key]) for record in own if record.get(key) is not None]
+        if points:
+            axes.plot(*np.transpose(sorted(points)), **style)
 
-
-def run(arguments: argparse.Namespace) -> None:
-    """Measures, prints and writes what the arguments ask for."""
-    records = []
-    started = time.perf_counter()
-    with tempfile.TemporaryDirectory() as folder:
-        for size in sorted(arguments.sizes):
-            world = half_learned_office(size, arguments.seed, arguments.walks, arguments.tasks)
-            saved = Path(folder) / "world.npz"
-            world.save(saved)
-            names = [name for name in arguments.solvers if name != "jacobi" or size <= arguments.jacobi_limit]
-            for backup in arguments.backups:
-                records += measure(world, saved, backup, names, arguments)
-                measuring.write_records(arguments, records, exponents=exponents(records))
-                measuring.note(f"{size}² {backup}: {time.perf_counter() - started:.0f} s")
-    print_records(records, arguments)
-
-
-if __name__ == "__main__":
-    imports_bytes = measuring.held_bytes()
-    chosen = _arguments()
-    if chosen.measure_memory:
-        jax.config.update("jax_enable_x64", True)
-        measure_memory(chosen.measure_memory, imports_bytes)
-    else:
-        sys.exit(measuring.main(run, chosen))
+    for label, own in groups(records, "name", "backup"):
+        number, axes = names.index(label["name"]), panels[backups.index(label["backup"])]
+        style: dict[str, Any] = {"color": f"C{number}", "marker": MARKERS[number % len(MARKERS)]}
+        line(axes, own, "cold_seconds", label=label["name"], **style)
+        line(axes, own, "warm_seconds", linestyle="--", markerfacecolor="white", **style)
+        line(panels[-1], own, "peak_bytes", 2**-20, **style)
+    for backup, axes in zip(backups, panels, strict=False):
+        first = next(own for label, own in groups(records, "name", "backup") if label["backup"] == backup)
+        line(axes, first, "dijkstra_seconds", color="black", linestyle=":", label="one shortest-path search")
+        axes.set(xscale="log", yscale="log", xlabel="cells", ylabel="seconds (dashed: after a step)", title=backup)
+    panels[-1].set(xscale="log", ylim=(0, None), xlabel="cells", ylabel="peak memory of the process (MiB)")
+    for axes in panels:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(alpha=0.3)
+    handles = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    picture.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, fontsize="small")
+    return picture
