@@ -19,7 +19,7 @@ from sidestep.errors import InputError, NotConverged
 from sidestep.inference.fit import Fit, fit
 from sidestep.inference.optimizers import LBFGS, Optimizer, Rprop
 from sidestep.inference.priors import Normal
-from sidestep.io.roads import Roads, demonstrations_of_trips, read_roads, read_trips
+from sidestep.io.roads import Roads, demonstrations_from_trips, read_roads, read_trips
 from sidestep.tabular.backups import BACKUPS, Behavior
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import action_log_likelihood
@@ -70,7 +70,7 @@ class Town(NamedTuple):
 
     def demonstrations(self, trips: Sequence[Trip]) -> Demonstrations:
         """Trips as demonstrations."""
-        return demonstrations_of_trips(trips, self.model.graph)
+        return demonstrations_from_trips(trips, self.model.graph)
 
     def uses(self, trips: Sequence[Trip]) -> Int[np.ndarray, " links"]:
         """How often trips used each link."""

@@ -64,7 +64,7 @@ def read_maze(folder: Path, animal: str, settings: Settings, trials: Sequence[in
     """
     source = folder / f"{animal}.csv"
     walks = read_walks(source)
-    trial = np.asarray(walks.of_each("trial"))
+    trial = np.asarray(walks.per_walk("trial"))
     first, last = trials
     return Maze(
         folder.name,

@@ -40,7 +40,7 @@ from sidestep.evaluation.evaluate import evaluate
 from sidestep.evaluation.study import mean_log_likelihood
 from sidestep.io.demonstrations import demonstrations_from_walks
 from sidestep.io.gridding import grid_walks
-from sidestep.io.trajectories import walks_of_trajectories
+from sidestep.io.trajectories import walks_from_trajectories
 from sidestep.io.walks import Walks
 from sidestep.maps.config import Settings
 from sidestep.maps.selection import choose_behavior
@@ -80,7 +80,7 @@ def offices(counts: Sequence[int], seeds: Sequence[int]) -> Iterator[tuple[int, 
         truth = office(ROWS, COLUMNS, seed)
         for count in counts:
             trajectories, goals = walk(truth, Walkers(walks=count + HELD_OUT, goals=PLACES, seed=seed))
-            walks = walks_of_trajectories(trajectories, goals, truth)
+            walks = walks_from_trajectories(trajectories, goals, truth)
             drawn = np.random.default_rng(seed).permutation(len(walks))
             elsewhere = places(truth, NEW_PLACES + len(goals), seed + 1)
             new = elsewhere[~np.isin(elsewhere, goals)][:NEW_PLACES]

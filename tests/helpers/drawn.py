@@ -4,7 +4,7 @@ import numpy as np
 import pyarrow as pa
 from hypothesis import strategies as st
 
-from sidestep.io.walks import walks_of_table
+from sidestep.io.walks import walks_from_table
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 
 SIZE = 7
@@ -31,7 +31,7 @@ def walk_along(*lines, goals=None, failed=None):
         for (walk, position), target in failed.items():
             targets[sum(lengths[:walk]) + position] = target
         columns |= {"failed_x": targets[:, 0], "failed_y": targets[:, 1]}
-    return walks_of_table(pa.table(columns), source="walks.csv")
+    return walks_from_table(pa.table(columns), source="walks.csv")
 
 
 def grid_of(*drawing, connectivity: Connectivity = 4):

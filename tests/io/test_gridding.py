@@ -11,7 +11,7 @@ from helpers.drawn import NAN, SIZE, grid_of, walk_along
 from sidestep.errors import InputError
 from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map
-from sidestep.io.walks import read_walks, walks_of_table
+from sidestep.io.walks import read_walks, walks_from_table
 from sidestep.tabular.grid import Grid
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -257,12 +257,12 @@ def test_rows_are_those_of_the_file_even_when_walks_interleave():
         }
     )
     with pytest.raises(InputError, match="row 4, field 'y'"):
-        grid_walks(walks_of_table(table), blank)
+        grid_walks(walks_from_table(table), blank)
 
 
 def interleaved(**columns):
     """Two walks whose rows alternate, so that the later walk holds the earlier row."""
-    return walks_of_table(pa.table({"walk": ["a", "b", "b", "a"], "step": [0, 0, 1, 1], **columns}))
+    return walks_from_table(pa.table({"walk": ["a", "b", "b", "a"], "step": [0, 0, 1, 1], **columns}))
 
 
 def test_the_first_bad_row_of_the_file_is_named():

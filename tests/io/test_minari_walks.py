@@ -14,7 +14,7 @@ from hypothesis import given
 from helpers.drawn import walk_along, walk_tables
 from helpers.stored import buffer, fresh, store
 from sidestep.errors import InputError
-from sidestep.io.walks import read_walks, walks_of_table, write_walks
+from sidestep.io.walks import read_walks, walks_from_table, write_walks
 
 pytestmark = pytest.mark.usefixtures("datasets")
 
@@ -26,7 +26,7 @@ LINE = np.array([[0.5, 0.5], [1.5, 0.5], [1.5, 1.5]])
 
 @given(walk_tables())
 def test_walks_come_back(table):
-    walks, dataset = walks_of_table(table), "minari:" + fresh("ours/walks")
+    walks, dataset = walks_from_table(table), "minari:" + fresh("ours/walks")
     write_walks(dataset, walks)
     read = read_walks(dataset)
     assert read.labels == walks.labels
@@ -44,7 +44,7 @@ def test_labels_steps_times_and_metadata_come_back(labels):
         "seen": [True, False, True, True],
     }
     table = pa.table({"walk": labels, "step": [0, 3, 4, 9], "x": [0, 1, 0, 1], "y": [0, 0, 1, 1], **columns})
-    walks, dataset = walks_of_table(table), "minari:" + fresh("ours/walks")
+    walks, dataset = walks_from_table(table), "minari:" + fresh("ours/walks")
     write_walks(dataset, walks)
     read = read_walks(dataset)
     assert read.labels == walks.labels

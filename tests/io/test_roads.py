@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sidestep.errors import InputError
-from sidestep.io.roads import demonstrations_of_trips, read_roads, read_trips
+from sidestep.io.roads import demonstrations_from_trips, read_roads, read_trips
 from sidestep.tabular.models import road_network
 
 LINKS = """link,from_node,to_node,length_m,oneway,name
@@ -105,7 +105,7 @@ def test_road_networks_that_are_none_are_refused(files, table, old, new, match):
         ("2,007,a", "2,b,a", r"trips\.csv, row 2, field 'origin': expected 007, as in its links, found b"),
         ("2,007,a", "2,007,c", r"trips\.csv, row 2, field 'destination': expected a, as in its links, found c"),
         ("007 b a", "007", r"trips\.csv, row 2, field 'links': expected at least two links, found 1"),
-        ("007 b a", "007 b a b a", r"trips\.csv, row 2, field 'links': goes on after it has reached"),
+        ("007 b a", "007 b a b a", r"trips\.csv, row 2, field 'links': continues after it has reached"),
         ("a c 007\n", "\n", r"trips\.csv, row 1, field 'links': expected a label"),
         (TRIPS, "trip,origin,destination,links\n", r"trips\.csv: expected at least one row"),
     ],
@@ -121,7 +121,7 @@ def test_trips_become_demonstrations_with_a_task_a_destination(files):
     links, turns, trips = files()
     roads = read_roads(links, turns)
     graph = road_network(roads.turns, roads.lengths).graph
-    demos = demonstrations_of_trips(read_trips(trips, roads), graph, step_cost=0.5)
+    demos = demonstrations_from_trips(read_trips(trips, roads), graph, step_cost=0.5)
     assert demos.states.tolist() == [0, 2, 3, 1]
     assert demos.next_states.tolist() == [2, 3, 1, 0]
     assert graph.successors[demos.states, demos.actions, 0].tolist() == demos.next_states.tolist()
@@ -136,4 +136,4 @@ def test_trips_without_a_turn_are_no_demonstrations(files):
     roads = read_roads(links, turns)
     graph = road_network(roads.turns, roads.lengths).graph
     with pytest.raises(InputError, match="trip, row 2: expected a turn"):
-        demonstrations_of_trips([np.array([0, 2]), np.array([0, 3])], graph)
+        demonstrations_from_trips([np.array([0, 2]), np.array([0, 3])], graph)

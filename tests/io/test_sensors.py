@@ -71,7 +71,7 @@ def test_maps_that_do_not_fit(tmp_path, changes, match):
 
 
 def test_a_map_of_another_shape(tmp_path):
-    with pytest.raises(InputError, match=r"seen.yaml, field 'image': expected the map's \(2, 3\).*found \(3, 2\)"):
+    with pytest.raises(InputError, match=r"seen.yaml, field 'image': expected the map's 2 × 3 cells, found 3 × 2"):
         read_sensor_map(sensor_map(tmp_path, np.transpose(GREY)), GRID)
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from helpers.drawn import walk_tables
 from sidestep.errors import InputError
-from sidestep.io.walks import read_walks, walks_of_table, write_walks
+from sidestep.io.walks import read_walks, walks_from_table, write_walks
 
 GOOD = """walk,step,x,y,t,goal_x,goal_y,subject,trial
 b,0,0.5,0.5,0.0,3.5,0.5,003,5
@@ -87,13 +87,13 @@ def test_failed_moves(tmp_path):
 def test_steps_may_be_nanoseconds():
     start = 2**62
     table = pa.table({"walk": [0, 0], "step": [start, start + 1], "x": [0, 1], "y": [0, 0]})
-    assert walks_of_table(table).steps.tolist() == [start, start + 1]
+    assert walks_from_table(table).steps.tolist() == [start, start + 1]
 
 
 def test_rows_keep_their_order_in_large_tables():
     walk = np.random.default_rng(0).integers(0, 3, 10_000)
     zeros = np.zeros(len(walk))
-    walks = walks_of_table(pa.table({"walk": walk, "step": np.arange(len(walk)), "x": zeros, "y": zeros}))
+    walks = walks_from_table(pa.table({"walk": walk, "step": np.arange(len(walk)), "x": zeros, "y": zeros}))
     for index, label in enumerate(walks.labels):
         rows = walks.rows[walks.offsets[index] : walks.offsets[index + 1]]
         np.testing.assert_array_equal(rows, np.flatnonzero(walk == label) + 1)
@@ -103,20 +103,20 @@ def test_rows_keep_their_order_in_large_tables():
 def test_the_first_bad_row_of_the_file_is_named(labels):
     table = pa.table({"walk": list(labels), "step": [0, 0, 0, 0], "x": [0.0] * 4, "y": [0.0] * 4})
     with pytest.raises(InputError, match="row 3, field 'step'"):
-        walks_of_table(table)
+        walks_from_table(table)
 
 
 @pytest.mark.parametrize("label", [None, float("nan")])
 def test_a_walk_without_a_label(label):
     table = pa.table({"walk": [0.5, label], "step": [0, 1], "x": [0.0, 1.0], "y": [0.0, 0.0]})
     with pytest.raises(InputError, match="row 2, field 'walk': expected the label of a walk"):
-        walks_of_table(table)
+        walks_from_table(table)
 
 
 def test_labels_in_a_dictionary_with_words_to_spare():
     labels = pa.DictionaryArray.from_arrays(pa.array([2, 1, 2, 1]), pa.array(["unused", "a", "b"]))
     table = pa.table({"walk": labels, "step": [0, 0, 1, 1], "x": [0.0, 1, 2, 3], "y": [0.0, 0, 0, 0]})
-    walks = walks_of_table(table)
+    walks = walks_from_table(table)
     assert walks.labels == ["b", "a"]
     assert walks.positions[:, 0].tolist() == [0, 2, 1, 3]
 
@@ -246,7 +246,7 @@ def test_absent_files_and_folders(tmp_path):
 def test_columns_of_another_kind_are_refused(column):
     table = pa.table({"walk": [0, 0], "step": [0, 1], "x": column, "y": [0, 0]})
     with pytest.raises(InputError, match="field 'x': expected numbers, found"):
-        walks_of_table(table)
+        walks_from_table(table)
 
 
 def test_partition_names_in_the_path_are_no_columns(tmp_path):
@@ -258,15 +258,15 @@ def test_partition_names_in_the_path_are_no_columns(tmp_path):
 def test_what_csv_cannot_hold_is_an_error_and_leaves_nothing(tmp_path):
     table = pa.table({"walk": [0, 0], "step": [0, 1], "x": [0, 1], "y": [0, 0], "tags": [["a"], []]})
     with pytest.raises(InputError, match=r"walks\.csv: the table cannot be written"):
-        write_walks(tmp_path / "walks.csv", walks_of_table(table))
+        write_walks(tmp_path / "walks.csv", walks_from_table(table))
     assert not list(tmp_path.iterdir())
-    write_walks(tmp_path / "walks.parquet", walks_of_table(table))
+    write_walks(tmp_path / "walks.parquet", walks_from_table(table))
     assert read_walks(tmp_path / "walks.parquet").metadata["tags"].to_pylist() == [["a"], []]
 
 
 @given(walk_tables(), st.sampled_from(["csv", "parquet"]))
 def test_walks_come_back(tmp_path_factory, table, ending):
-    walks, path = walks_of_table(table), tmp_path_factory.mktemp("walks") / f"walks.{ending}"
+    walks, path = walks_from_table(table), tmp_path_factory.mktemp("walks") / f"walks.{ending}"
     write_walks(path, walks)
     read = read_walks(path)
     assert read.labels == walks.labels

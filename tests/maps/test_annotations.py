@@ -97,7 +97,7 @@ def test_what_cannot_be_is_refused(office, tmp_path, capsys):
     for options, expected in (
         (("--person", "who"), "walks.csv, field 'who': the column is missing"),
         (("--candidates", tmp_path / "none.csv"), "none.csv"),
-        (("--person", "step"), "walks.csv, field 'step': expected a column that says something else"),
+        (("--person", "step"), "walks.csv, field 'step': expected a column of metadata"),
         (("--behavior", "auto", "--tempering", 0.5), "field 'tempering'"),
         (("--candidates", walks, "--person", "who"), "field 'person'"),
         (("--candidates", walks, "--behavior", "auto"), "field 'behavior'"),

@@ -12,7 +12,7 @@ from scipy.special import expit, logit
 
 from helpers.office import WALL, call, summary, write_office, written
 from sidestep.io.maps import read_map, write_map
-from sidestep.io.trajectories import walks_of_trajectories
+from sidestep.io.trajectories import walks_from_trajectories
 from sidestep.io.walks import write_walks
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import true_model
@@ -126,7 +126,7 @@ def test_half_of_a_wall_is_sensed_and_the_other_half_found_by_behavior(tmp_path)
     lower = np.array([row * 9 + column for row in range(7, 13) for column in range(9) if column != 4])
     starts = [random.choice(np.setdiff1d(lower, [goal]), 15) for goal in goals]
     walks = simulate(jax.random.key(0), true_model(FLAT), tasks, starts)
-    write_walks(tmp_path / "walks.csv", walks_of_trajectories(walks, goals, FLAT))
+    write_walks(tmp_path / "walks.csv", walks_from_trajectories(walks, goals, FLAT))
     write_map(tmp_path / "blank.yaml", np.full(FLAT.shape, 0.5), FLAT)
     write_map(tmp_path / "seen.yaml", np.where(FLAT.known == Cell.OCCUPIED, 0.9, 0.1), FLAT)
     variance = np.full(FLAT.shape, np.nan)

@@ -6,7 +6,7 @@ import pytest
 
 from sidestep.errors import InputError
 from sidestep.io.demonstrations import demonstrations_from_walks
-from sidestep.io.walks import walks_of_table
+from sidestep.io.walks import walks_from_table
 from sidestep.tabular.demonstrations import Trajectory, gather, next_power_of_two, pad_to_power_of_two
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.tasks import reach
@@ -67,7 +67,7 @@ def walks(*lines, goals=None):
     if goals:
         table["goal_x"] = [goals[walk] + 0.5 for walk in table["walk"]]
         table["goal_y"] = [0.5] * len(xs)
-    return walks_of_table(pa.table(table))
+    return walks_from_table(pa.table(table))
 
 
 def test_one_task_for_every_goal():

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from sidestep.errors import InputError
 from sidestep.io.demonstrations import demonstrations_from_walks
-from sidestep.io.trajectories import walks_of_trajectories
+from sidestep.io.trajectories import walks_from_trajectories
 from sidestep.io.walks import read_walks, write_walks
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.demonstrations import gather
@@ -111,7 +111,7 @@ def test_walks_in_a_file_are_the_demonstrations_that_were_walked(tmp_path, conne
     trajectories = walked(grid, goals, [[4, 24, 5, 22], [0, 11, 24, 20]], Behavior(BoltzmannAverage(), 30.0))
     failed = sum(int((walk.states[1:] == walk.states[:-1]).sum()) for walk in trajectories)
     assert failed > 5
-    write_walks(tmp_path / f"walks{ending}", walks_of_trajectories(trajectories, goals, grid))
+    write_walks(tmp_path / f"walks{ending}", walks_from_trajectories(trajectories, goals, grid))
     found = demonstrations_from_walks(read_walks(tmp_path / f"walks{ending}"), grid.forget())
     order = [1, 0]  # tasks come back in the order of their goals
     expected = gather([walk._replace(task=order[walk.task]) for walk in trajectories], [
@@ -124,7 +124,7 @@ def test_walks_in_a_file_are_the_demonstrations_that_were_walked(tmp_path, conne
 
 def test_walks_without_a_failed_move_have_no_column_for_them():
     grid = Grid(OPEN)
-    walks = walks_of_trajectories(walked(grid, [8], [[0, 4]]), [8], grid)
+    walks = walks_from_trajectories(walked(grid, [8], [[0, 4]]), [8], grid)
     assert np.isnan(walks.failed_moves).all()
     np.testing.assert_allclose(walks.goals, [[2.5, 0.5], [2.5, 0.5]])
     np.testing.assert_allclose(next(iter(walks))[[0, -1]], [[0.5, 2.5], [2.5, 0.5]])

@@ -26,8 +26,7 @@ from sidestep.evaluation.evaluate import evaluate
 from sidestep.evaluation.study import mean_log_likelihood
 from sidestep.io.demonstrations import demonstrations_from_moves
 from sidestep.io.gridding import Moves, grid_walks
-from sidestep.io.maps import read_map
-from sidestep.io.true_map import read_truth
+from sidestep.io.maps import read_map, read_map_like
 from sidestep.io.walks import read_walks
 from sidestep.maps.config import Settings
 from sidestep.maps.selection import choose_behavior, told
@@ -75,7 +74,7 @@ def compare(
     to score; with `auto` also what `choose_behavior` does.
     """
     given = read_map(map_file, connectivity=settings.connectivity)
-    truth = read_truth(truth_file, given)
+    truth = read_map_like(truth_file, given)
     walks = read_walks(walks_file)
     held = round(hold_out * len(walks))
     if not 0 < held < len(walks):

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from sidestep.evaluation.evaluate import StageCallback, evaluate, sample_sizes
-from sidestep.io.true_map import read_truth
+from sidestep.io.maps import read_map_like
 from sidestep.maps.learned_map import add_to_summary, read_learned_map
 from sidestep.robots.robot import BUMP_COST
 
@@ -28,7 +28,7 @@ def evaluate_map(
     size, resolution or origin.
     """
     learned = read_learned_map(folder)
-    truth = read_truth(truth_file, learned.grid)
+    truth = read_map_like(truth_file, learned.grid)
     robot = learned.robot(bump_cost)
     scores = evaluate(robot, learned.blocked, truth, learned.unknown, learned.visited, seed, report).to_dict()
     limits = {"planned_at_most": sample_sizes(truth.size)._asdict(), "bump_cost": bump_cost}

@@ -11,8 +11,8 @@ from sidestep._files import write_json
 from sidestep.errors import InputError
 from sidestep.io.maps import read_map
 from sidestep.io.tables import write_table
-from sidestep.io.trajectories import walks_of_trajectories
-from sidestep.io.walks import table_of_walks
+from sidestep.io.trajectories import walks_from_trajectories
+from sidestep.io.walks import table_from_walks
 from sidestep.tabular.backups import BACKUPS, Behavior
 from sidestep.tabular.demonstrations import Trajectory
 from sidestep.tabular.grid import Connectivity, Grid
@@ -49,7 +49,7 @@ def simulate_walks(map_file: Path, out: Path, walkers: Walkers) -> dict[str, Any
     """
     grid = read_map(map_file, connectivity=walkers.connectivity)
     trajectories, goals = walk(grid, walkers)
-    write_table(out, table_of_walks(walks_of_trajectories(trajectories, goals, grid)))
+    write_table(out, table_from_walks(walks_from_trajectories(trajectories, goals, grid)))
     summary = {
         "command": "simulate",
         "map": str(map_file),

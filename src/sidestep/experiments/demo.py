@@ -16,7 +16,7 @@ from sidestep.cli.simulate import Walkers, walk
 from sidestep.evaluation.evaluate import evaluate, plan_paths
 from sidestep.io.demonstrations import demonstrations_from_walks
 from sidestep.io.maps import write_map
-from sidestep.io.trajectories import walks_of_trajectories
+from sidestep.io.trajectories import walks_from_trajectories
 from sidestep.io.walks import write_walks
 from sidestep.maps.config import Settings, fit_map
 from sidestep.maps.learned_map import LearnedMap, write_learned_map
@@ -38,7 +38,7 @@ def demo(folder: Path, seed: int = 0, report: Callable[[str], None] = lambda _: 
     truth = office(ROWS, COLUMNS, seed)
     report("walkers cross the office")
     trajectories, goals = walk(truth, replace(WALKERS, seed=seed))
-    walks = walks_of_trajectories(trajectories, goals, truth)
+    walks = walks_from_trajectories(trajectories, goals, truth)
     write_map(folder / "truth.yaml", truth.known.astype(np.float64), truth)
     write_walks(folder / "walks.csv", walks)
 

@@ -32,7 +32,7 @@ from sidestep.experiments.room import (
 from sidestep.inference.fit import fit
 from sidestep.inference.priors import Normal, Prior
 from sidestep.io.demonstrations import demonstrations_from_walks as on_grid
-from sidestep.io.walks import Walks, walks_of_table
+from sidestep.io.walks import Walks, walks_from_table
 from sidestep.plotting.maps import Panel, figure_learned, save
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.demonstrations import Demonstrations
@@ -141,7 +141,7 @@ def _walks(demonstrations: Demonstrations) -> Walks:
         for walk, (places, goal) in enumerate(zip(demonstrations.paths(), goals[tasks_of(demonstrations)], strict=True))
         for step, (x, y) in enumerate(np.clip(places, edge, SIDE - edge))
     ]
-    return walks_of_table(pa.Table.from_pylist(rows))
+    return walks_from_table(pa.Table.from_pylist(rows))
 
 
 def _saying(report: Report, name: str) -> Callable[[FitProgress, ObstacleMotion], None]:

@@ -1,7 +1,15 @@
-"""Which cells a path visits, and for how long: the geometry under `sidestep.io.gridding`.
+"""Grid traversal: the cells that a path visits, and the length of the path in each.
 
-Here positions are in cell units, (columns from the left, rows from the bottom), as `Grid.to_cell_units`
-gives them.
+The grid traversal of Amanatides and Woo (1987) follows one ray from one cell border to the next. This one differs:
+
+1. All crossings of all segments with the lines of the grid are computed at once and sorted along each segment.
+2. A visit needs a length: cells whose corner or side the path only touches are not visited.
+3. A path along a border is in the cell that is not known to be occupied.
+
+Positions are in cell units, (columns from the left, rows from the bottom), as `Grid.to_cell_units` returns them.
+
+References:
+    J. Amanatides and A. Woo. A fast voxel traversal algorithm for ray tracing. Eurographics, 1987.
 """
 
 from dataclasses import dataclass
@@ -10,18 +18,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 TOUCH = 1e-9
-"""Visits with a shorter path, in cells, only touch a corner or an edge, up to rounding; they do not count."""
+"""A shorter path in a cell, in cell sides, only touches a corner or a side, up to rounding."""
 
 
 @dataclass(frozen=True, eq=False)
 class Visits:
-    """The cells that paths visit, in order, walk after walk; successive visits of a walk are to different
-    cells.
+    """The cells that paths visit, in order, walk after walk; successive visits of a walk are to different cells.
 
-    - `walk`: the index of the walk.
-    - `cell`: row and column, row 0 at the top.
-    - `length`: the length of the path inside the cell during this visit, in cells.
-    - `arrival`: the index of the first position at or after the moment of entry.
+    Attributes:
+        walk: the index of the walk.
+        cell: row and column, row 0 at the top.
+        length: the length of the path inside the cell during the visit, in cell sides.
+        arrival: the index of the first position at or after the moment of entry.
     """
 
     walk: Int[np.ndarray, " visits"]
@@ -29,22 +37,26 @@ class Visits:
     length: Float[np.ndarray, " visits"]
     arrival: Int[np.ndarray, " visits"]
 
-    def __getitem__(self, chosen: Bool[np.ndarray, " visits"] | Int[np.ndarray, " chosen"]) -> "Visits":
-        """The visits that a mask or an array of indices chooses."""
-        return Visits(self.walk[chosen], self.cell[chosen], self.length[chosen], self.arrival[chosen])
+    def __getitem__(self, index: Bool[np.ndarray, " visits"] | Int[np.ndarray, " selected"]) -> "Visits":
+        """Return the visits that a mask or an array of indices selects."""
+        return Visits(self.walk[index], self.cell[index], self.length[index], self.arrival[index])
 
 
-def visits_of(
+def visited_cells(
     points: Float[np.ndarray, "points 2"],
     offsets: Int[np.ndarray, " boundaries"],
     occupied: Bool[np.ndarray, "rows columns"],
 ) -> Visits:
-    """The cells that straight lines between successive points of each walk pass through.
+    """Return the cells on the straight lines between successive points of each walk.
 
-    Points of walk i are `offsets[i]` to `offsets[i + 1]`, at least two, all on the grid. Every walk has a
-    visit, even if it stands still. Successive visits are to cells that share a side, or, where the line
-    runs through a corner (closer than `TOUCH`), only that corner. A line that runs along the border of two
-    cells is in the upper or right one, unless that is known to be occupied.
+    Every walk has a visit, even if it stands still. Successive visits are to cells that share a side, or only a corner
+    where the line runs through that corner (closer than `TOUCH`). A line along the border of two cells is in the upper
+    or right one, unless that is known to be occupied.
+
+    Args:
+        points: positions on the grid in cell units.
+        offsets: points `offsets[i]` to `offsets[i + 1]`, at least two, are those of walk i.
+        occupied: the cells that are known to be occupied.
     """
     walks = len(offsets) - 1
     start = np.delete(np.arange(len(points)), offsets[1:] - 1)
@@ -53,7 +65,7 @@ def visits_of(
     origin, along = points[start][segment], (points[start + 1] - points[start])[segment]
     middle = origin + (0.5 * (begin + end))[:, None] * along
     length = (end - begin) * np.hypot(along[:, 0], along[:, 1])
-    visits = _merged(Visits(walk[segment], cells_of(middle, occupied), length, (start + 1)[segment]))
+    visits = _merged(Visits(walk[segment], cells_at(middle, occupied), length, (start + 1)[segment]))
     lasting = visits.length >= TOUCH
     moving = np.zeros(walks, dtype=bool)
     moving[visits.walk[lasting]] = True
@@ -61,28 +73,28 @@ def visits_of(
     return _merged(visits[lasting | (first & ~moving[visits.walk])])
 
 
-def cells_of(
+def cells_at(
     points: Float[np.ndarray, "points 2"], occupied: Bool[np.ndarray, "rows columns"]
 ) -> Int[np.ndarray, "points 2"]:
-    """Row and column of the cell that holds each point; see `visits_of` for points on a border."""
+    """Return row and column of the cell of each point; on a border, as `visited_cells` does."""
     rows, columns = occupied.shape
 
     def cells(shift_right: float, shift_up: float) -> Int[np.ndarray, "points 2"]:
         column, row_up = np.floor(points + np.array([shift_right, shift_up])).astype(np.int64).T
         return np.stack([rows - 1 - np.clip(row_up, 0, rows - 1), np.clip(column, 0, columns - 1)], axis=1)
 
-    chosen = cells(TOUCH, TOUCH)
+    result = cells(TOUCH, TOUCH)
     for shifts in ((-TOUCH, TOUCH), (TOUCH, -TOUCH), (-TOUCH, -TOUCH)):
-        blocked = np.flatnonzero(occupied[chosen[:, 0], chosen[:, 1]])
+        blocked = np.flatnonzero(occupied[result[:, 0], result[:, 1]])
         if blocked.size:
-            chosen[blocked] = cells(*shifts)[blocked]
-    return chosen
+            result[blocked] = cells(*shifts)[blocked]
+    return result
 
 
 def _pieces(
     start: Float[np.ndarray, "segments 2"], end: Float[np.ndarray, "segments 2"]
 ) -> tuple[Int[np.ndarray, " pieces"], Float[np.ndarray, " pieces"], Float[np.ndarray, " pieces"]]:
-    """Segments cut at every border of cells: the segment of each piece, and the fractions of its two ends."""
+    """Cut segments at every line of the grid; return the segment of each piece and the fractions of its two ends."""
     crossed = [_crossings(start[:, axis], end[:, axis]) for axis in (0, 1)]
     segment = np.concatenate([np.arange(len(start)), *(segments for segments, _ in crossed)])
     begin = np.concatenate([np.zeros(len(start)), *(fractions for _, fractions in crossed)])
@@ -95,7 +107,7 @@ def _pieces(
 def _crossings(
     start: Float[np.ndarray, " segments"], end: Float[np.ndarray, " segments"]
 ) -> tuple[Int[np.ndarray, " crossings"], Float[np.ndarray, " crossings"]]:
-    """Where segments cross whole numbers on one axis: the segment, and the fraction of it before."""
+    """Return where segments cross whole numbers on one axis: the segment, and the fraction of it before."""
     first = np.floor(np.minimum(start, end)) + 1
     count = np.maximum(np.ceil(np.maximum(start, end)) - first, 0).astype(np.int64)
     segment = np.repeat(np.arange(len(start)), count)
@@ -104,7 +116,7 @@ def _crossings(
 
 
 def _merged(visits: Visits) -> Visits:
-    """Successive visits to the same cell as one."""
+    """Join successive visits to the same cell."""
     changes = (np.diff(visits.walk) != 0) | (np.diff(visits.cell, axis=0) != 0).any(axis=1)
     first = np.flatnonzero(np.concatenate([[True], changes]))
     length = np.add.reduceat(visits.length, first)

@@ -1,23 +1,24 @@
 """Maps as ROS `map_server` and Nav2 read them: a YAML file beside a PGM or PNG image.
 
-Every pixel is a cell and row 0 is the top. A pixel of grey value v stands for occupancy p = (255 − v)/255,
-or v/255 where the YAML says `negate: 1`; p above `occupied_thresh` is occupied, below `free_thresh` free,
-anything else unknown. In `raw` mode v itself is the occupancy in percent, and above 100 unknown.
+Every pixel is a cell and row 0 is the top. A pixel of gray value v has occupancy p = (255 − v)/255, or v/255 where the
+YAML has `negate: 1`; p above `occupied_thresh` is occupied, below `free_thresh` free, anything else unknown. In `raw`
+mode v itself is the occupancy in percent, and above 100 unknown.
 """
 
 import math
 import warnings
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import yaml
 from jaxtyping import Bool, Float
-from PIL import Image
 
 from sidestep._files import read_whole, write_whole
 from sidestep.errors import InputError
 from sidestep.tabular.grid import Cell, Connectivity, Grid
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 MOST_PIXELS = 100_000_000
 """Images with more pixels are refused before they are decoded."""
@@ -25,19 +26,25 @@ MOST_PIXELS = 100_000_000
 OCCUPIED_ABOVE, FREE_BELOW = 0.65, 0.196
 """The thresholds written into learned maps.
 
-They are those of nearly every ROS map. In `scale` mode Nav2 spreads the occupancy between them over 0…100
-and sets everything above 0.65 to 100, the only value that its default costmap treats as a wall
-(`lethal_cost_threshold: 100`). With a threshold of 1 no learned wall, however sure, would ever stop a
-robot.
+They are those of nearly every ROS map. In `scale` mode Nav2 spreads the occupancy between them over 0…100 and sets
+everything above 0.65 to 100, the only value that its default costmap treats as a wall (`lethal_cost_threshold: 100`).
+With a threshold of 1, no learned wall would stop a robot, however sure.
 """
+
+_ORIGIN_TOLERANCE = 1e-3
+"""Two corners are the same within this distance in cell sides (and within rounding)."""
 
 
 class Raster(NamedTuple):
-    """What a ROS map's two files say, before anything is made of it.
+    """The contents of the two files of a ROS map, without an interpretation.
 
-    - `occupancy`: of each cell, row 0 at the top, from 0 to 1; NaN where the map does not say.
-    - `mode`: trinary, scale or raw. `resolution`: metres. `origin`: metres and radians, of the lower-left corner.
-    - `occupied_above`, `free_below`: the thresholds.
+    Attributes:
+        occupancy: of each cell, row 0 at the top, from 0 to 1; NaN where the map has none.
+        mode: trinary, scale or raw.
+        resolution: the side of a cell in metres.
+        origin: x, y (metres) and yaw (radians) of the lower-left corner.
+        occupied_above: the threshold for occupied cells.
+        free_below: the threshold for free cells.
     """
 
     occupancy: Float[np.ndarray, "rows columns"]
@@ -49,26 +56,62 @@ class Raster(NamedTuple):
 
 
 def read_map(path: str | Path, connectivity: Connectivity = 4) -> Grid:
-    """The grid of a ROS map: geometry from its YAML file (metres, radians), known cells from its image.
+    """Return the grid of a ROS map: geometry from the YAML file (metres, radians), known cells from the image.
 
-    `connectivity` (4 or 8) is the walker's, no part of the file. Raises `InputError` as `read_raster` does.
+    Args:
+        path: the YAML file.
+        connectivity: 4 or 8, of the moves on the map; it is not in the file.
 
-    >>> grid = read_map("office.yaml")  # doctest: +SKIP
+    Raises:
+        InputError: as `read_raster` does.
+
+    Example:
+        >>> grid = read_map("office.yaml")  # doctest: +SKIP
     """
-    found = read_raster(path)
+    raster = read_raster(path)
     with np.errstate(invalid="ignore"):
-        free = np.where(found.occupancy < found.free_below, Cell.FREE, Cell.UNKNOWN)
-        known = np.where(found.occupancy > found.occupied_above, Cell.OCCUPIED, free)
-    return Grid(known, found.resolution, found.origin, connectivity)
+        free = np.where(raster.occupancy < raster.free_below, Cell.FREE, Cell.UNKNOWN)
+        known = np.where(raster.occupancy > raster.occupied_above, Cell.OCCUPIED, free)
+    return Grid(known, raster.resolution, raster.origin, connectivity)
+
+
+def read_map_like(path: str | Path, grid: Grid) -> Grid:
+    """Return the grid of another ROS map of the same place, with the connectivity of `grid`.
+
+    Raises:
+        InputError: as `read_raster` does, and for another size, resolution or origin than that of `grid`.
+    """
+    other = read_map(path, connectivity=grid.connectivity)
+    check_geometry(path, other.shape, other.resolution, other.origin, grid)
+    return other
+
+
+def check_geometry(
+    path: object, shape: tuple[int, ...], resolution: float, origin: tuple[float, float, float], grid: Grid
+) -> None:
+    """Raise `InputError` if the map in `path` has another size, resolution or origin than `grid`."""
+    if shape != grid.shape:
+        expected, actual = (" × ".join(map(str, each)) for each in (grid.shape, shape))
+        raise InputError(f"expected the map's {expected} cells, found {actual}", source=path, field="image")
+    if not np.isclose(resolution, grid.resolution):
+        message = f"expected the map's {grid.resolution} metres a cell, found {resolution}"
+        raise InputError(message, source=path, field="resolution")
+    if not np.allclose(origin, grid.origin, atol=_ORIGIN_TOLERANCE * grid.resolution):
+        raise InputError(f"expected the map's {grid.origin}, found {origin}", source=path, field="origin")
 
 
 def read_raster(path: str | Path) -> Raster:
-    """What a ROS map's files say.
+    """Return the contents of the files of a ROS map.
 
-    The image is PGM or PNG, of 8 or 16 bits, grey or in colour (then the mean of the channels counts); cells under
-    fully transparent pixels are unknown. Raises `InputError`, naming file and key, for YAML that cannot be read, lacks
-    keys or holds values of the wrong kind, and for an image that lies outside the YAML's folder, has more than
-    `MOST_PIXELS` or cannot be decoded.
+    The image is PGM or PNG, of 8 or 16 bits, gray or in color (then the mean of the channels counts); cells under fully
+    transparent pixels are unknown.
+
+    Args:
+        path: the YAML file.
+
+    Raises:
+        InputError: naming file and key, for YAML that cannot be read, lacks keys or has values of the wrong kind, and
+            for an image that is outside the folder of the YAML file, has more than `MOST_PIXELS` or cannot be decoded.
     """
     path = Path(path)
     settings = _settings(path)
@@ -83,21 +126,35 @@ def read_raster(path: str | Path) -> Raster:
     if free >= occupied:
         message = f"expected less than occupied_thresh ({occupied}), found {free}"
         raise InputError(message, source=path, field="free_thresh")
-    origin, negate, mode = _origin(settings, path), _negate(settings, path), _mode(settings, path)
-    grey, transparent = _grey(_image_path(settings, path))
-    occupancy = _occupancy(grey, negate, mode)
+    origin, mode = _origin(settings, path), settings.get("mode", "trinary")
+    negate = _one_of(_entry(settings, "negate", path), (0, 1), "0 or 1", "negate", path)
+    _one_of(mode, ("trinary", "scale", "raw"), "trinary, scale or raw", "mode", path)
+    gray, transparent = _gray(_image_path(settings, path))
+    occupancy = _occupancy(gray, bool(negate), mode)
     occupancy[transparent] = np.nan
     return Raster(occupancy, mode, resolution, origin, occupied, free)
 
 
 def write_map(path: str | Path, blocked: Float[np.ndarray, "rows columns"], grid: Grid) -> None:
-    """Write P(blocked), one value from 0 to 1 a cell, as a ROS map in `scale` mode: `NAME.yaml` and
-    `NAME.pgm`.
+    """Write P(blocked) as a ROS map in `scale` mode: `NAME.yaml` and `NAME.pgm`.
 
-    A pixel is 255·(1 − p) rounded; resolution and origin are the grid's, to the last digit. Both files
-    appear whole or not at all, the image first. Raises `InputError` for a name that does not end in .yaml
-    or .yml, an array of another shape than the grid, and values outside 0…1.
+    A pixel is 255·(1 − p) rounded; resolution and origin are those of the grid, to the last digit. Both files appear
+    whole or not at all, the image first.
+
+    Args:
+        path: a name that ends in .yaml or .yml.
+        blocked: P(blocked) of each cell, from 0 to 1.
+        grid: the geometry of the map.
+
+    Raises:
+        InputError: for another ending, an array of another shape than the grid, and values outside 0…1.
+
+    Example:
+        >>> write_map("learned.yaml", blocked, grid)  # doctest: +SKIP
     """
+    import yaml
+    from PIL import Image
+
     path = Path(path)
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise InputError("expected a file whose name ends in .yaml or .yml", source=path)
@@ -122,7 +179,9 @@ def write_map(path: str | Path, blocked: Float[np.ndarray, "rows columns"], grid
 
 
 def _settings(path: Path) -> dict[str, Any]:
-    """The mapping that a YAML file holds."""
+    """Return the mapping in a YAML file."""
+    import yaml
+
     content = read_whole(path)
     try:
         settings = yaml.safe_load(content)
@@ -134,14 +193,14 @@ def _settings(path: Path) -> dict[str, Any]:
 
 
 def _entry(settings: dict[str, Any], key: str, path: Path) -> Any:
-    """The value of a required key."""
+    """Return the value of a required key."""
     if settings.get(key) is None:
         raise InputError("the key is missing", source=path, field=key)
     return settings[key]
 
 
 def _number(value: object, key: str, path: Path) -> float:
-    """A finite number; also from text, for YAML takes 5e-2 for text where ROS takes it for a number."""
+    """Return a finite number, also from text: 5e-2 is text in YAML and a number in ROS."""
     try:
         number = math.nan if isinstance(value, bool) else float(value)  # pyright: ignore[reportArgumentType]
     except (TypeError, ValueError, OverflowError):
@@ -152,7 +211,7 @@ def _number(value: object, key: str, path: Path) -> float:
 
 
 def _origin(settings: dict[str, Any], path: Path) -> tuple[float, float, float]:
-    """x, y (metres) and yaw (radians) of the lower-left corner."""
+    """Return x, y (metres) and yaw (radians) of the lower-left corner."""
     origin = _entry(settings, "origin", path)
     if not isinstance(origin, list) or len(origin) != 3:
         raise InputError(f"expected three numbers [x, y, yaw], found {origin!r}", source=path, field="origin")
@@ -160,24 +219,14 @@ def _origin(settings: dict[str, Any], path: Path) -> tuple[float, float, float]:
     return x, y, yaw
 
 
-def _negate(settings: dict[str, Any], path: Path) -> bool:
-    """Whether white stands for occupied."""
-    negate = _entry(settings, "negate", path)
-    if negate not in (0, 1):
-        raise InputError(f"expected 0 or 1, found {negate!r}", source=path, field="negate")
-    return bool(negate)
-
-
-def _mode(settings: dict[str, Any], path: Path) -> str:
-    """How pixels are read."""
-    mode = settings.get("mode", "trinary")
-    if mode not in ("trinary", "scale", "raw"):
-        raise InputError(f"expected trinary, scale or raw, found {mode!r}", source=path, field="mode")
-    return mode
+def _one_of(value: Any, allowed: tuple[Any, ...], expected: str, key: str, path: Path) -> Any:
+    if value not in allowed:
+        raise InputError(f"expected {expected}, found {value!r}", source=path, field=key)
+    return value
 
 
 def _image_path(settings: dict[str, Any], path: Path) -> Path:
-    """Where the image lies, which has to be in the YAML's own folder or below, links followed."""
+    """Return the path of the image, which must be in the folder of the YAML file or below, links followed."""
     name = _entry(settings, "image", path)
     if not isinstance(name, str) or not name:
         raise InputError(f"expected the name of an image, found {name!r}", source=path, field="image")
@@ -194,13 +243,18 @@ def _image_path(settings: dict[str, Any], path: Path) -> Path:
     return path.parent / name
 
 
-def _grey(path: Path) -> tuple[Float[np.ndarray, "rows columns"], Bool[np.ndarray, "rows columns"]]:
-    """The grey value of each pixel on a scale of 0 to 255, and which pixels are fully transparent."""
+def _gray(path: Path) -> tuple[Float[np.ndarray, "rows columns"], Bool[np.ndarray, "rows columns"]]:
+    """Return the gray value of each pixel on a scale of 0 to 255, and which pixels are fully transparent."""
+    from PIL import Image
+
     try:
         # Pillow warns of large images and of oddities in headers without naming the file.
         with warnings.catch_warnings(action="ignore"), Image.open(path, formats=("PPM", "PNG")) as image:
-            _refuse_absurd_size(image.size, path)
-            return _grey_of_image(image)
+            width, height = image.size
+            if not 0 < width * height <= MOST_PIXELS:
+                message = f"expected from 1 to {MOST_PIXELS:,} pixels, found {width:,} by {height:,}"
+                raise InputError(message, source=path)
+            return _gray_of_image(image)
     except InputError:
         raise
     except Image.DecompressionBombError as error:
@@ -209,33 +263,24 @@ def _grey(path: Path) -> tuple[Float[np.ndarray, "rows columns"], Bool[np.ndarra
         raise InputError(f"expected an image in PGM or PNG format: {error}", source=path) from error
 
 
-def _refuse_absurd_size(size: tuple[int, int], path: Path) -> None:
-    """Refuse images that no map needs, or that hold nothing."""
-    width, height = size
-    if not 0 < width * height <= MOST_PIXELS:
-        message = f"expected from 1 to {MOST_PIXELS:,} pixels, found {width:,} by {height:,}"
-        raise InputError(message, source=path)
-
-
-def _grey_of_image(
-    image: Image.Image,
+def _gray_of_image(
+    image: "Image.Image",
 ) -> tuple[Float[np.ndarray, "rows columns"], Bool[np.ndarray, "rows columns"]]:
-    """`_grey` of an opened image."""
     if image.mode.startswith("I"):  # 16 bits a pixel
-        grey = np.asarray(image, dtype=np.float64) * (255 / 65535)
-        return grey, np.zeros(grey.shape, dtype=bool)
-    if image.mode in ("1", "L") and "transparency" not in image.info:
-        grey = np.asarray(image.convert("L"), dtype=np.float64)
-        return grey, np.zeros(grey.shape, dtype=bool)
-    if image.mode == "F":
+        gray = np.asarray(image, dtype=np.float64) * (255 / 65535)
+    elif image.mode in ("1", "L") and "transparency" not in image.info:
+        gray = np.asarray(image.convert("L"), dtype=np.float64)
+    elif image.mode == "F":
         raise ValueError("the pixels are fractions, as in PFM")
-    channels = np.asarray(image.convert("RGBA"))
-    return channels[..., :3].mean(axis=-1), channels[..., 3] == 0
+    else:
+        channels = np.asarray(image.convert("RGBA"))
+        return channels[..., :3].mean(axis=-1), channels[..., 3] == 0
+    return gray, np.zeros(gray.shape, dtype=bool)
 
 
-def _occupancy(grey: Float[np.ndarray, "rows columns"], negate: bool, mode: str) -> Float[np.ndarray, "rows columns"]:
-    """How occupied each cell is, from 0 to 1; NaN where the map does not say."""
+def _occupancy(gray: Float[np.ndarray, "rows columns"], negate: bool, mode: str) -> Float[np.ndarray, "rows columns"]:
+    """Return the occupancy of each cell, from 0 to 1; NaN where the map has none."""
     if mode == "raw":  # `negate` has no meaning here, as in Nav2.
-        percent = np.rint(grey)
+        percent = np.rint(gray)
         return np.where(percent <= 100, percent / 100, np.nan)
-    return grey / 255 if negate else (255 - grey) / 255
+    return gray / 255 if negate else (255 - gray) / 255

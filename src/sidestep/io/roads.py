@@ -1,4 +1,4 @@
-"""Road networks and trips in files: links, the turns between them, and which links each trip took.
+"""Road networks and trips in files: links, the turns between them, and the links of each trip.
 
 Three tables (CSV or Parquet), each with any number of other columns:
 
@@ -14,30 +14,36 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pyarrow as pa
 from jaxtyping import Bool, Float, Int
 
 from sidestep.errors import InputError
-from sidestep.io.tables import check_columns, finite_column, read_table
+from sidestep.io.tables import check_columns, check_rows, finite_column, read_table
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.tasks import reach
 
+if TYPE_CHECKING:
+    import pyarrow as pa
+
 EIGHTHS = 8
-"""In how many directions a turn can lead."""
+"""The number of directions of turns."""
 
 
 @dataclass(frozen=True, eq=False)
 class Roads:
     """A road network; links are numbered in the order of their table.
 
-    - `labels`: of each link.
-    - `begins`, `ends`: the nodes of each link, numbered.
-    - `lengths`: metres.
-    - `one_way`: which links are said to be the only direction of their road.
-    - `turns`: from which link to which; `directions`: of each turn, in eighths of a circle, 0 straight on.
+    Attributes:
+        labels: the label of each link.
+        begins: the number of the node where each link begins.
+        ends: the number of the node where each link ends.
+        lengths: the length of each link in metres.
+        one_way: whether each link is the only direction of its road.
+        turns: the two links of each turn.
+        directions: of each turn, in eighths of a circle, 0 straight on.
     """
 
     labels: list[str]
@@ -49,44 +55,48 @@ class Roads:
     directions: Int[np.ndarray, " turns"]
 
     def __len__(self) -> int:
-        """The number of links."""
+        """Return the number of links."""
         return len(self.labels)
 
 
 def read_roads(links: str | Path, turns: str | Path) -> Roads:
-    """The road network in a table of links and one of turns.
+    """Return the road network in a table of links and a table of turns.
 
-    Raises `InputError`, naming file, row and column, for columns that are missing, links that repeat or are not there,
-    lengths that are not above 0, turns that repeat or lead onto a link that begins elsewhere, and directions other than
-    0…7.
+    Raises:
+        InputError: naming file, row and column, for columns that are missing, links that repeat or do not exist,
+            lengths that are not above 0, turns that repeat or lead onto a link that begins elsewhere, and directions
+            other than 0…7.
 
-    >>> roads = read_roads("links.csv", "turns.csv")  # doctest: +SKIP
+    Example:
+        >>> roads = read_roads("links.csv", "turns.csv")  # doctest: +SKIP
     """
     table = _read(links, ("link", "from_node", "to_node", "length_m", "oneway"))
     labels = _labels(table, "link", links)
-    _refuse(_repeats(np.asarray(labels)), links, "link", "the link appears more than once")
+    check_rows(_is_first(np.asarray(labels)), "the link appears more than once", links, "link")
     nodes = np.asarray([_labels(table, name, links) for name in ("from_node", "to_node")])
     begins, ends = np.unique(nodes, return_inverse=True)[1].reshape(nodes.shape)
     lengths = finite_column(table, "length_m", str(links))
-    _refuse(lengths <= 0, links, "length_m", "expected metres above 0")
+    check_rows(lengths > 0, "expected metres above 0", links, "length_m")
     one_way = _whole(table, "oneway", links, 1) == 1
     table = _read(turns, ("link", "action", "next_link"))
     number = {label: index for index, label in enumerate(labels)}
     pairs = np.stack([_numbered(table, name, turns, number, links) for name in ("link", "next_link")], axis=1)
     meets = ends[pairs[:, 0]] == begins[pairs[:, 1]]
-    _refuse(~meets, turns, "next_link", "expected a link that begins where the first one ends")
-    _refuse(_repeats(pairs), turns, "next_link", "the turn appears more than once")
+    check_rows(meets, "expected a link that begins where the first one ends", turns, "next_link")
+    check_rows(_is_first(pairs), "the turn appears more than once", turns, "next_link")
     return Roads(labels, begins, ends, lengths, one_way, pairs, _whole(table, "action", turns, EIGHTHS - 1))
 
 
 def read_trips(path: str | Path, roads: Roads) -> list[Int[np.ndarray, " _"]]:
-    """The links of each trip in a table, numbered as in `roads`.
+    """Return the links of each trip in a table, numbered as in `roads`.
 
-    Raises `InputError`, naming file, row and column, for columns that are missing, links that are not there, trips of
-    fewer than two links, without a turn from one link to the next, that begin or end elsewhere than at their origin and
-    destination, or that go on after they have reached it.
+    Raises:
+        InputError: naming file, row and column, for columns that are missing, links that do not exist, trips of fewer
+            than two links, without a turn from one link to the next, that begin or end elsewhere than at their origin
+            and destination, or that continue after they have reached it.
 
-    >>> trips = read_trips("trips.csv", roads)  # doctest: +SKIP
+    Example:
+        >>> trips = read_trips("trips.csv", roads)  # doctest: +SKIP
     """
     table = _read(path, ("trip", "origin", "destination", "links"))
     number = {label: index for index, label in enumerate(roads.labels)}
@@ -96,33 +106,39 @@ def read_trips(path: str | Path, roads: Roads) -> list[Int[np.ndarray, " _"]]:
     for row, (cell, (origin, destination)) in enumerate(zip(_labels(table, "links", path), ends, strict=True), start=1):
         trip = cell.split()
         _check_trip(trip, number, turns, path, row)
-        for field, given, found in (("origin", origin, trip[0]), ("destination", destination, trip[-1])):
-            if given != found:
-                raise InputError(f"expected {found}, as in its links, found {given}", source=path, row=row, field=field)
+        for field, label, link in (("origin", origin, trip[0]), ("destination", destination, trip[-1])):
+            if label != link:
+                raise InputError(f"expected {link}, as in its links, found {label}", source=path, row=row, field=field)
         if destination in trip[:-1]:
-            raise InputError("goes on after it has reached its destination", source=path, row=row, field="links")
+            raise InputError("continues after it has reached its destination", source=path, row=row, field="links")
         trips.append(np.asarray([number[link] for link in trip]))
     return trips
 
 
-def demonstrations_of_trips(
+def demonstrations_from_trips(
     trips: Sequence[Int[np.ndarray, " _"]], graph: Graph, *, discount: float = 1.0, step_cost: float | None = 1.0
 ) -> Demonstrations:
-    """Demonstrations on the graph of a road network (`road_network`), one task for every destination.
+    """Return demonstrations on the graph of a road network (`road_network`), with one task for every destination.
 
-    `discount` and `step_cost` are those of `reach`. Raises `InputError`, naming the trip, for one without a turn from
-    one link to the next.
+    Args:
+        trips: the links of each trip, from `read_trips`.
+        graph: the graph of the road network.
+        discount: γ in (0, 1], as in `reach`.
+        step_cost: the cost of a metre, as in `reach`.
+
+    Raises:
+        InputError: naming the trip, for one without a turn from one link to the next.
     """
-    onto = np.asarray(graph.successors)[:, :, 0]
+    next_links = np.asarray(graph.successors)[:, :, 0]
     goals, task = np.unique([trip[-1] for trip in trips], return_inverse=True)
-    walks = []
+    trajectories = []
     for row, (trip, goal) in enumerate(zip(trips, task.tolist(), strict=True), start=1):
-        leads = onto[trip[:-1]] == trip[1:, None]
-        if not leads.any(axis=1).all():
+        matches = next_links[trip[:-1]] == trip[1:, None]
+        if not matches.any(axis=1).all():
             raise InputError("expected a turn from each link to the next", source="trip", row=row)
-        walks.append(Trajectory(trip, leads.argmax(axis=1), goal))
+        trajectories.append(Trajectory(trip, matches.argmax(axis=1), goal))
     tasks = [reach(graph, int(goal), discount=discount, step_cost=step_cost) for goal in goals]
-    return gather(walks, tasks)
+    return gather(trajectories, tasks)
 
 
 def _check_trip(trip: list[str], number: dict[str, int], turns: set[tuple[int, int]], path: object, row: int) -> None:
@@ -136,8 +152,8 @@ def _check_trip(trip: list[str], number: dict[str, int], turns: set[tuple[int, i
             raise InputError(f"there is no turn from {one} to {other}", source=path, row=row, field="links")
 
 
-def _read(path: str | Path, names: tuple[str, ...]) -> pa.Table:
-    """A table that has these columns, and rows."""
+def _read(path: str | Path, names: tuple[str, ...]) -> "pa.Table":
+    """Return a table that has these columns, and rows."""
     table = read_table(path, labels=tuple(name for name in names if name != "length_m"))
     check_columns(table, names, str(path))
     if not len(table):
@@ -145,8 +161,8 @@ def _read(path: str | Path, names: tuple[str, ...]) -> pa.Table:
     return table
 
 
-def _labels(table: pa.Table, name: str, path: object) -> list[str]:
-    """A column as text, which may not be empty anywhere."""
+def _labels(table: "pa.Table", name: str, path: object) -> list[str]:
+    """Return a column without empty cells as text."""
     cells = table[name].to_pylist()
     if None in cells:
         raise InputError("expected a label, found an empty cell", source=path, row=cells.index(None) + 1, field=name)
@@ -154,9 +170,9 @@ def _labels(table: pa.Table, name: str, path: object) -> list[str]:
 
 
 def _numbered(
-    table: pa.Table, name: str, path: object, number: dict[str, int], links: object
+    table: "pa.Table", name: str, path: object, number: dict[str, int], links: object
 ) -> Int[np.ndarray, " rows"]:
-    """A column of labels of links, as their numbers."""
+    """Return the numbers of the links in a column of labels."""
     labels = _labels(table, name, path)
     for row, label in enumerate(labels, start=1):
         if label not in number:
@@ -164,20 +180,15 @@ def _numbered(
     return np.asarray([number[label] for label in labels])
 
 
-def _whole(table: pa.Table, name: str, path: object, most: int) -> Int[np.ndarray, " rows"]:
-    """A column of whole numbers from 0."""
+def _whole(table: "pa.Table", name: str, path: object, most: int) -> Int[np.ndarray, " rows"]:
+    """Return a column of whole numbers from 0."""
     values = finite_column(table, name, str(path))
-    _refuse((values < 0) | (values > most) | (values % 1 != 0), path, name, f"expected a whole number, 0…{most}")
+    valid = (values >= 0) & (values <= most) & (values % 1 == 0)
+    check_rows(valid, f"expected a whole number, 0…{most}", path, name)
     return values.astype(np.int64)
 
 
-def _repeats(values: np.ndarray) -> Bool[np.ndarray, " rows"]:
-    """Which rows are like an earlier one."""
+def _is_first(values: np.ndarray) -> Bool[np.ndarray, " rows"]:
+    """Return which rows differ from all rows before them."""
     first = np.unique(values, axis=0, return_index=True)[1]
-    return ~np.isin(np.arange(len(values)), first)
-
-
-def _refuse(bad: Bool[np.ndarray, " rows"], path: object, field: str, message: str) -> None:
-    """Refuses the first bad row."""
-    if bad.any():
-        raise InputError(message, source=path, row=int(np.argmax(bad)) + 1, field=field)
+    return np.isin(np.arange(len(values)), first)

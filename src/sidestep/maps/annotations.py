@@ -11,7 +11,7 @@ from sidestep.errors import InputError
 from sidestep.inference.fit import Fit
 from sidestep.inference.maximize import Progress
 from sidestep.inference.priors import Normal
-from sidestep.io.demonstrations import demonstrations_from_moves, pursuing_moves
+from sidestep.io.demonstrations import demonstrations_from_moves
 from sidestep.io.gridding import Moves
 from sidestep.io.walks import Walks
 from sidestep.maps.config import Settings, fit_map
@@ -96,8 +96,8 @@ def fit_walks(
     if whose.person is None:
         found = fit_map(model, demonstrations, settings, report, each=prior, **how)
         return Found(found, settings, demonstrations, {})
-    said = walks.of_each(whose.person)
-    names = [said[walk] for walk in np.unique(moves.walk[pursuing_moves(moves)]).tolist()]
+    said = walks.per_walk(whose.person)
+    names = [said[walk] for walk in np.unique(moves.before_goal().walk).tolist()]
     persons = list(dict.fromkeys(names))
     demonstrations, person = split_by_person(demonstrations, np.array([persons.index(name) for name in names]))
     settings = replace(settings, unknown=tuple(dict.fromkeys((*settings.unknown, "sharpness"))))

@@ -8,18 +8,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 from jaxtyping import Int
-from scipy.sparse.csgraph import connected_components
 
 from sidestep.errors import InputError
 from sidestep.inference.fit import Fit
 from sidestep.inference.goals import GoalFit, fit_goals
 from sidestep.inference.maximize import Progress
 from sidestep.inference.priors import Normal
+from sidestep.io.demonstrations import connected_regions
 from sidestep.io.gridding import Moves
 from sidestep.io.tables import check_columns, finite_column, read_table, write_table
 from sidestep.maps.config import Settings, fit_map
-from sidestep.tabular.demonstrations import Demonstrations, Trajectory
-from sidestep.tabular.graph import walkable_graph
+from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.tasks import reach
@@ -72,7 +71,7 @@ def read_candidates(path: Path, grid: Grid, moves: Moves) -> Int[np.ndarray, " c
     _refuse(~grid.contains(places), path, "expected a place on the map")
     states = grid.states(places)
     _refuse(grid.known.reshape(-1)[states] == Cell.OCCUPIED, path, "expected a place outside known obstacles")
-    part = connected_components(walkable_graph(grid.passable()), directed=False)[1]
+    part = connected_regions(grid)
     _refuse(~(part[states][:, None] == part[moves.states]).all(axis=1), path, "expected a place that all can reach")
     first = np.unique(states, return_index=True)[1]
     _refuse(~np.isin(np.arange(len(states)), first), path, "expected a cell of its own for every candidate")
@@ -103,17 +102,10 @@ def fit_candidates(
     def learn(present: ObstacleGrid, shown: Demonstrations) -> Fit[ObstacleGrid]:
         return fit_map(present, shown, settings, report, each=prior, afresh=present is model)
 
-    found = fit_goals(model, trajectories_of_moves(moves), tasks, settings.behavior(), learn)
+    found = fit_goals(model, moves.trajectories(), tasks, settings.behavior(), learn)
     goals = moves.goals.copy()
     goals[walks] = candidates[found.posterior.argmax(axis=1)]
     return GoalPosterior(found, walks, candidates, replace(moves, goals=goals))
-
-
-def trajectories_of_moves(moves: Moves) -> list[Trajectory]:
-    """One trajectory, of a task of no matter, for each walk that moves."""
-    starts = np.flatnonzero(np.diff(moves.walk)) + 1
-    parts = zip(*(np.split(each, starts) for each in (moves.states, moves.actions, moves.next_states)), strict=True)
-    return [Trajectory(np.append(states, after[-1]), actions, 0) for states, actions, after in parts]
 
 
 def write_posterior(path: Path, guessed: GoalPosterior, labels: list[object], grid: Grid) -> None:

@@ -45,7 +45,7 @@ def read_positions(dataset: str) -> pa.Table:
 
 
 def write_positions(dataset: str, table: pa.Table) -> None:
-    """Write a table of walks, as `table_of_walks` makes it, as a local Minari dataset, whole or not at all.
+    """Write a table of walks, as `table_from_walks` makes it, as a local Minari dataset, whole or not at all.
 
     Raises `InputError` for an id that is malformed or taken, a table without rows, and a column that is neither numbers
     nor text, or has gaps.
