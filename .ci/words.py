@@ -121,8 +121,9 @@ def main() -> int:
                 problems += phrases(python_prose(text), f"{PHRASES}|{OPTIONS}")
         elif path.parts[0] in ("docs", "README.md"):
             problems += phrases(iter([(1, text)]), f"{PHRASES}|{OPTIONS}")
-            named = re.compile(rf"`[^`]*\b({'|'.join(sorted(NAMES))})\b[^`]*`")
-            problems += [(text[: m.start()].count("\n") + 1, f"name {m[1]}") for m in named.finditer(text)]
+            for line, content in enumerate(text.splitlines(), 1):
+                words = re.findall(r"\w+", " ".join(re.findall(r"`([^`]+)`", content)))
+                problems += [(line, f"name {word}") for word in words if word in NAMES]
         results += [f"{path}:{line}: {problem}" for line, problem in sorted(problems)]
     print("\n".join(results))
     return min(len(results), 1)
