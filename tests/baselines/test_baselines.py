@@ -8,16 +8,22 @@ import pytest
 from sidestep.baselines import behavior_cloning as cloning
 from sidestep.baselines.behavior_cloning import behavior_cloning
 from sidestep.baselines.constraint_inference import constraint_inference
-from sidestep.baselines.interface import behavior_aware, known_map, transitions_only, visit_counts
+from sidestep.baselines.interface import (
+    behavior_aware,
+    model_result,
+    transitions_only,
+    visit_counts,
+)
 from sidestep.baselines.joint import joint_estimation
 from sidestep.baselines.maxent_irl import CostlyReward, maxent_irl
 from sidestep.evaluation.study import mean_log_likelihood
-from sidestep.maps.config import Settings
+from sidestep.maps.config import BehaviorConfig, MapConfig, PriorConfig
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
 from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid, true_model
 from sidestep.tabular.planning import plan
+from sidestep.tabular.reward import Reward
 from sidestep.tabular.simulation import simulate
 from sidestep.tabular.tasks import reach, with_state_costs
 
@@ -39,7 +45,7 @@ def walks():
 @pytest.mark.parametrize("method", [behavior_aware, constraint_inference, joint_estimation])
 def test_a_wall_that_stood_in_the_way_is_found(method, walks):
     """All of it that anybody would have crossed, which is more than every cell that nobody visited."""
-    learned = method(BLANK, walks, Settings())
+    learned = method(BLANK, walks, MapConfig())
     assert learned.ranking[WALL == 1].min() > learned.ranking[WALL == 0].max()
     assert (np.asarray(learned.model.blocked)[WALL == 1] > 0.5).all()
     path = plan(learned.model, learned.reward.reach(BLANK, 4)).path_from(0)
@@ -50,7 +56,7 @@ def test_a_wall_that_stood_in_the_way_is_found(method, walks):
 def test_visits_are_counted():
     walk = Trajectory(np.array([0, 1, 2, 1, 2, 7]), np.array([3, 3, 2, 3, 1]), 0)
     demos = gather([walk], [reach(BLANK, 7)])
-    learned = visit_counts(BLANK, demos, Settings())
+    learned = visit_counts(BLANK, demos, MapConfig())
     blocked = np.asarray(learned.model.blocked).ravel()
     np.testing.assert_allclose(blocked[[0, 1, 2, 7]], [1 / 2, 1 / 3, 1 / 3, 1 / 2])
     np.testing.assert_allclose(np.delete(blocked, [0, 1, 2, 7]), 0.98)
@@ -58,15 +64,15 @@ def test_visits_are_counted():
 
 
 def test_transitions_alone_say_nothing_of_what_nobody_touched(walks):
-    blocked = np.asarray(transitions_only(BLANK, walks, Settings(lines=0.0)).model.blocked)
-    prior = 1 / (1 + np.exp(-Settings().prior_mean))
+    blocked = np.asarray(transitions_only(BLANK, walks, MapConfig(prior=PriorConfig(wall_prior=0.0))).model.blocked)
+    prior = 1 / (1 + np.exp(-MapConfig().prior.mean))
     np.testing.assert_allclose(blocked[WALL == 1], prior, atol=1e-4)
     assert blocked[WALL == 0].max() < prior
 
 
 def test_costs_explain_detours_without_walls(walks):
     """They are highest where people would have walked, no move fails, and plans go round what is dear."""
-    learned = maxent_irl(BLANK, walks, Settings())
+    learned = maxent_irl(BLANK, walks, MapConfig())
     assert np.asarray(learned.model.blocked).max() == 0
     assert learned.ranking[1:4, 2].min() > learned.ranking[WALL == 0].mean()
     path = plan(learned.model, learned.reward.reach(BLANK, 9)).path_from(5)
@@ -79,7 +85,7 @@ def test_costs_are_what_makes_actions_most_probable():
     grid = Grid(known)
     around = Trajectory(np.array([3, 0, 1, 2, 5]), np.array([0, 3, 3, 1]), 0)
     under = Trajectory(np.array([3, 6, 7, 8, 5]), np.array([1, 3, 3, 0]), 0)
-    settings = Settings(beta=40.0)
+    settings = MapConfig(behavior=BehaviorConfig(beta=40.0))
     demos = gather([around] * 60 + [under] * 40, [reach(grid, 5)])
     learned = maxent_irl(grid, demos, settings)
     task = learned.reward.reach(grid, 5)
@@ -96,7 +102,7 @@ def test_constraints_end_where_the_walls_end():
     starts = [np.setdiff1d(np.arange(25), [0, 24, 12])] * 2
     world = ObstacleGrid(BLANK, jnp.full(25, -20.0))
     demos = gather(simulate(jax.random.key(1), world, tasks, starts, Behavior(BoltzmannAverage(), 7.0)), tasks)
-    assert np.asarray(constraint_inference(BLANK, demos, Settings()).model.blocked).max() < 0.5
+    assert np.asarray(constraint_inference(BLANK, demos, MapConfig()).model.blocked).max() < 0.5
 
 
 def test_joint_tells_a_costly_floor_from_a_wall():
@@ -108,7 +114,7 @@ def test_joint_tells_a_costly_floor_from_a_wall():
     disliked = [with_state_costs(task, jnp.asarray(0.1 * carpet), room.graph.successors[..., 0]) for task in plain]
     starts = [np.repeat(np.setdiff1d(np.arange(25), [goal]), 4) for goal in goals]
     walks = simulate(jax.random.key(0), room, disliked, starts, Behavior(LogSumExp(), 40.0))
-    learned = joint_estimation(BLANK, gather(walks, plain), Settings(beta=40.0))
+    learned = joint_estimation(BLANK, gather(walks, plain), MapConfig(behavior=BehaviorConfig(beta=40.0)))
     assert isinstance(learned.reward, CostlyReward)
     assert learned.reward.costs is not None
     np.testing.assert_allclose(learned.reward.costs[carpet == 1], 0.1, atol=0.03)
@@ -129,7 +135,7 @@ def walk(*states):
 def test_cloning_does_what_was_demonstrated_in_a_corridor():
     """To one end; what was done nowhere is thought possible, and a known obstacle is not walked into."""
     corridor = Grid(np.array([[-1, -1, -1, -1, 1]]))
-    learned = behavior_cloning(corridor, gather([walk(0, 1, 2, 3)], [reach(corridor, 3)]), Settings())
+    learned = behavior_cloning(corridor, gather([walk(0, 1, 2, 3)], [reach(corridor, 3)]), MapConfig())
     policy = learned.policy(3)
     assert (policy[:3].argmax(axis=1) == 3).all()
     assert policy[:3, 3].min() > 0.5
@@ -147,7 +153,7 @@ def test_cloning_generalises_to_goals_that_nobody_had():
     starts = [np.random.default_rng(goal).choice(np.delete(np.arange(49), 24), 12) for goal in range(5)]
     starts = [own[own != goal] for own, goal in zip(starts, (0, 6, 42, 48, 24), strict=True)]
     shown = gather(simulate(jax.random.key(2), true_model(room.passable()), tasks, starts), tasks)
-    learned = behavior_cloning(room, shown, Settings())
+    learned = behavior_cloning(room, shown, MapConfig())
     for goal in (10, 20, 33, 45):
         others = np.delete(np.arange(49), goal)
         shortest = [abs(start // 7 - goal // 7) + abs(start % 7 - goal % 7) for start in others]
@@ -159,25 +165,25 @@ def test_cloning_generalises_to_goals_that_nobody_had():
 @pytest.mark.parametrize(("logit", "found"), [(8.0, True), (20.0, False)])
 def test_what_people_do_cannot_be_told_where_they_have_no_values(logit, found, walks):
     """Once in a hundred million tries somebody gets through a wall, and each try costs: values are out of reach."""
-    paying = Settings(discount=1.0, step_cost=1.0, beta=0.5)
+    paying = MapConfig(Reward(1.0, 1.0), BehaviorConfig(beta=0.5))
     walled = ObstacleGrid(BLANK, jnp.where(jnp.arange(25) % 5 == 1, logit, -3.0))
-    nats = mean_log_likelihood(known_map(walled, walks, paying), walks)
+    nats = mean_log_likelihood(model_result(walled, walks, paying), walks)
     assert (nats is not None) == found
     if nats is not None:
-        assert nats == pytest.approx(float(known_map(walled, walks, paying).log_policies(walks).mean()))
+        assert nats == pytest.approx(float(model_result(walled, walks, paying).log_policies(walks).mean()))
 
 
 def test_cloning_is_particular_to_places():
     """The goal is four cells to the right, and people go straight there in one row, and by another row in another."""
     straight, around = walk(5, 6, 7, 8, 9), walk(15, 10, 11, 12, 13, 14, 19)._replace(task=1)
     shown = gather([straight, around] * 5, [reach(BLANK, goal) for goal in (9, 19)])
-    learned = behavior_cloning(BLANK, shown, Settings())
+    learned = behavior_cloning(BLANK, shown, MapConfig())
     assert learned.planner.plan_to(9).paths_from(np.array([5]))[0].tolist() == straight.states.tolist()
     assert learned.planner.plan_to(19).paths_from(np.array([15]))[0].tolist() == around.states.tolist()
 
 
 def test_cloning_takes_actions_to_be_as_probable_as_its_policy_says(walks):
-    learned = behavior_cloning(BLANK, walks, Settings())
+    learned = behavior_cloning(BLANK, walks, MapConfig())
     assert learned.ranking is learned.shares is None
     each = learned.log_policies(walks)
     for move in (0, 17, len(walks) - 1):
@@ -189,4 +195,4 @@ def test_cloning_takes_actions_to_be_as_probable_as_its_policy_says(walks):
 @pytest.mark.parametrize(("most", "converged"), [(1, False), (2000, True)])
 def test_cloning_says_whether_it_converged(walks, monkeypatch, most, converged):
     monkeypatch.setattr(cloning, "_ITERATIONS", most)
-    assert behavior_cloning(BLANK, walks, Settings()).converged == converged
+    assert behavior_cloning(BLANK, walks, MapConfig()).converged == converged

@@ -1,5 +1,7 @@
 """The command line's manners: help, exit codes, and one line for everything that is wrong with the input."""
 
+from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -7,8 +9,10 @@ import pytest
 import yaml
 from PIL import Image
 
-from sidestep.cli import app as cli
+import sidestep
+from sidestep.cli import display
 from sidestep.cli.app import main
+from sidestep.cli.options import present_spelling
 from sidestep.io.maps import write_map
 from sidestep.tabular.grid import Grid
 
@@ -157,9 +161,9 @@ def test_images_of_absurd_size(here, capsys):
     ("--prior-variance 0", "field 'prior variance'"),
     ("--prior-mean inf", "field 'prior mean'"),
     ("--horizon 0", "at least one action"),
-    ("--iterations 0", "field 'iterations'"),
-    ("--sample 0", "field 'sample'"),
-    ("--sample 2", "field 'sample'"),
+    ("--max-iterations 0", "field 'max_iterations'"),
+    ("--max-walks 0", "field 'max_walks'"),
+    ("--max-walks 2", "field 'max_walks'"),
     ("--backup logsumexp --discount 1 --step-cost 1 --beta 1", "log-sum-exp"),
 ])  # fmt: skip
 def test_bad_settings(here, capsys, options, expected):
@@ -178,7 +182,7 @@ def test_walks_whose_goal_is_walled_off(here, capsys):
     ("learn walks.txt --map map.yaml --out out", "walks.txt"),
     ("learn walks.csv --map none.yaml --out out", "none.yaml"),
     ("plan nowhere --start 1,1 --goal 2,2", "summary.json"),
-    ("evaluate nowhere --truth map.yaml", "summary.json"),
+    ("evaluate nowhere --true-map map.yaml", "summary.json"),
     ("simulate none.yaml --out new.csv", "none.yaml"),
     ("simulate map.yaml --out new.csv", "free cells"),
     ("simulate map.yaml --out new.csv --walks 0", "field 'walks'"),
@@ -214,40 +218,49 @@ class TestWithALearnedMap:
             ("plan learned --start nan,0.5 --goal 0.5,0.5", "field 'start'", "outside the map"),
             ("plan learned --start 0.5,0.5 --goal 1.5,1.5", "field 'goal'", "known obstacle"),
             ("plan learned --start 1.5,1.5 --goal 0.5,0.5", "field 'start'", "known obstacle"),
-            ("evaluate learned --truth other.yaml", "other.yaml", "2 × 3"),
-            ("evaluate learned --truth finer.yaml", "finer.yaml", "field 'resolution'"),
-            ("evaluate learned --truth none.yaml", "none.yaml"),
+            ("evaluate learned --true-map other.yaml", "other.yaml", "2 × 3"),
+            ("evaluate learned --true-map finer.yaml", "finer.yaml", "field 'resolution'"),
+            ("evaluate learned --true-map none.yaml", "none.yaml"),
         ):
             refused(learned, capsys, arguments, *expected)
         Path("learned/blocked.npy").write_bytes(b"broken")
         refused(learned, capsys, "plan learned --start 0.5,0.5 --goal 2.5,0.5", "blocked.npy")
-        refused(learned, capsys, "evaluate learned --truth true.yaml", "blocked.npy")
+        refused(learned, capsys, "evaluate learned --true-map true.yaml", "blocked.npy")
 
     def test_walled_off(self, learned, capsys):
         capsys.readouterr()
         blocked = np.load("learned/blocked.npy")
         blocked[1, 1] = 1
         np.save("learned/blocked.npy", blocked)
-        refused(learned, capsys, "plan learned --start 0.5,0.5 --goal 2.5,0.5", "no way from (0.5, 0.5)")
+        refused(learned, capsys, "plan learned --start 0.5,0.5 --goal 2.5,0.5", "expected a path from (0.5, 0.5)")
 
 
-def test_a_fit_that_fails_on_its_way_writes_no_map(here, capsys, monkeypatch):
-    """The reporter breaks down, as a defect of ours would: one line, no traceback, no half-written map."""
+def test_main_with_a_failing_callback_prints_one_line_and_writes_no_map(here, capsys, monkeypatch):
+    """A defect of the program: one line, no traceback, no half-written map."""
 
-    def broken(progress):
-        print(1 / (2 - progress.iteration))
+    @contextmanager
+    def failing_progress(_):
+        yield (lambda progress: print(1 / (2 - progress.iteration))), print
 
-    def learn(walks, map_file, folder, settings, _, *others):
-        return whole(walks, map_file, folder, settings, broken, *others)
-
-    whole = cli.learn  # pyright: ignore
-    monkeypatch.setattr(cli, "learn", learn)
+    monkeypatch.setattr(display, "fit_progress", failing_progress)
     assert run("learn walks.csv --map map.yaml --out out") == 1
-    told = capsys.readouterr().err
-    assert told.strip().splitlines() == [
+    assert capsys.readouterr().err.strip().splitlines() == [
         "error: sidestep failed (ZeroDivisionError: division by zero); set SIDESTEP_DEBUG=1 for details to report"
     ]
     assert written(here / "out") <= {"fit.checkpoint"}
-    monkeypatch.setenv("SIDESTEP_DEBUG", "1")
-    assert run("learn walks.csv --map map.yaml --out out") == 1
-    assert "Traceback" in capsys.readouterr().err
+
+
+def test_main_with_version_prints_the_version(capsys):
+    assert run("--version") == 0
+    assert capsys.readouterr().out.strip() == version("sidestep") == sidestep.__version__
+
+
+@pytest.mark.parametrize(("old", "present"), [
+    ("--behavior auto", "--select-behavior"),
+    ("--behavior=given", ""),
+    ("--unknown sharpness --unknown=lapses", "--learn beta --learn lapse"),
+    ("--person who --candidates g.csv", "--person-column who --goal-candidates g.csv"),
+    ("--lines 2 --sample 3 --iterations=4 --truth t", "--wall-prior 2 --max-walks 3 --max-iterations=4 --true-map t"),
+])  # fmt: skip
+def test_present_spelling_of_version_0_1_options_is_theirs_of_today(old, present):
+    assert present_spelling(old.split()) == present.split()

@@ -6,20 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from helpers.office import call, write_office
-from sidestep.cli import compare
-from sidestep.cli.compare import METHODS
-from sidestep.cli.display import console
+from helpers.office import call, summary, write_office
+from sidestep.baselines.comparison import BASELINES, compare_methods
 from sidestep.io.demonstrations import demonstrations_from_walks
 from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map, write_map
 from sidestep.io.walks import read_walks
-from sidestep.maps.config import Settings, fit_map
-from sidestep.maps.selection import choose_behavior
+from sidestep.maps.config import BehaviorConfig, FitConfig, MapConfig
+from sidestep.maps.learn import learn_map
+from sidestep.maps.selection import select_behavior
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
-from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import log_likelihood
-from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.reward import Reward
+
+METHODS = {"behavior", *BASELINES}
 
 
 @pytest.fixture(scope="module")
@@ -30,28 +30,35 @@ def office(tmp_path_factory):
     return folder
 
 
+def compare(office, out, *options):
+    files = (office / "walks.csv", "--map", office / "half.yaml", "--true-map", office / "true.yaml")
+    return call("compare", *files, "--out", out, *options)
+
+
 @pytest.fixture(scope="module")
-def compared_table(office):
+def table(office):
     """What the command prints."""
-    files = (office / "walks.csv", "--map", office / "half.yaml", "--truth", office / "true.yaml")
-    with console.capture() as captured:
-        assert call("compare", *files, "--out", office / "compared", "--seed", 3) == 0
-    return captured.get()
+    with pytest.MonkeyPatch.context() as patch:
+        lines = []
+        patch.setattr("sidestep.cli.display.print_table", lambda rows, columns: lines.append((rows, columns)))
+        assert compare(office, office / "compared", "--seed", 3) == 0
+    return lines[0]
 
 
 @pytest.fixture(scope="module")
-def compared(office, compared_table):
-    assert compared_table
-    return json.loads((office / "compared" / "summary.json").read_text())
+def compared(office, table):
+    assert table
+    return summary(office / "compared")
 
 
-def test_every_method_has_every_score(office, compared):
-    assert set(compared["methods"]) == set(METHODS)
+def test_compare_with_defaults_gives_every_method_every_score(office, compared):
+    assert set(compared["methods"]) == METHODS
     for name, scores in compared["methods"].items():
         for key in ("legal_fraction", "arriving_fraction", "heldout_log_likelihood", "seconds"):
             assert np.isfinite(scores[key])
         assert scores["arriving_fraction"] >= scores["legal_fraction"]
         assert scores["converged"] is True
+        assert scores["failure"] is None
         assert (scores["regret"] is None) == (scores["arriving_fraction"] < 1)
         for key in ("auc", "average_precision"):
             assert scores[key] is None if name == "cloning" else np.isfinite(scores[key])
@@ -60,92 +67,127 @@ def test_every_method_has_every_score(office, compared):
     assert (office / "compared" / "compare.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_one_method_cannot_do_is_no_reason_to_say_nothing_of_the_others(office, tmp_path, monkeypatch, capsys):
-    """Whose entropy is worth more to them than a step costs never arrive, so there are no costs of cells to find."""
-    monkeypatch.setattr(compare, "METHODS", {name: METHODS[name] for name in ("costs", "behavior")})
-    files = (office / "walks.csv", "--map", office / "half.yaml", "--truth", office / "true.yaml", "--out", tmp_path)
-    assert call("compare", *files, "--discount", 1, "--step-cost", 1, "--beta", 0.5) == 0
-    methods = json.loads((tmp_path / "summary.json").read_text())["methods"]
-    assert methods["costs"]["auc"] is methods["costs"]["seconds"] is None
-    assert methods["costs"]["failed"] in " ".join(capsys.readouterr().err.split())
-    assert np.isfinite(methods["behavior"]["auc"])
+def test_compare_without_held_out_walks_learns_the_map_of_learn(office, tmp_path):
+    """The one road: Python, `learn` and `compare` give the same numbers."""
+    options = ("--max-walks", 40, "--seed", 2, "--learn", "lapse")
+    assert compare(office, tmp_path / "compared", "--hold-out", 0, *options) == 0
+    arguments = ("learn", office / "walks.csv", "--map", office / "half.yaml", "--out", tmp_path / "learned")
+    assert call(*arguments, *options) == 0
+    config = MapConfig(behavior=BehaviorConfig(learn=("lapse",)), max_walks=40, seed=2)
+    learned = learn_map(read_map(office / "half.yaml"), read_walks(office / "walks.csv"), config)
+    by_learn = np.load(tmp_path / "learned" / "blocked.npy")
+    np.testing.assert_array_equal(np.load(tmp_path / "compared" / "behavior" / "blocked.npy"), by_learn)
+    np.testing.assert_array_equal(learned.blocked, by_learn)
+    assert summary(tmp_path / "compared")["methods"]["behavior"]["heldout_log_likelihood"] is None
 
 
-def test_who_has_not_converged_is_named(office, tmp_path, monkeypatch, capsys):
-    def hurried(name):
-        return lambda grid, shown, settings: METHODS[name](grid, shown, replace(settings, iterations=1))
+def test_compare_methods_with_a_method_without_values_scores_the_others(office):
+    """With a step cost below log(4)/β a log-sum-exp agent gains by walking on, so the costs have no values."""
+    grid, truth = read_map(office / "half.yaml"), read_map(office / "true.yaml")
+    config = MapConfig(Reward(1.0, 1.0), BehaviorConfig(beta=0.5))
+    baselines = {"costs": BASELINES["costs"]}
+    comparison = compare_methods(grid, truth, read_walks(office / "walks.csv"), config, baselines=baselines)
+    behavior, costs = comparison.records
+    assert (behavior.method, costs.method) == ("behavior", "costs")
+    assert costs.failure is not None
+    assert costs.result is None
+    assert costs.evaluation.auc is None
+    assert behavior.failure is None
+    assert behavior.evaluation.auc is not None
 
-    monkeypatch.setattr(compare, "METHODS", {name: hurried(name) for name in ("behavior", "visits", "joint")})
-    files = (office / "walks.csv", "--map", office / "half.yaml", "--truth", office / "true.yaml", "--out", tmp_path)
-    assert call("compare", *files) == 0
-    methods = json.loads((tmp_path / "summary.json").read_text())["methods"]
-    assert {name: scores["converged"] for name, scores in methods.items()} == {
-        "behavior": False,
-        "visits": True,
-        "joint": False,
-    }
+
+def test_compare_with_few_iterations_names_the_methods_that_did_not_converge(office, tmp_path, capsys):
+    assert compare(office, tmp_path, "--max-iterations", 1) == 0
+    methods = summary(tmp_path)["methods"]
+    assert not methods["behavior"]["converged"]
+    assert not methods["joint"]["converged"]
+    assert methods["visits"]["converged"]
     notes = capsys.readouterr().err
     assert "behavior did not converge" in notes
     assert "joint did not converge" in notes
     assert "visits" not in notes
 
 
-def test_behavior_is_chosen_by_the_walks_that_are_learned_from(office, tmp_path, monkeypatch):
-    monkeypatch.setattr(compare, "METHODS", {name: METHODS[name] for name in ("behavior", "transitions")})
-    files = (office / "walks.csv", "--map", office / "half.yaml", "--truth", office / "true.yaml", "--out", tmp_path)
-    with console.capture() as captured:
-        assert call("compare", *files, "--behavior", "auto", "--seed", 3) == 0
-    grid, walks = read_map(office / "half.yaml"), read_walks(office / "walks.csv")
-    own = walks.select(np.sort(np.random.default_rng(3).permutation(80)[16:]))
-    choice = choose_behavior(grid, grid_walks(own, grid), Settings(seed=3))
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["behavior"]["reasons"] == choice.reasons
-    assert summary["settings"]["beta"] == choice.settings.beta
-    assert summary["settings"]["unknown"] == ["lapses"]
-    assert all(reason in captured.get() for reason in choice.reasons)
+def test_compare_methods_with_selection_selects_by_the_walks_that_are_learned_from(office):
+    grid, truth, walks = (
+        read_map(office / "half.yaml"),
+        read_map(office / "true.yaml"),
+        read_walks(office / "walks.csv"),
+    )
+    config = MapConfig(behavior=BehaviorConfig(select=True), seed=3)
+    comparison = compare_methods(grid, truth, walks, config, baselines={"transitions": BASELINES["transitions"]})
+    train = walks.select(np.sort(np.random.default_rng(3).permutation(80)[16:]))
+    selection = select_behavior(grid, grid_walks(train, grid), config)
+    assert comparison.reasons == selection.reasons
+    assert comparison.config == selection.config
+    assert comparison.config.behavior.learn == ("lapse",)
+    assert not comparison.config.behavior.select
+    told = json.loads(json.dumps(comparison.summary(), allow_nan=False))
+    assert told["behavior"]["reasons"] == selection.reasons
 
 
-def test_a_truth_of_another_place_is_refused(office, tmp_path, capsys):
+def test_compare_methods_with_goal_candidates_scores_held_out_walks(office, tmp_path):
+    """Walks that do not name their goals: the most probable goals are those of the walks."""
+    grid, truth, walks = (
+        read_map(office / "half.yaml"),
+        read_map(office / "true.yaml"),
+        read_walks(office / "walks.csv"),
+    )
+    (tmp_path / "goals.csv").write_text(
+        "goal_x,goal_y\n" + "".join(f"{x},{y}\n" for x, y in np.unique(walks.goals, axis=0).tolist())
+    )
+    options = ("--goal-candidates", tmp_path / "goals.csv", "--max-walks", 30)
+    assert compare(office, tmp_path / "out", *options) == 0
+    methods = summary(tmp_path / "out")["methods"]
+    assert all(np.isfinite(methods[name]["heldout_log_likelihood"]) for name in METHODS)
+    assert (tmp_path / "out" / "behavior" / "posterior.csv").exists()
+    assert truth.shape == grid.shape
+
+
+def test_compare_with_a_true_map_of_another_place_is_refused(office, tmp_path, capsys):
     shifted = replace(read_map(office / "true.yaml"), origin=(0.0, 2.0, 0.0))
     write_map(tmp_path / "far.yaml", np.zeros(shifted.shape), shifted)
-    files = (office / "walks.csv", "--map", office / "half.yaml", "--truth", tmp_path / "far.yaml")
+    files = (office / "walks.csv", "--map", office / "half.yaml", "--true-map", tmp_path / "far.yaml")
     assert call("compare", *files, "--out", tmp_path / "out") == 1
     assert "far.yaml, field 'origin'" in capsys.readouterr().err
 
 
-def test_behavior_sees_walls_and_transitions_alone_do_not(compared):
+def test_compare_finds_walls_that_transitions_alone_miss(compared):
     methods = compared["methods"]
-    assert methods["behavior"]["mean_obstacle"] > methods["transitions"]["mean_obstacle"] + 0.1
+    for name in ("behavior", "joint"):
+        assert methods[name]["mean_obstacle"] > methods["transitions"]["mean_obstacle"] + 0.1
     assert methods["behavior"]["legal_fraction"] >= methods["transitions"]["legal_fraction"]
     assert methods["behavior"]["heldout_log_likelihood"] > methods["transitions"]["heldout_log_likelihood"]
 
 
-def test_held_out_walks_are_judged_by_what_the_others_taught(office, compared):
+def test_compare_scores_held_out_walks_by_the_map_of_the_others(office, compared):
     grid, walks = read_map(office / "half.yaml"), read_walks(office / "walks.csv")
     drawn = np.random.default_rng(3).permutation(80)
-    own, others = (demonstrations_from_walks(walks.select(np.sort(some)), grid) for some in (drawn[16:], drawn[:16]))
-    assert isinstance(others, Demonstrations)
-    model = fit_map(ObstacleGrid(grid, Settings().prior_mean), own, Settings()).model
-    people = Behavior(BoltzmannAverage(), Settings.beta)
-    expected = log_likelihood(model, others, people, terms=("actions",)).actions / len(others)
+    learned = learn_map(grid, walks.select(np.sort(drawn[16:])))
+    heldout = demonstrations_from_walks(walks.select(np.sort(drawn[:16])), grid)
+    behavior = Behavior(BoltzmannAverage(), BehaviorConfig.beta)
+    expected = log_likelihood(learned.model, heldout, behavior, terms=("actions",)).actions / len(heldout)
     assert compared["methods"]["behavior"]["heldout_log_likelihood"] == pytest.approx(float(expected), rel=1e-6)
 
 
-def test_the_table_says_where_there_is_no_score(compared_table):
-    rows = {line.split()[1]: line for line in compared_table.splitlines() if len(line.split()) > 8}
-    assert set(METHODS) <= set(rows)
-    assert [cell.strip() for cell in rows["cloning"].split("│")[2:5]] == ["–", "–", "–"]
-    assert "–" not in rows["behavior"].split("│")[2:5]
+def test_compare_prints_a_row_for_every_method(table):
+    rows, columns = table
+    assert set(rows) == METHODS
+    assert [rows["cloning"][key] for key in list(columns)[:3]] == [None, None, None]
+    assert None not in [rows["behavior"][key] for key in list(columns)[:3]]
 
 
-def test_joint_sees_the_wall_too(compared):
-    methods = compared["methods"]
-    assert methods["joint"]["mean_obstacle"] > methods["transitions"]["mean_obstacle"] + 0.1
-
-
-@pytest.mark.parametrize("share", [0, 1, 0.001])
-def test_a_share_that_leaves_nothing_is_refused(office, share, capsys):
-    files = (office / "walks.csv", "--map", office / "half.yaml", "--truth", office / "true.yaml")
-    assert call("compare", *files, "--out", office / "none", "--hold-out", share) == 1
+@pytest.mark.parametrize("fraction", [-0.1, 1, 0.001])
+def test_compare_with_a_fraction_that_leaves_nothing_is_refused(office, fraction, capsys):
+    assert compare(office, office / "none", "--hold-out", fraction) == 1
     assert "hold_out" in capsys.readouterr().err
     assert not (office / "none").exists()
+
+
+def test_compare_takes_every_option_of_learn(capsys):
+    options = []
+    for command in ("learn", "compare"):
+        assert call(command, "--help") == 0
+        options.append({word for word in capsys.readouterr().out.split() if word.startswith("--")})
+    assert options[0] <= options[1]
+    assert FitConfig.terms == "both"

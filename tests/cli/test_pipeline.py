@@ -1,6 +1,8 @@
 """From a map to walks, from walks to a learned map, and from that to scores and paths, by the command line alone."""
 
 import json
+from contextlib import contextmanager
+from dataclasses import asdict
 
 import numpy as np
 import pyarrow.csv
@@ -10,11 +12,12 @@ import yaml
 from PIL import Image
 
 from helpers.office import WALL, call, summary, write_office, written
-from sidestep.cli import app as cli
+from sidestep.cli import display
 from sidestep.inference.checkpoints import Saver
 from sidestep.io.maps import read_map
 from sidestep.io.walks import read_walks, write_walks
-from sidestep.maps.learned_map import read_learned_map
+from sidestep.maps.config import MapConfig
+from sidestep.maps.learned_map import load_map
 from sidestep.tabular.grid import Cell
 
 SCORES = (
@@ -96,15 +99,16 @@ def test_learning_says_how_it_went(office, learned):
     assert [task["converged"] for task in told["tasks"]] == [True] * 5
     assert told["seconds"] > 0
     assert told["peak_memory_bytes"] > 10_000_000
-    assert told["settings"] | {"backup": "boltzmann", "connectivity": 4, "terms": "both", "seed": 0} == told["settings"]
+    assert told["connectivity"] == 4
+    assert told["settings"] == json.loads(json.dumps(asdict(MapConfig())))
 
 
 def test_evaluating_adds_the_scores_to_the_summary(office, learned, tmp_path, capsys):
     before = summary(learned)
-    assert call("evaluate", learned, "--truth", office / "true.yaml", "--out", tmp_path / "scores") == 0
+    assert call("evaluate", learned, "--true-map", office / "true.yaml", "--out", tmp_path / "scores") == 0
     assert summary(learned) == before
     split_by_person = summary(tmp_path / "scores")
-    assert call("evaluate", learned, "--truth", office / "true.yaml") == 0
+    assert call("evaluate", learned, "--true-map", office / "true.yaml") == 0
     together = summary(learned)
     assert {key: together[key] for key in before} == before
     for key in SCORES:
@@ -153,10 +157,10 @@ def test_eight_directions_parquet_and_the_paper_s_gradient(office, tmp_path):
     options = ("--connectivity", 8, "--gradient", "fixed-policy", "--prior-mean", -2, "--prior-variance", 2)
     assert call("learn", walks, "--map", office / "blank.yaml", "--out", out, *options) == 0
     told = summary(out)
-    assert told["settings"]["gradient"] == "fixed_policy"
-    assert told["settings"]["connectivity"] == 8
-    assert read_learned_map(out).grid.connectivity == 8
-    assert call("evaluate", out, "--truth", office / "true.yaml") == 0
+    assert told["settings"]["fit"]["gradient"] == "fixed_policy"
+    assert told["connectivity"] == 8
+    assert load_map(out).grid.connectivity == 8
+    assert call("evaluate", out, "--true-map", office / "true.yaml") == 0
     assert summary(out)["auc"] > 0.9
     assert call("plan", out, "--start", "-0.75,2.25", "--goal", "0.25,3.25") == 0
     assert summary(out / "plan")["moves"] >= 2
@@ -165,7 +169,7 @@ def test_eight_directions_parquet_and_the_paper_s_gradient(office, tmp_path):
 @pytest.mark.parametrize("options", [
     ("--discount", 1, "--step-cost", 1, "--beta", 3),
     ("--backup", "mellowmax", "--horizon", 12),
-    ("--terms", "transitions", "--lines", 0),
+    ("--terms", "transitions", "--wall-prior", 0),
 ])  # fmt: skip
 def test_other_people_and_rewards(office, tmp_path, options):
     assert call("learn", office / "walks.csv", "--map", office / "blank.yaml", "--out", tmp_path, *options) == 0
@@ -173,13 +177,13 @@ def test_other_people_and_rewards(office, tmp_path, options):
     assert told["converged"]
     if "transitions" in options:
         assert told["log_likelihood_actions"] == 0
-        assert blocked.max() <= 1 / (1 + np.exp(-told["settings"]["prior_mean"])) + 1e-12
+        assert blocked.max() <= 1 / (1 + np.exp(-told["settings"]["prior"]["mean"])) + 1e-12
     else:
         assert blocked[WALL].min() > blocked[~WALL].max()
 
 
 def test_a_sample_is_drawn_by_the_seed(office, tmp_path):
-    learn = ("learn", office / "walks.csv", "--map", office / "blank.yaml", "--sample", 12, "--terms", "transitions")
+    learn = ("learn", office / "walks.csv", "--map", office / "blank.yaml", "--max-walks", 12, "--terms", "transitions")
     for name, seed in (("one", 1), ("same", 1), ("other", 2)):
         assert call(*learn, "--seed", seed, "--out", tmp_path / name) == 0
         assert summary(tmp_path / name)["data"]["walks"] == 12
@@ -198,30 +202,29 @@ def test_simulation_repeats_by_seed(office, tmp_path):
 
 def test_an_interrupted_run_goes_on(office, learned, tmp_path, monkeypatch, capsys):
     learn = ("learn", office / "walks.csv", "--map", office / "half.yaml", "--out", tmp_path)
-    whole = cli.learn  # pyright: ignore
+    iterations = []
 
-    def interrupted(walks, map_file, folder, settings, report, *others):
+    @contextmanager
+    def interrupting(_):
         def stop(progress):
-            report(progress)
             if progress.iteration == 4:
                 raise KeyboardInterrupt
 
-        return whole(walks, map_file, folder, settings, stop, *others)
+        yield stop, print
+
+    @contextmanager
+    def recording(_):
+        yield (lambda progress: iterations.append(progress.iteration)), print
 
     monkeypatch.setattr(Saver, "pause", lambda *_: 0.0)
-    monkeypatch.setattr(cli, "learn", interrupted)
+    monkeypatch.setattr(display, "fit_progress", interrupting)
     assert call(*learn) == 1
     assert written(tmp_path) == ["fit.checkpoint"]
     told = capsys.readouterr()
     assert "--resume" in told.err
     assert "Traceback" not in told.err
 
-    iterations = []
-
-    def watched(walks, map_file, folder, settings, _, *others):
-        return whole(walks, map_file, folder, settings, lambda now: iterations.append(now.iteration), *others)
-
-    monkeypatch.setattr(cli, "learn", watched)
+    monkeypatch.setattr(display, "fit_progress", recording)
     assert call(*learn, "--beta", 9, "--resume") == 1  # not the same fit
     assert "other settings" in capsys.readouterr().err
     assert call(*learn, "--resume") == 0
@@ -231,7 +234,7 @@ def test_an_interrupted_run_goes_on(office, learned, tmp_path, monkeypatch, caps
 
 
 def test_known_cells_of_the_learned_map_are_known_again(learned):
-    found = read_learned_map(learned)
+    found = load_map(learned)
     assert found.grid.known[0, 2] == Cell.OCCUPIED
     assert found.grid.known[4, 0] == Cell.FREE
     assert (found.grid.known == Cell.UNKNOWN).sum() == 23

@@ -19,7 +19,7 @@ from sidestep.evaluation.evaluate import (
 from sidestep.robots.planners import ModelPlanner, PolicyPlanner
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, true_model
-from sidestep.tabular.tasks import Reward
+from sidestep.tabular.reward import Reward
 
 #  0 . #      states 0 1 2
 #  . . .             3 4 5     with obstacles at 2 and 7

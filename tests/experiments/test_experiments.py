@@ -9,7 +9,8 @@ from PIL import Image
 from sidestep.experiments import demo, reproduce
 from sidestep.experiments.reproduce import VARIANTS
 from sidestep.inference.optimizers import LBFGS, Adam
-from sidestep.maps.learned_map import read_learned_map
+from sidestep.maps.config import SimulationConfig
+from sidestep.maps.learned_map import load_map
 from sidestep.tabular.graph import walkable_graph
 from sidestep.worlds.grids import WORLDS, block
 
@@ -84,12 +85,10 @@ def test_ten_optimal_walks_for_each_pair_with_ties_at_random():
     assert [path.tolist() for path in again] == [path.tolist() for path in paths]
 
 
-def test_the_demonstration_in_a_small_office(tmp_path, monkeypatch):
-    monkeypatch.setattr(demo, "ROWS", 10)
-    monkeypatch.setattr(demo, "COLUMNS", 10)
-    monkeypatch.setattr(demo, "WALKERS", demo.Walkers(walks=60, goals=5))  # pyright: ignore
+def test_the_demonstration_in_a_small_office(tmp_path):
+    config = demo.DemoConfig(rows=10, columns=10, agents=SimulationConfig(walks=60, goals=5))
     told = []
-    summary = demo.demo(tmp_path, seed=1, report=told.append)
+    summary = demo.demo(tmp_path, seed=1, notify=told.append, config=config)
     assert len(told) == 3
     assert json.loads((tmp_path / "summary.json").read_text()) == json.loads(json.dumps(summary))
     assert set(summary["scores"]) >= SCORES
@@ -97,7 +96,7 @@ def test_the_demonstration_in_a_small_office(tmp_path, monkeypatch):
     assert {path.name for path in tmp_path.iterdir()} == {
         "demo.png", "learned", "summary.json", "truth.pgm", "truth.yaml", "walks.csv",
     }  # fmt: skip
-    found = read_learned_map(tmp_path / "learned")
+    found = load_map(tmp_path / "learned")
     assert found.unknown.all()  # nothing of the office was known
     assert found.blocked.shape == (10, 10)
     assert np.isfinite(found.blocked).all()

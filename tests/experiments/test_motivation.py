@@ -5,11 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from sidestep.baselines.interface import ModelResult, reward_of
+from sidestep.baselines.interface import ModelResult
 from sidestep.baselines.maxent_irl import CostlyReward
 from sidestep.cli.app import main
 from sidestep.experiments import motivation
 from sidestep.experiments.motivation import COLUMNS, FORMS, Form, at_stakes, tried, true_world
+from sidestep.maps.fit import behavior_of
 from sidestep.robots.robot import risk_averse_robot
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
@@ -22,9 +23,11 @@ GOAL = 8 * COLUMNS + 12
 
 def with_state_costs(form: Form, cost: float) -> ModelResult:
     """Who takes nothing to be in the way, and every cell to cost the same."""
-    reward = CostlyReward(form.settings.discount, form.settings.step_cost, np.full(BLANK.size, cost))
+    reward = CostlyReward(form.config.reward.discount, form.config.reward.step_cost, np.full(BLANK.size, cost))
     free = ObstacleGrid(BLANK.passable())
-    return ModelResult(free, reward, form.settings.behavior(), np.zeros(BLANK.shape), risk_averse_robot(free, []), True)
+    return ModelResult(
+        free, reward, behavior_of(form.config.behavior), np.zeros(BLANK.shape), risk_averse_robot(free, []), True
+    )
 
 
 def steps_to_the_goal(starts):
@@ -62,8 +65,8 @@ def test_mud_takes_five_times_as_long_and_who_knows_it_goes_the_best_way():
     form, world = FORMS["steps"], true_world()
     known = ModelResult(
         world,
-        reward_of(form.settings),
-        form.settings.behavior(),
+        form.config.reward,
+        behavior_of(form.config.behavior),
         np.asarray(world.blocked),
         risk_averse_robot(world, []),
         True,

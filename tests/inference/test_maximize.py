@@ -3,16 +3,18 @@
 import jax
 import numpy as np
 
-from sidestep.cli.simulate import Walkers, walk
 from sidestep.inference import batching, maximize, objective
 from sidestep.inference.fit import fit
 from sidestep.inference.objective import Objective
 from sidestep.inference.optimizers import Rprop
+from sidestep.maps.config import SimulationConfig
 from sidestep.tabular.backups import Behavior, LogSumExp
 from sidestep.tabular.demonstrations import gather
 from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.reward import Reward
 from sidestep.tabular.tasks import reach
 from sidestep.worlds.offices import office
+from sidestep.worlds.walks import simulate_walks
 
 
 def test_states_are_left_out_only_where_a_step_is_tried(monkeypatch):
@@ -40,7 +42,7 @@ def test_states_are_left_out_only_where_a_step_is_tried(monkeypatch):
     monkeypatch.setattr(Objective, "evaluate", watched)
     monkeypatch.setattr(objective, "_of_actions", of_batch)
     truth = office(20, 24, 2)
-    trajectories, goals = walk(truth, Walkers(walks=24, goals=6, discount=1.0, step_cost=1.0))
+    trajectories, goals = simulate_walks(truth, SimulationConfig(24, 6, reward=Reward(1.0, 1.0)))
     shown = gather(trajectories, [reach(truth.forget(), goal, discount=1.0, step_cost=1.0) for goal in goals])
     found = fit(ObstacleGrid(truth.forget(), 0.0), shown, Behavior(LogSumExp(), 5.0), optimizer=Rprop(tolerance=1.0))
     assert found.converged

@@ -6,10 +6,11 @@ import pyarrow.csv
 import pytest
 
 from helpers.office import call, summary, write_office, written
-from sidestep.cli.learn import learn as learn_map
 from sidestep.io.maps import read_map, write_map
+from sidestep.io.walks import read_walks
 from sidestep.maps.annotations import WalkAnnotations
-from sidestep.maps.config import Settings
+from sidestep.maps.goal_candidates import read_goal_candidates
+from sidestep.maps.learn import learn_map
 
 
 @pytest.fixture(scope="module")
@@ -42,11 +43,11 @@ def test_goals_that_walks_do_not_name_are_found_among_candidates(office, tmp_pat
     columns = dict(zip(("goal_x", "goal_y"), np.concatenate([own, nobody]).T, strict=True))
     pyarrow.csv.write_csv(pa.table(columns), tmp_path / "goals.csv")
 
-    assert learn(office, tmp_path / "walks.csv", tmp_path / "out", "--candidates", tmp_path / "goals.csv") == 0
+    assert learn(office, tmp_path / "walks.csv", tmp_path / "out", "--goal-candidates", tmp_path / "goals.csv") == 0
     told = summary(tmp_path / "out")["behavior"]["goals"]
     assert told["converged"]
     assert told["candidates"] == 4
-    assert told["shares"][3] < 0.1  # nobody had it
+    assert told["probabilities"][3] < 0.1  # nobody had it
     assert all(later >= before - 1e-6 for before, later in zip(told["evidence"], told["evidence"][1:], strict=False))
     found = pyarrow.csv.read_csv(tmp_path / "out" / "posterior.csv")
     chances = found["probability"].to_numpy().reshape(-1, 4)
@@ -64,10 +65,10 @@ def test_a_fit_is_reported_in_every_round(office, tmp_path):
     own = walked(office, "reported", "--walks", 6).select(["goal_x", "goal_y"]).group_by(["goal_x", "goal_y"])
     pyarrow.csv.write_csv(own.aggregate([]), places)
     told = []
-    whose = WalkAnnotations(candidates=places)
-    walks, blank = office / "reported.csv", office / "blank.yaml"
-    found = learn_map(walks, blank, tmp_path / "out", Settings(), told.append, whose=whose)
-    rounds = len(found["behavior"]["goals"]["evidence"]) - 1
+    annotations = WalkAnnotations(goal_candidates=read_goal_candidates(places))
+    walks, grid = read_walks(office / "reported.csv"), read_map(office / "blank.yaml")
+    learned = learn_map(grid, walks, annotations=annotations, callback=told.append)
+    rounds = len(learned.summary()["behavior"]["goals"]["evidence"]) - 1
     assert [progress.iteration for progress in told].count(0) == rounds > 1
 
 
@@ -79,11 +80,11 @@ def test_who_is_sharper_is_told_by_name(office, tmp_path):
         table.append_column("who", pa.array([name] * len(table))) for table, name in ((sharp, "Ada"), (vague, "Bo"))
     ]
     pyarrow.csv.write_csv(pa.concat_tables(tables), tmp_path / "walks.csv")
-    assert learn(office, tmp_path / "walks.csv", tmp_path / "out", "--person", "who") == 0
+    assert learn(office, tmp_path / "walks.csv", tmp_path / "out", "--person-column", "who") == 0
     persons = summary(tmp_path / "out")["behavior"]["persons"]
     assert list(persons) == ["Ada", "Bo"]
     assert persons["Ada"] > 2 * persons["Bo"]
-    assert summary(tmp_path / "out")["settings"]["unknown"] == ["sharpness"]
+    assert summary(tmp_path / "out")["settings"]["behavior"]["learn"] == ["beta"]
 
 
 def test_what_cannot_be_is_refused(office, tmp_path, capsys):
@@ -95,16 +96,16 @@ def test_what_cannot_be_is_refused(office, tmp_path, capsys):
     (tmp_path / "wall.csv").write_text("goal_x,goal_y\n-0.75,2.25\n0.25,4.25\n")
     (tmp_path / "two.csv").write_text("goal_x,goal_y\n-0.75,2.25\n0.75,2.25\n")
     for options, expected in (
-        (("--person", "who"), "walks.csv, field 'who': the column is missing"),
-        (("--candidates", tmp_path / "none.csv"), "none.csv"),
-        (("--person", "step"), "walks.csv, field 'step': expected a column of metadata"),
-        (("--behavior", "auto", "--tempering", 0.5), "field 'tempering'"),
-        (("--candidates", walks, "--person", "who"), "field 'person'"),
-        (("--candidates", walks, "--behavior", "auto"), "field 'behavior'"),
-        (("--candidates", tmp_path / "two.csv", "--unknown", "lapses"), "field 'unknown'"),
-        (("--candidates", tmp_path / "outside.csv"), "outside.csv, row 2, field 'goal_x, goal_y'"),
-        (("--candidates", tmp_path / "twice.csv"), "twice.csv, row 2"),
-        (("--candidates", tmp_path / "one.csv"), "one.csv: expected at least 2"),
+        (("--person-column", "who"), "walks.csv, field 'who': the column is missing"),
+        (("--goal-candidates", tmp_path / "none.csv"), "none.csv"),
+        (("--person-column", "step"), "walks.csv, field 'step': expected a column of metadata"),
+        (("--select-behavior", "--tempering", 0.5), "field 'tempering'"),
+        (("--goal-candidates", walks, "--person-column", "who"), "field 'person_column'"),
+        (("--goal-candidates", walks, "--select-behavior"), "field 'select_behavior'"),
+        (("--goal-candidates", tmp_path / "two.csv", "--learn", "lapse"), "field 'learn'"),
+        (("--goal-candidates", tmp_path / "outside.csv"), "outside.csv, row 2, field 'goal_x, goal_y'"),
+        (("--goal-candidates", tmp_path / "twice.csv"), "twice.csv, row 2"),
+        (("--goal-candidates", tmp_path / "one.csv"), "one.csv: expected at least 2"),
     ):
         assert learn(office, walks, tmp_path / "out", *options) == 1, expected
         lines = capsys.readouterr().err.strip().splitlines()
@@ -119,8 +120,11 @@ def test_what_cannot_be_is_refused(office, tmp_path, capsys):
     walk = tmp_path / "walk.csv"
     walk.write_text("walk,step,x,y\n0,0,-0.75,2.25\n0,1,-0.25,2.25\n")
     arguments = ("learn", walk, "--map", tmp_path / "corner.yaml", "--out", tmp_path / "out")
-    assert call(*arguments, "--candidates", tmp_path / "behind.csv") == 1
-    assert "behind.csv, row 2, field 'goal_x, goal_y': expected a place that all can reach" in capsys.readouterr().err
+    assert call(*arguments, "--goal-candidates", tmp_path / "behind.csv") == 1
+    assert (
+        "behind.csv, row 2, field 'goal_x, goal_y': expected a position that every walk can reach"
+        in capsys.readouterr().err
+    )
     half = ("learn", walks, "--map", office / "half.yaml", "--out", tmp_path / "out")
-    assert call(*half, "--candidates", tmp_path / "wall.csv") == 1
+    assert call(*half, "--goal-candidates", tmp_path / "wall.csv") == 1
     assert "wall.csv, row 2" in capsys.readouterr().err

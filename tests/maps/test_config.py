@@ -1,4 +1,4 @@
-"""The fit that settings describe: what a walk's first cell says."""
+"""The fit that config describe: what a walk's first cell says."""
 
 from dataclasses import replace
 
@@ -8,14 +8,15 @@ from scipy.optimize import root_scalar
 from sidestep.inference.fit import fit
 from sidestep.inference.goals import weighted
 from sidestep.inference.priors import Normal
-from sidestep.maps.config import Settings, fit_map
+from sidestep.maps.config import FitConfig, MapConfig, PriorConfig
+from sidestep.maps.fit import behavior_of, fit_map
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.tasks import Task, reach
 
 GRID = Grid.unknown(1, 4)
-SETTINGS = Settings(lines=0.0, prior_mean=1.0, prior_variance=2.5, terms="transitions")
+CONFIG = MapConfig(prior=PriorConfig(1.0, 2.5, wall_prior=0.0), fit=FitConfig("transitions"))
 
 
 def walks(*lengths: int) -> Demonstrations[Task]:
@@ -25,9 +26,9 @@ def walks(*lengths: int) -> Demonstrations[Task]:
     return gather([Trajectory(path, np.full(len(path) - 1, right), 0) for path in paths], [reach(GRID, goal)])
 
 
-def logits(demonstrations: Demonstrations[Task], settings: Settings = SETTINGS) -> np.ndarray:
+def logits(demonstrations: Demonstrations[Task], config: MapConfig = CONFIG) -> np.ndarray:
     """The logits that are learned."""
-    found = fit_map(ObstacleGrid(GRID, settings.prior_mean), demonstrations, settings)
+    found = fit_map(ObstacleGrid(GRID, config.prior.mean), demonstrations, config)
     assert found.converged
     return np.asarray(found.model.parameters)
 
@@ -49,7 +50,7 @@ def test_where_walks_begin_is_free():
 
 def test_of_a_known_map_the_first_cells_say_nothing():
     known = ObstacleGrid(GRID.passable(), 1.0)
-    assert fit_map(known, walks(3, 1), SETTINGS).final.prior == 0
+    assert fit_map(known, walks(3, 1), CONFIG).final.prior == 0
 
 
 def test_a_walk_that_may_have_had_several_goals_begins_once():
@@ -65,10 +66,10 @@ def test_only_walks_that_count_begin_anywhere():
 
 
 def test_actions_alone_do_not_say_who_stood_where():
-    settings = replace(SETTINGS, terms="actions")
-    prior = Normal(settings.prior_mean, settings.prior_variance)
-    model = ObstacleGrid(GRID, settings.prior_mean)
-    by_actions = fit(model, walks(3, 3), settings.behavior(), prior=prior, terms=("actions",)).model.parameters
-    np.testing.assert_allclose(logits(walks(3, 3), settings), by_actions, atol=1e-6)
+    config = replace(CONFIG, fit=FitConfig("actions"))
+    prior = Normal(config.prior.mean, config.prior.variance)
+    model = ObstacleGrid(GRID, config.prior.mean)
+    by_actions = fit(model, walks(3, 3), behavior_of(config.behavior), prior=prior, terms=("actions",)).model.parameters
+    np.testing.assert_allclose(logits(walks(3, 3), config), by_actions, atol=1e-6)
     # with transitions, the first cell is freer than by actions
-    assert logits(walks(3, 3), replace(SETTINGS, terms="both"))[0] < float(by_actions[0]) - 1
+    assert logits(walks(3, 3), replace(CONFIG, fit=FitConfig("both")))[0] < float(by_actions[0]) - 1

@@ -6,46 +6,46 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.cli.simulate import Walkers, walk
 from sidestep.evaluation.metrics import score_map, visit_ranking
 from sidestep.evaluation.relevance import relevant_obstacles
 from sidestep.inference import batching, maximize, objective
 from sidestep.inference.fit import fit
 from sidestep.inference.optimizers import LBFGS, Adam, Rprop
 from sidestep.inference.priors import FreeCellEvidence, Normal
-from sidestep.maps import config as settings
-from sidestep.maps.config import Settings, fit_map
+from sidestep.maps import fit as map_fit
+from sidestep.maps.config import BehaviorConfig, FitConfig, MapConfig, PriorConfig, SimulationConfig
+from sidestep.maps.fit import fit_map, max_iterations, optimizer_for
 from sidestep.tabular.backups import Behavior, LogSumExp
 from sidestep.tabular.demonstrations import gather
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.reward import Reward
 from sidestep.tabular.tasks import reach
 from sidestep.worlds.offices import office
+from sidestep.worlds.walks import simulate_walks
 
 TRUTH = office(20, 24, seed=0)
 UNKNOWN = Grid.unknown(20, 24)
-SETTINGS = Settings(
-    backup="logsumexp", beta=5.0, discount=1.0, step_cost=1.0, prior_mean=0.5, prior_variance=4.0, lines=0.0
-)
+CONFIG = MapConfig(Reward(1.0, 1.0), BehaviorConfig("logsumexp", 5.0), PriorConfig(0.5, 4.0, wall_prior=0.0))
 
 
 @pytest.fixture(scope="module")
 def demonstrations():
-    trajectories, goals = walk(TRUTH, Walkers(60, 6, discount=1.0, step_cost=1.0, seed=0))
+    trajectories, goals = simulate_walks(TRUTH, SimulationConfig(60, 6, reward=Reward(1.0, 1.0), seed=0))
     return gather(trajectories, [reach(UNKNOWN, goal, discount=1.0, step_cost=1.0) for goal in goals])
 
 
 @pytest.fixture
 def everything_is_large(monkeypatch):
     """For the choice of the optimiser, for solves that are only as exact as it needs, and for a batch for each task."""
-    for module in (settings, maximize, batching):
+    for module in (map_fit, maximize, batching):
         monkeypatch.setattr(module, "LARGE", 1)
     monkeypatch.setattr(batching, "cores", lambda: 1)
 
 
 @pytest.mark.usefixtures("everything_is_large")
 def test_a_large_map_is_learned(demonstrations):
-    found = fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, SETTINGS)
+    found = fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, CONFIG)
     objectives = [progress.objective for progress in found.history]
     assert found.converged, found.message
     assert "promises" in found.message
@@ -69,7 +69,9 @@ def two_offices():
     walks, goals = [], []
     for side in (0, 1):
         shown = [known if own == side else np.ones_like(known) for own, known in enumerate(offices)]
-        found, ends = walk(Grid(np.hstack([shown[0], wall, shown[1]])), Walkers(30, 3, discount=1.0, step_cost=1.0))
+        found, ends = simulate_walks(
+            Grid(np.hstack([shown[0], wall, shown[1]])), SimulationConfig(30, 3, reward=Reward(1.0, 1.0))
+        )
         walks += [trajectory._replace(task=trajectory.task + len(goals)) for trajectory in found]
         goals += ends
     return unknown, gather(walks, [reach(unknown, goal, discount=1.0, step_cost=1.0) for goal in goals])
@@ -85,12 +87,12 @@ def test_taking_over_what_does_not_change_changes_nothing_but_the_work(monkeypat
 
     monkeypatch.setattr(objective, "_of_actions", weights)
     unknown, demonstrations = two_offices()
-    found = fit_map(ObstacleGrid(unknown, 0.5), demonstrations, SETTINGS)
+    found = fit_map(ObstacleGrid(unknown, 0.5), demonstrations, CONFIG)
     once = len(solves)
     solves.clear()
     for share in ("_NEGLIGIBLE", "_LITTLE"):
         monkeypatch.setattr(maximize, share, 0.0)
-    expected = fit_map(ObstacleGrid(unknown, 0.5), demonstrations, SETTINGS)
+    expected = fit_map(ObstacleGrid(unknown, 0.5), demonstrations, CONFIG)
     assert once < len(solves)
     assert len(found.history) == len(expected.history)
     for one, other in zip(found.history, expected.history, strict=True):
@@ -100,9 +102,9 @@ def test_taking_over_what_does_not_change_changes_nothing_but_the_work(monkeypat
 
 def test_it_ends_where_a_search_along_the_gradient_does(demonstrations, monkeypatch):
     """But for what the tolerance leaves: some thousandths of a nat a move."""
-    by_search = fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, SETTINGS)
-    monkeypatch.setattr(settings, "LARGE", 1)
-    from_above = fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, SETTINGS)
+    by_search = fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, CONFIG)
+    monkeypatch.setattr(map_fit, "LARGE", 1)
+    from_above = fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, CONFIG)
     assert len(from_above.history) < len(by_search.history)
     assert from_above.final.objective > by_search.final.objective - 5e-3 * len(demonstrations)
 
@@ -117,7 +119,7 @@ def transitions_only(grid, demonstrations):
 
 @pytest.mark.usefixtures("everything_is_large")
 def test_the_climb_begins_with_cells_that_nobody_visited_taken_as_blocked(demonstrations):
-    start = fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, SETTINGS).history[0]
+    start = fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, CONFIG).history[0]
     by_walks = transitions_only(UNKNOWN, demonstrations)
     unseen = TRUTH.size - len(np.unique([*demonstrations.states, *demonstrations.next_states]))
     # P(blocked) = σ(8), 7.5 from the prior's mean
@@ -128,7 +130,9 @@ def test_the_climb_begins_with_cells_that_nobody_visited_taken_as_blocked(demons
 @pytest.mark.usefixtures("everything_is_large")
 def test_what_the_map_knows_is_left_alone(demonstrations):
     half = Grid(np.where(np.arange(24) < 12, TRUTH.known, -1))
-    start = fit_map(ObstacleGrid(half, 0.5), demonstrations, replace(SETTINGS, iterations=1)).history[0]
+    start = fit_map(ObstacleGrid(half, 0.5), demonstrations, replace(CONFIG, fit=FitConfig(max_iterations=1))).history[
+        0
+    ]
     visited = np.unique([*demonstrations.states, *demonstrations.next_states])
     unseen = np.setdiff1d(np.flatnonzero(half.known == -1), visited)
     by_walks = transitions_only(half, demonstrations)
@@ -143,9 +147,10 @@ def test_what_the_map_knows_is_left_alone(demonstrations):
     ({"gradient": "fixed_policy"}, 10_000, Adam),
 ])  # fmt: skip
 def test_who_climbs(options, cells, kind):
-    chosen = settings.optimizer_for(replace(SETTINGS, **options), cells, moves=2000)
+    config = FitConfig(**options)
+    chosen = optimizer_for(config, cells, moves=2000)
     assert isinstance(chosen, kind)
     if isinstance(chosen, Rprop):
         assert chosen.tolerance == pytest.approx(2.0)
-    assert settings.optimizer_for(replace(SETTINGS, **options, iterations=7), cells, moves=2000).iterations == 7
-    assert settings.most_iterations(replace(SETTINGS, **options)) == chosen.iterations
+    assert optimizer_for(replace(config, max_iterations=7), cells, moves=2000).iterations == 7
+    assert max_iterations(config) == chosen.iterations

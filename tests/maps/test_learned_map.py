@@ -6,26 +6,26 @@ import numpy as np
 import pytest
 
 from sidestep.errors import InputError
-from sidestep.maps.learned_map import LearnedMap, read_learned_map, write_learned_map
+from sidestep.maps.learned_map import LearnedMap, load_map
 from sidestep.tabular.grid import Cell, Grid
-from sidestep.tabular.tasks import Reward
+from sidestep.tabular.reward import Reward
 
 BLOCKED = np.array([[0.0, 0.25, 1.0], [0.5, 1e-7, 0.999]])
 KNOWN = np.where(BLOCKED == 0, Cell.FREE, np.where(BLOCKED == 1, Cell.OCCUPIED, Cell.UNKNOWN)).astype(int)
 GRID = Grid(KNOWN, resolution=0.05, origin=(1.5, -2.0, 0.3), connectivity=8)
 VISITED = np.array([[0, 4], [3, 4]])
 LEARNED = LearnedMap(GRID, BLOCKED, VISITED, Reward(0.9, 2.5))
-SUMMARY = {"command": "learn", "settings": {"connectivity": 8, "discount": 0.9, "step_cost": 2.5, "beta": 3.0}}
+SUMMARY = {"command": "learn", "connectivity": 8, "settings": {"reward": {"discount": 0.9, "step_cost": 2.5}}}
 
 
 @pytest.fixture
 def folder(tmp_path):
-    write_learned_map(tmp_path, LEARNED, SUMMARY)
+    LEARNED.save(tmp_path, command="learn")
     return tmp_path
 
 
 def test_round_trip(folder):
-    found = read_learned_map(folder)
+    found = load_map(folder)
     np.testing.assert_array_equal(found.blocked, BLOCKED)
     np.testing.assert_array_equal(found.visited, VISITED)
     np.testing.assert_array_equal(found.grid.known, KNOWN)
@@ -36,7 +36,7 @@ def test_round_trip(folder):
 
 
 def test_the_model_has_the_probabilities_of_the_map(folder):
-    np.testing.assert_allclose(read_learned_map(str(folder)).model().blocked, BLOCKED, rtol=1e-9)
+    np.testing.assert_allclose(load_map(str(folder)).model.blocked, BLOCKED, rtol=1e-9)
 
 
 FILES = ("summary.json", "map.yaml", "map.pgm", "blocked.npy", "visited.npy")
@@ -55,7 +55,7 @@ def test_a_file_that_is_missing_or_garbled_is_named(folder, name, content):
     else:
         (folder / name).write_bytes(content)
     with pytest.raises(InputError, match=name.replace(".", r"\.")):
-        read_learned_map(folder)
+        load_map(folder)
 
 
 BAD_ARRAYS = {
@@ -81,21 +81,22 @@ BAD_ARRAYS = {
 def test_arrays_that_do_not_fit_the_map_are_refused(folder, tmp_path, name, index):
     (folder / name).write_bytes(array_file(tmp_path, BAD_ARRAYS[name][index]))
     with pytest.raises(InputError, match=name.replace(".", r"\.")):
-        read_learned_map(folder)
+        load_map(folder)
 
 
 @pytest.mark.parametrize("summary", [
     [],
     {},
     {"settings": None},
-    {"settings": {"connectivity": 8, "discount": 0.9}},
-    {"settings": {"connectivity": 5, "discount": 0.9, "step_cost": None}},
-    {"settings": {"connectivity": 4, "discount": "much", "step_cost": None}},
-    {"settings": {"connectivity": 4, "discount": 1.5, "step_cost": None}},
-    {"settings": {"connectivity": 4, "discount": 0.9, "step_cost": -1.0}},
-    {"settings": {"connectivity": 4, "discount": 0.9, "step_cost": "a"}},
+    {"settings": {"reward": {"discount": 0.9, "step_cost": None}}},
+    {"connectivity": 8, "settings": {"reward": {"discount": 0.9}}},
+    {"connectivity": 5, "settings": {"reward": {"discount": 0.9, "step_cost": None}}},
+    {"connectivity": 4, "settings": {"reward": {"discount": "much", "step_cost": None}}},
+    {"connectivity": 4, "settings": {"reward": {"discount": 1.5, "step_cost": None}}},
+    {"connectivity": 4, "settings": {"reward": {"discount": 0.9, "step_cost": -1.0}}},
+    {"connectivity": 4, "settings": {"reward": {"discount": 0.9, "step_cost": "a"}}},
 ])  # fmt: skip
 def test_settings_that_no_learning_has_written_are_refused(folder, summary):
     (folder / "summary.json").write_text(json.dumps(summary))
     with pytest.raises(InputError, match=r"summary\.json"):
-        read_learned_map(folder)
+        load_map(folder)

@@ -10,7 +10,8 @@ from sidestep.tabular.graph import moves_into
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.planning import plan
-from sidestep.tabular.tasks import Reward, reach
+from sidestep.tabular.reward import Reward
+from sidestep.tabular.tasks import reach
 
 REWARDS = [Reward(), Reward(discount=1.0, step_cost=1.0), Reward(discount=0.99, step_cost=0.5)]
 ROOT_TWO = 2**0.5

@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array, hstack, vstack
 from scipy.special import log_softmax
 
-from sidestep.maps.config import Settings
+from sidestep.maps.config import MapConfig
 from sidestep.robots.planners import PolicyPlanner
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Grid
@@ -71,9 +71,9 @@ class Cloned:
         return log_softmax(_features(self.grid, states, goals) @ self.weights.T + self.intercepts, axis=-1)
 
 
-def behavior_cloning(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> Cloned:
+def behavior_cloning(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> Cloned:
     """A policy from the actions, whatever the settings say of people."""
-    del settings
+    del config
     walks = np.asarray(demonstrations.trajectory)
     fold = walks % _FOLDS
     if walks[-1] + 1 < _FOLDS:

@@ -18,8 +18,9 @@ from jaxtyping import Bool, Float
 from scipy.sparse import coo_array, eye_array
 from scipy.sparse.linalg import spsolve
 
-from sidestep.baselines.interface import ModelResult, known_map
-from sidestep.maps.config import Settings
+from sidestep.baselines.interface import ModelResult, model_result
+from sidestep.maps.config import MapConfig
+from sidestep.maps.fit import behavior_of
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, true_model
@@ -36,24 +37,24 @@ class _People(NamedTuple):
     log_likelihood: float
 
 
-def constraint_inference(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> ModelResult:
+def constraint_inference(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
     """Cells forbidden one after another; the earlier, the surer."""
     seen = np.zeros(grid.size, dtype=bool)
     seen[np.concatenate(demonstrations.paths())] = True
     possible = ~seen & (grid.known.ravel() == Cell.UNKNOWN)
     forbidden: list[int] = []
-    found = _people(grid, forbidden, demonstrations, settings)
+    found = _people(grid, forbidden, demonstrations, config)
     while (possible.sum() - len(forbidden)) > 0:
         visits = np.where(possible, found.visits, -np.inf)
         visits[forbidden] = -np.inf
-        after = _people(grid, [*forbidden, int(visits.argmax())], demonstrations, settings)
+        after = _people(grid, [*forbidden, int(visits.argmax())], demonstrations, config)
         if after.log_likelihood - found.log_likelihood < np.log(possible.sum()):
             break
         forbidden.append(int(visits.argmax()))
         found = after
     logits = _logits(possible, forbidden, found.visits)
     model = ObstacleGrid(grid, logits)
-    return known_map(model, demonstrations, settings)
+    return model_result(model, demonstrations, config)
 
 
 def _logits(
@@ -67,7 +68,7 @@ def _logits(
     return logits
 
 
-def _people(grid: Grid, forbidden: list[int], demonstrations: Demonstrations, settings: Settings) -> _People:
+def _people(grid: Grid, forbidden: list[int], demonstrations: Demonstrations, config: MapConfig) -> _People:
     known = grid.passable().known
     known.flat[forbidden] = Cell.OCCUPIED
     model = true_model(replace(grid, known=known))
@@ -76,7 +77,9 @@ def _people(grid: Grid, forbidden: list[int], demonstrations: Demonstrations, se
     first = demonstrations.first_moves()
     for index in range(len(demonstrations.tasks.terminal)):
         made = plan(
-            model, jax.tree.map(lambda leaf, index=index: leaf[index], demonstrations.tasks), settings.behavior()
+            model,
+            jax.tree.map(lambda leaf, index=index: leaf[index], demonstrations.tasks),
+            behavior_of(config.behavior),
         )
         own = task == index
         total += float(np.log(np.asarray(made.policy)[states[own], actions[own]]).sum())

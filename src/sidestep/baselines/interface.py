@@ -14,7 +14,8 @@ from jaxtyping import Float
 
 from sidestep.evaluation.metrics import visit_ranking
 from sidestep.inference.batching import LARGE
-from sidestep.maps.config import Settings, fit_map
+from sidestep.maps.config import MapConfig
+from sidestep.maps.fit import behavior_of, fit_map
 from sidestep.robots.planners import Planner
 from sidestep.robots.robot import risk_averse_robot
 from sidestep.tabular.backups import Behavior
@@ -22,7 +23,8 @@ from sidestep.tabular.demonstrations import Demonstrations, pad_to_power_of_two
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import log_policies
 from sidestep.tabular.models import ObstacleGrid
-from sidestep.tabular.tasks import Reward, stack_tasks
+from sidestep.tabular.reward import Reward
+from sidestep.tabular.tasks import stack_tasks
 
 _SELDOM = 0.98
 """P(blocked) of a cell that nobody visited, to who only counts visits."""
@@ -95,41 +97,41 @@ class ModelResult(NamedTuple):
         return np.asarray(log_policies(self.model, shown, self.behavior))[: len(demonstrations)]
 
 
-Method = Callable[[Grid, Demonstrations, Settings], BaselineResult]
+Method = Callable[[Grid, Demonstrations, MapConfig], BaselineResult]
 
 
-def reward_of(settings: Settings) -> Reward:
+def reward_of(config: MapConfig) -> Reward:
     """What people are taken to pursue."""
-    return Reward(settings.discount, settings.step_cost)
+    return config.reward
 
 
-def known_map(
+def model_result(
     model: ObstacleGrid,
     demonstrations: Demonstrations,
-    settings: Settings,
+    config: MapConfig,
     ranking: Float[np.ndarray, "rows columns"] | None = None,
 ) -> ModelResult:
     """A map as what was learned: robots know it and where people walked. Without a ranking, cells have P(blocked)."""
     ranking = np.asarray(model.blocked, dtype=np.float64) if ranking is None else ranking
     planner = risk_averse_robot(model, np.concatenate(demonstrations.paths()))
-    return ModelResult(model, reward_of(settings), settings.behavior(), ranking, planner, converged=True)
+    return ModelResult(model, reward_of(config), behavior_of(config.behavior), ranking, planner, converged=True)
 
 
-def behavior_aware(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> ModelResult:
+def behavior_aware(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
     """Behavior-aware modeling, as `sidestep learn` has it."""
-    found = fit_map(ObstacleGrid(grid, settings.prior_mean), demonstrations, settings)
-    learned = known_map(found.model, demonstrations, settings)
+    found = fit_map(ObstacleGrid(grid, config.prior.mean), demonstrations, config)
+    learned = model_result(found.model, demonstrations, config)
     return learned._replace(behavior=found.people.behavior_of(), converged=found.converged)
 
 
-def transitions_only(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> ModelResult:
+def transitions_only(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
     """What transitions and first cells alone make most probable, whatever people wanted."""
-    return behavior_aware(grid, demonstrations, replace(settings, terms="transitions"))
+    return behavior_aware(grid, demonstrations, replace(config, fit=replace(config.fit, terms="transitions")))
 
 
-def visit_counts(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> ModelResult:
+def visit_counts(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
     """Counting: a cell visited n times is blocked with probability 1/(n + 1), one that was never visited with .98."""
     ranking = visit_ranking(np.concatenate(demonstrations.paths()), grid)
     blocked = np.clip(1 / (1 - ranking), None, _SELDOM).ravel()
     model = ObstacleGrid(grid, np.log(blocked) - np.log1p(-blocked))
-    return known_map(model, demonstrations, settings, ranking)
+    return model_result(model, demonstrations, config, ranking)

@@ -14,21 +14,22 @@ there people know the true dynamics; Herman et al. also have people whose belief
 
 import numpy as np
 
-from sidestep.baselines.interface import ModelResult, known_map
+from sidestep.baselines.interface import ModelResult, model_result
 from sidestep.baselines.maxent_irl import CostlyReward, who_pay
-from sidestep.maps.config import Settings, fit_map
+from sidestep.maps.config import MapConfig
+from sidestep.maps.fit import fit_map
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
 
 
-def joint_estimation(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> ModelResult:
+def joint_estimation(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
     """A cost of every cell and P(blocked) of every unknown one; the ranking is by P(blocked).
 
     What cells cost people is no concern of robots: they plan as with any learned map.
     """
-    model, walkers = ObstacleGrid(grid, settings.prior_mean), who_pay(grid, settings)
-    found = fit_map(model, demonstrations, settings, walkers=walkers)
-    learned = known_map(found.model, demonstrations, settings)
-    reward = CostlyReward(settings.discount, settings.step_cost, np.asarray(found.people.costs))
+    model, walkers = ObstacleGrid(grid, config.prior.mean), who_pay(grid, config)
+    found = fit_map(model, demonstrations, config, behavior=walkers)
+    learned = model_result(found.model, demonstrations, config)
+    reward = CostlyReward(config.reward.discount, config.reward.step_cost, np.asarray(found.people.costs))
     return learned._replace(reward=reward, behavior=found.people.behavior_of(), converged=found.converged)

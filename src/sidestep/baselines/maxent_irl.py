@@ -17,15 +17,16 @@ from sidestep.baselines.interface import ModelResult
 from sidestep.errors import NotConverged
 from sidestep.inference.fit import fit
 from sidestep.inference.optimizers import LBFGS
-from sidestep.maps.config import Settings
+from sidestep.maps.config import MapConfig
 from sidestep.robots.planners import ModelPlanner
 from sidestep.tabular.backups import Behavior, LogSumExp
 from sidestep.tabular.behavior_model import BehaviorModel, behavior_model
 from sidestep.tabular.demonstrations import Demonstrations
-from sidestep.tabular.graph import grid_graph
+from sidestep.tabular.graph import Graph, grid_graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import true_model
-from sidestep.tabular.tasks import Reward, Task, with_state_costs
+from sidestep.tabular.reward import Reward
+from sidestep.tabular.tasks import Task, with_state_costs
 
 _ITERATIONS = 5000
 _FLAT = 1e-3
@@ -38,29 +39,29 @@ class CostlyReward(Reward):
 
     costs: Float[np.ndarray, " cells"] | None = None
 
-    def reach(self, grid: Grid, goal: int) -> Task:
+    def reach(self, world: Grid | Graph, goal: int | tuple[float, float]) -> Task:
         """The task of reaching a state, less what the cells cost that moves aim at."""
-        task = super().reach(grid, goal)
-        if self.costs is None:
+        task = super().reach(world, goal)
+        if self.costs is None or isinstance(world, Graph):
             return task
-        return with_state_costs(task, jnp.asarray(self.costs), grid_graph(grid).successors[..., 0])
+        return with_state_costs(task, jnp.asarray(self.costs), grid_graph(world).successors[..., 0])
 
 
-def maxent_irl(grid: Grid, demonstrations: Demonstrations, settings: Settings) -> ModelResult:
+def maxent_irl(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
     """A cost for every cell; the ranking is by costs. Robots pursue what people do, costs with it."""
-    model, walkers = true_model(grid.passable()), who_pay(grid, settings)
+    model, walkers = true_model(grid.passable()), who_pay(grid, config)
     optimizer = LBFGS(iterations=_ITERATIONS, tolerance=_FLAT)
     found = fit(model, demonstrations, walkers, terms=("actions",), optimizer=optimizer)
     if not found.converged:
         raise NotConverged(f"the costs of cells were not found: {found.message}")
     costs = np.asarray(found.people.costs)
-    reward = CostlyReward(settings.discount, settings.step_cost, costs)
+    reward = CostlyReward(config.reward.discount, config.reward.step_cost, costs)
     planner = ModelPlanner(model, partial(reward.reach, model.blank))
     return ModelResult(model, reward, found.people.behavior_of(), costs.reshape(grid.shape), planner, found.converged)
 
 
-def who_pay(grid: Grid, settings: Settings) -> BehaviorModel:
+def who_pay(grid: Grid, config: MapConfig) -> BehaviorModel:
     """People of maximum causal entropy whom it costs something to aim at cells."""
     return behavior_model(
-        Behavior(LogSumExp(), settings.beta), aimed_at=np.asarray(grid_graph(grid).successors[..., 0])
+        Behavior(LogSumExp(), config.behavior.beta), aimed_at=np.asarray(grid_graph(grid).successors[..., 0])
     )

@@ -1,4 +1,4 @@
-"""What the command line shows: progress while it works, tables when it has; errors and progress on standard error."""
+"""What the command line shows: progress, notes and errors on standard error, results on standard output."""
 
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -15,26 +15,37 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
 
 from sidestep.inference.maximize import Progress as FitProgress
 
-console = Console(highlight=False, width=None if sys.stdout.isatty() else 140)
-errors = Console(stderr=True, highlight=False)
+_console = Console(highlight=False, width=None if sys.stdout.isatty() else 140)
+_errors = Console(stderr=True, highlight=False)
+
+
+def print_lines(*lines: str) -> None:
+    """Print lines of results."""
+    for line in lines:
+        _console.print(line, markup=False, soft_wrap=True)
+
+
+def print_notes(*lines: str) -> None:
+    """Print notes, warnings or errors."""
+    for line in lines:
+        _errors.print(line, markup=False, soft_wrap=True)
 
 
 @contextmanager
 def working(text: str) -> Iterator[Callable[[str], None]]:
-    """A spinner on a terminal, with a text that can be changed."""
-    with errors.status(text) as status:
+    """Show a spinner on a terminal; the result changes its text."""
+    with _errors.status(text) as status:
         yield status.update
 
 
 @contextmanager
-def fitting(iterations: int) -> Iterator[tuple[Callable[[FitProgress], None], Callable[[str], None]]]:
-    """A progress bar on a terminal for a fit of at most `iterations`, how long these would take, and what comes before.
+def fit_progress(iterations: int) -> Iterator[tuple[Callable[[FitProgress], None], Callable[[str], None]]]:
+    """Show a progress bar on a terminal for a fit of at most `iterations`; the results report to it.
 
-    When a fit converges cannot be known; so the time is the longest that is left, at the pace of the last ten minutes.
+    When a fit converges cannot be known. So the time is the longest that is left, at the pace of the last ten minutes.
     """
     columns = (
         TextColumn("learning"),
@@ -45,7 +56,7 @@ def fitting(iterations: int) -> Iterator[tuple[Callable[[FitProgress], None], Ca
         TimeRemainingColumn(),
         TextColumn("left; {task.fields[state]}"),
     )
-    with Progress(*columns, console=errors, transient=True, speed_estimate_period=600) as bar:
+    with Progress(*columns, console=_errors, transient=True, speed_estimate_period=600) as bar:
         task = bar.add_task("learning", total=iterations, state="compiling")
 
         def report(progress: FitProgress) -> None:
@@ -56,10 +67,10 @@ def fitting(iterations: int) -> Iterator[tuple[Callable[[FitProgress], None], Ca
 
 
 @contextmanager
-def stages() -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar on a terminal for each stage of a work, with the time that is left of it.
+def stage_progress() -> Iterator[Callable[[str, int, int], None]]:
+    """Show a progress bar on a terminal for each stage, with the time that is left of it.
 
-    How much a later stage has to do is known when it begins; so no time is told for the whole.
+    The size of a later stage is known when it begins, so there is no time for the whole.
     """
     columns = (
         TextColumn("{task.description}"),
@@ -69,23 +80,23 @@ def stages() -> Iterator[Callable[[str, int, int], None]]:
         TimeRemainingColumn(),
         TextColumn("left"),
     )
-    with Progress(*columns, console=errors, transient=True, speed_estimate_period=600) as bar:
-        begun: dict[str, TaskID] = {}
+    with Progress(*columns, console=_errors, transient=True, speed_estimate_period=600) as bar:
+        tasks: dict[str, TaskID] = {}
 
-        def report(stage: str, done: int, of: int) -> None:
-            if stage not in begun:
-                begun[stage] = bar.add_task(stage, total=of)
-            bar.update(begun[stage], completed=done)
+        def report(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done)
 
         yield report
 
 
 def print_scores(rows: Mapping[str, Mapping[str, Any]]) -> None:
-    """The scores of learned maps by name, those of `evaluate`, as a table."""
+    """Print the scores of learned maps, those of `evaluate`, by name."""
     columns = {
         "auc": "AUC",
         "average_precision": "average\nprecision",
-        "auc_relevant": "AUC of those\nthat matter",
+        "auc_relevant": "relevant\nAUC",
         "recall": "recall",
         "mean_obstacle": "mean on\nobstacles",
         "mean_free": "mean on\nfree cells",
@@ -98,9 +109,16 @@ def print_scores(rows: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def print_table(rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> None:
-    """A table of a row for each name; `columns` are the numbers' keys and headings, and what is missing is a dash."""
+    """Print a table with a row for each name.
+
+    Args:
+        rows: The numbers of each row by key; a dash stands for None.
+        columns: The heading of each key.
+    """
+    from rich.table import Table
+
     table = Table("", *columns.values())
     for name, scores in rows.items():
         cells = (scores.get(key) for key in columns)
         table.add_row(name, *("–" if number is None else f"{number:.3f}" for number in cells))
-    console.print(table)
+    _console.print(table)

@@ -1,57 +1,50 @@
 """`sidestep plan`: a path in a learned map, as CSV and PNG."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
-import numpy as np
-import pyarrow as pa
+import typer
 
-from sidestep.errors import InputError
-from sidestep.io.tables import write_table
-from sidestep.maps.learned_map import add_to_summary, read_learned_map
-from sidestep.plotting.maps import figure_plan, save
-from sidestep.robots.robot import BUMP_COST
-from sidestep.tabular.grid import Cell, Grid
-
-Position = tuple[float, float]
+from sidestep.cli.options import BUMP_COST, BumpCost, LearnedFolder, position_of
 
 
-def plan_path(folder: Path, start: Position, goal: Position, out: Path, bump_cost: float = BUMP_COST) -> dict[str, Any]:
-    """Plans as a robot does (`sidestep.robots.robot`) from `start` to `goal` (metres) in the learned map of `folder`.
+def plan(
+    folder: LearnedFolder,
+    start: Annotated[str, typer.Option(help="In metres.", metavar="X,Y")],
+    goal: Annotated[str, typer.Option(help="In metres.", metavar="X,Y")],
+    out: Annotated[Path | None, typer.Option("--out", help="The folder to write to (DIR/plan).", metavar="DIR")] = None,
+    bump_cost: BumpCost = BUMP_COST,
+) -> None:
+    """Plan a path in a learned map: path.csv, path.png, summary.json."""
+    import numpy as np
+    import pyarrow as pa
 
-    Writes `path.csv` (`step, x, y, blocked`), `path.png` and `summary.json` to `out`, and returns the summary.
+    from sidestep.cli.display import print_lines
+    from sidestep.io.tables import write_table
+    from sidestep.maps.learned_map import add_to_summary, load_map
+    from sidestep.plotting.maps import figure_plan, save
 
-    Raises `InputError` for positions outside the map or in known obstacles, and where there is no way.
-    """
-    learned = read_learned_map(folder)
-    first, last = (_state(learned.grid, position, name) for name, position in (("start", start), ("goal", goal)))
-    path = learned.robot(bump_cost).plan_to(last).paths_from(np.array([first]))[0]
-    if path[-1] != last:
-        raise InputError(f"no way from {start} to {goal} in the learned map", source=folder)
-    chances = learned.blocked.reshape(-1)[path]
-    x, y = learned.grid.centres(path).T
-    lengths = np.linalg.norm(np.diff(np.stack([x, y]), axis=1), axis=0)
+    out = out or folder / "plan"
+    first, last = position_of(start, "--start"), position_of(goal, "--goal")
+    learned = load_map(folder)
+    path = learned.plan(first, last, bump_cost=bump_cost)
+    x, y = path.positions.T
+    steps = np.arange(len(path.states))
+    write_table(out / "path.csv", pa.table({"step": steps, "x": x, "y": y, "blocked": path.blocked}))
+    save(figure_plan(learned.grid, learned.blocked, path.states), out / "path.png")
     summary = {
         "command": "plan",
-        "start": start,
-        "goal": goal,
+        "start": first,
+        "goal": last,
         "bump_cost": bump_cost,
-        "moves": len(path) - 1,
-        "length_metres": float(lengths.sum()),
-        "max_probability_blocked": float(chances.max()),
-        "probability_free": float(np.prod(1 - chances)),
+        "moves": len(path.states) - 1,
+        "length_metres": path.length,
+        "max_probability_blocked": float(path.blocked.max()),
+        "probability_free": float(np.prod(1 - path.blocked)),
     }
-    write_table(out / "path.csv", pa.table({"step": np.arange(len(path)), "x": x, "y": y, "blocked": chances}))
-    save(figure_plan(learned.grid, learned.blocked, path), out / "path.png")
     add_to_summary(folder, out, "plan", summary)
-    return summary
-
-
-def _state(grid: Grid, position: Position, name: str) -> int:
-    point = np.array([position], dtype=np.float64)
-    if not grid.contains(point)[0]:
-        raise InputError(f"{position} lies outside the map", field=name)
-    state = grid.state(position)
-    if grid.known.flat[state] == Cell.OCCUPIED:
-        raise InputError(f"{position} lies in a known obstacle", field=name)
-    return state
+    print_lines(
+        f"{summary['moves']} moves, {path.length:g} m; the likeliest obstacle on the way has "
+        f"P(blocked) = {path.blocked.max():.3f}",
+        f"path in {out}",
+    )

@@ -1,82 +1,82 @@
-"""A first look: an office nobody mapped, learned from the walks of those who work there.
+"""A first look: an office, learned from the walks of agents that know it.
 
-Walkers who know the office cross it between a few places. The map is forgotten, learned again from their walks alone,
-and used to plan to goals that nobody had.
+Agents cross the office between a few places. The map is learned from their walks alone, and used to plan to goals that
+no walk had.
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sidestep._files import write_json
-from sidestep.cli.simulate import Walkers, walk
-from sidestep.evaluation.evaluate import evaluate, plan_paths
-from sidestep.io.demonstrations import demonstrations_from_walks
+from sidestep.evaluation.evaluate import plan_paths
 from sidestep.io.maps import write_map
 from sidestep.io.trajectories import walks_from_trajectories
 from sidestep.io.walks import write_walks
-from sidestep.maps.config import Settings, fit_map
-from sidestep.maps.learned_map import LearnedMap, write_learned_map
+from sidestep.maps.config import BehaviorConfig, MapConfig, SimulationConfig
+from sidestep.maps.learn import learn_map
 from sidestep.plotting.maps import Panel, figure_learned, save
-from sidestep.tabular.models import ObstacleGrid
-from sidestep.tabular.tasks import Reward
+from sidestep.tabular.reward import Reward
 from sidestep.worlds.offices import office, places
-
-ROWS, COLUMNS = 14, 24
-WALKERS = Walkers(walks=400, goals=12)
-SETTINGS = Settings(beta=20.0, discount=0.97)
-NEW_PLACES = 4
+from sidestep.worlds.walks import simulate_walks
 
 
-def demo(folder: Path, seed: int = 0, report: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Runs the demonstration, writes `demo.png`, the true map, the walks and the learned map to a folder, and returns
-    the summary. `seed` draws the office, its walkers and the new goals; `report` is told what is being done.
+@dataclass(frozen=True)
+class DemoConfig:
+    """The office of `rows` × `columns` cells, the agents in it, how the map is learned, and how many new goals."""
+
+    rows: int = 14
+    columns: int = 24
+    agents: SimulationConfig = field(default_factory=lambda: SimulationConfig(walks=400, goals=12))
+    learning: MapConfig = field(default_factory=lambda: MapConfig(Reward(discount=0.97), BehaviorConfig(beta=20.0)))
+    new_places: int = 4
+
+
+def demo(
+    folder: Path, seed: int = 0, notify: Callable[[str], None] = lambda _: None, config: DemoConfig | None = None
+) -> dict[str, Any]:
+    """Run the demonstration; write `demo.png`, the true map, the walks and the learned map.
+
+    Args:
+        folder: The folder to write to.
+        seed: Draws the office, the walks and the new goals.
+        notify: Called with a line of text at each stage.
+        config: The sizes; by default those of `sidestep demo`.
+
+    Returns:
+        The content of `summary.json`.
     """
-    truth = office(ROWS, COLUMNS, seed)
-    report("walkers cross the office")
-    trajectories, goals = walk(truth, replace(WALKERS, seed=seed))
+    config = config or DemoConfig()
+    agents = replace(config.agents, seed=seed)
+    truth = office(config.rows, config.columns, seed)
+    notify("agents cross the office")
+    trajectories, goals = simulate_walks(truth, agents)
     walks = walks_from_trajectories(trajectories, goals, truth)
     write_map(folder / "truth.yaml", truth.known.astype(np.float64), truth)
     write_walks(folder / "walks.csv", walks)
 
-    report("learning the map from their walks")
-    blank = truth.forget()
-    reward = Reward(SETTINGS.discount, SETTINGS.step_cost)
-    shown = demonstrations_from_walks(walks, blank, discount=reward.discount, step_cost=reward.step_cost)
-    found = fit_map(ObstacleGrid(blank, SETTINGS.prior_mean), shown, SETTINGS)
-    blocked = np.asarray(found.model.blocked)
+    notify("learning the map from their walks")
+    learned = learn_map(truth.forget(), walks, config.learning)
+    learning = learned.learning
+    assert learning is not None
 
-    report("planning between all pairs of places")
-    learned = LearnedMap(blank, blocked, shown.visited_state_goals(), reward)
-    scores = evaluate(learned.robot(), blocked, truth, np.ones(truth.shape, bool), learned.visited)
-    elsewhere = places(truth, NEW_PLACES + len(goals), seed + 1)
-    new = elsewhere[~np.isin(elsewhere, goals)][:NEW_PLACES]
+    notify("planning between all pairs of places")
+    scores = learned.evaluate(truth)
+    elsewhere = places(truth, config.new_places + len(goals), seed + 1)
+    new = elsewhere[~np.isin(elsewhere, goals)][: config.new_places]
     paths, _ = plan_paths(learned.robot(), new[:1], new[1:])
+    title = "what they say of its walls, and new plans"
+    starts, ends = new[:1].tolist(), new[1:].tolist()
     panels = [
-        Panel(f"{len(walks)} walks in an office", truth, paths=shown.paths(), goals=goals),
-        Panel(
-            "what they say of its walls, and new plans",
-            blank,
-            blocked,
-            truth,
-            paths,
-            new[:1].tolist(),
-            new[1:].tolist(),
-        ),
+        Panel(f"{len(walks)} walks in an office", truth, paths=learning.demonstrations.paths(), goals=goals),
+        Panel(title, learned.grid, learned.blocked, truth, paths, starts, ends),
     ]
     save(figure_learned(panels), folder / "demo.png")
-    summary = {
-        "command": "demo",
-        "settings": asdict(SETTINGS),
-        "walkers": asdict(replace(WALKERS, seed=seed)),
-        "objective": found.final.objective,
-        "converged": found.converged,
-        "message": found.message,
-        "scores": scores.to_dict(),
-    }
-    write_learned_map(folder / "learned", learned, summary)
+    entries = {"command": "demo", "agents": asdict(agents), "scores": scores.to_dict()}
+    learned.save(folder / "learned", **entries)
+    summary = {**entries, **learned.summary()}
     write_json(folder / "summary.json", summary)
     return summary

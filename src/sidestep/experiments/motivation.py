@@ -26,9 +26,10 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped
 
 from sidestep._files import write_json
-from sidestep.baselines.interface import ModelResult, behavior_aware, reward_of
+from sidestep.baselines.interface import ModelResult, behavior_aware
 from sidestep.baselines.maxent_irl import maxent_irl
-from sidestep.maps.config import Settings
+from sidestep.maps.config import BehaviorConfig, MapConfig
+from sidestep.maps.fit import behavior_of
 from sidestep.plotting.maps import save
 from sidestep.plotting.policies import Curves, PolicyPanel, figure_policies
 from sidestep.robots.robot import risk_averse_robot
@@ -36,8 +37,9 @@ from sidestep.tabular.demonstrations import Demonstrations, gather
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.planning import plan
+from sidestep.tabular.reward import Reward
 from sidestep.tabular.simulation import simulate
-from sidestep.tabular.tasks import Reward, Task
+from sidestep.tabular.tasks import Task
 from sidestep.worlds.rooms import two_rooms
 
 ROWS, COLUMNS, DOOR = 9, 13, 8
@@ -64,12 +66,12 @@ class Form(NamedTuple):
     """
 
     worth: float
-    settings: Settings
+    config: MapConfig
 
 
 FORMS = {
-    "goal": Form(1.0, Settings(beta=200.0, discount=0.95)),
-    "steps": Form(40.0, Settings(beta=10.0, discount=1.0, step_cost=1.0)),
+    "goal": Form(1.0, MapConfig(Reward(0.95), BehaviorConfig(beta=200.0))),
+    "steps": Form(40.0, MapConfig(Reward(1.0, 1.0), BehaviorConfig(beta=10.0))),
 }
 
 
@@ -118,7 +120,7 @@ def run(folder: Path, seed: int = 0, report: Callable[[str], None] = lambda _: N
         "arrives_by_behavior_at_least": min(behavior["arrives"]),
         "stakes": list(STAKES),
         "forms": forms,
-        "settings": {name: asdict(form.settings) | {"worth": form.worth} for name, form in FORMS.items()},
+        "settings": {name: asdict(form.config) | {"worth": form.worth} for name, form in FORMS.items()},
         "seconds": round(time.monotonic() - started, 1),
     }
     curves = [
@@ -132,7 +134,7 @@ def run(folder: Path, seed: int = 0, report: Callable[[str], None] = lambda _: N
 
 def walks(form: Form, seed: int) -> Demonstrations:
     """Walks of people who know the world and go the best ways, from dry places."""
-    world, reward, random = true_world(), reward_of(form.settings), np.random.default_rng(seed)
+    world, reward, random = true_world(), form.config.reward, np.random.default_rng(seed)
     goals, dry = [_state(goal) for goal in GOALS], np.flatnonzero(np.asarray(world.known) == Cell.FREE)
     tasks = [reward.reach(_blank(), goal) for goal in goals]
     starts = [random.choice(np.setdiff1d(dry, [goal]), WALKERS) for goal in goals]
@@ -141,11 +143,16 @@ def walks(form: Form, seed: int) -> Demonstrations:
 
 def learned(form: Form, demonstrations: Demonstrations) -> dict[str, ModelResult]:
     """The truth, and what each method makes of the walks on a map of which nothing is known."""
-    world, settings = true_world(), form.settings
+    world, config = true_world(), form.config
     truth = ModelResult(
-        world, reward_of(settings), settings.behavior(), np.asarray(world.blocked), risk_averse_robot(world, []), True
+        world,
+        config.reward,
+        behavior_of(config.behavior),
+        np.asarray(world.blocked),
+        risk_averse_robot(world, []),
+        True,
     )
-    return {"truth": truth} | {name: learn(_blank(), demonstrations, settings) for name, learn in METHODS.items()}
+    return {"truth": truth} | {name: learn(_blank(), demonstrations, config) for name, learn in METHODS.items()}
 
 
 def at_stakes(known: ModelResult, form: Form, goal: int, stakes: float) -> Task:
@@ -154,7 +161,7 @@ def at_stakes(known: ModelResult, form: Form, goal: int, stakes: float) -> Task:
     What cells cost stays as it was learned: a global cost function knows nothing of tasks.
     """
     own = known.reward.reach(_blank(), goal)
-    bare = Reward(form.settings.discount, form.settings.step_cost).reach(_blank(), goal)
+    bare = form.config.reward.reach(_blank(), goal)
     final = jnp.full((1,), stakes * form.worth)
     return Task(own.reward + (stakes - 1) * bare.reward, final, own.terminal, own.discount)
 

@@ -30,9 +30,9 @@ from sidestep.tabular.backups import Behavior, BoltzmannAverage, Gradient
 from sidestep.tabular.demonstrations import Demonstrations, gather
 from sidestep.tabular.likelihood import ALL_TERMS, Term
 from sidestep.tabular.models import ObstacleGrid, true_model
+from sidestep.tabular.reward import Reward
 from sidestep.tabular.simulation import simulate
 from sidestep.tabular.solve import SolveOptions
-from sidestep.tabular.tasks import Reward
 from sidestep.worlds.grids import WORLDS, World
 
 WALKS_PER_PAIR = 10

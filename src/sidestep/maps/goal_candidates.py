@@ -1,13 +1,12 @@
-"""`sidestep learn --candidates`: walks that do not name their goals, each with a posterior over candidates."""
+"""Walks that do not name their goals: candidates, and a posterior over them for each walk."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pyarrow as pa
-from jaxtyping import Int
+from jaxtyping import Bool, Float, Int
 
 from sidestep.errors import InputError
 from sidestep.inference.fit import Fit
@@ -16,102 +15,145 @@ from sidestep.inference.maximize import Progress
 from sidestep.inference.priors import Normal
 from sidestep.io.demonstrations import connected_regions
 from sidestep.io.gridding import Moves
-from sidestep.io.tables import check_columns, finite_column, read_table, write_table
-from sidestep.maps.config import Settings, fit_map
+from sidestep.maps.config import MapConfig
+from sidestep.maps.fit import behavior_of, fit_map
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid
-from sidestep.tabular.tasks import reach
+
+_CERTAIN = 0.9
+"""The posterior probability above which a goal counts as certain."""
+
+
+@dataclass(frozen=True, eq=False)
+class GoalCandidates:
+    """The goals that walks may have had.
+
+    Attributes:
+        positions: x, y of each candidate in metres, two candidates at least.
+        source: The file, for error messages.
+    """
+
+    positions: Float[np.ndarray, "candidates 2"]
+    source: str = "goal candidates"
 
 
 class GoalPosterior(NamedTuple):
-    """What was learned of walks without goals.
+    """A posterior over the goal of each walk.
 
-    - `found`: the model, and P(g | walk) for each of `walks` and `candidates`.
-    - `walks`: those that moved at all. `candidates`: states.
-    - `moves`: theirs, with the most probable goal of each.
+    Attributes:
+        fit: The model, and P(goal | walk).
+        walks: The index of each walk that moves.
+        candidates: The states of the candidates.
+        moves: The moves, with the most probable goal of each walk.
+        labels: The label of each of `walks`.
     """
 
-    found: GoalFit[ObstacleGrid]
+    fit: GoalFit[ObstacleGrid]
     walks: Int[np.ndarray, " walks"]
     candidates: Int[np.ndarray, " candidates"]
     moves: Moves
+    labels: list[object]
 
-    @property
-    def fit(self) -> Fit[ObstacleGrid]:
-        """The last fit."""
-        return self.found.fit
-
-    def told(self) -> dict[str, Any]:
-        """For a summary."""
+    def summary(self) -> dict[str, Any]:
+        """Return the numbers of `summary.json`."""
         return {
             "candidates": len(self.candidates),
-            "shares": self.found.shares.tolist(),
-            "surely_known": float((self.found.posterior.max(axis=1) > _SURELY).mean()),
-            "evidence": list(self.found.evidence),
-            "converged": self.found.converged,
+            "probabilities": self.fit.shares.tolist(),
+            "fraction_certain": float((self.fit.posterior.max(axis=1) > _CERTAIN).mean()),
+            "evidence": list(self.fit.evidence),
+            "converged": self.fit.converged,
         }
 
 
-_SURELY = 0.9
-"""A goal is surely known where its posterior is above this."""
+def read_goal_candidates(path: str | Path) -> GoalCandidates:
+    """Read a table with columns `goal_x`, `goal_y` in metres, one row a candidate.
 
-
-def read_candidates(path: Path, grid: Grid, moves: Moves) -> Int[np.ndarray, " candidates"]:
-    """The states of the goals that a table names, in metres: `goal_x`, `goal_y`.
-
-    Raises `InputError`, with the row, for places outside the map, in known obstacles or walled off by these from where
-    some move was made, and for a cell named twice.
+    Raises:
+        InputError: For columns that are missing or not finite, and fewer than two rows.
     """
+    from sidestep.io.tables import check_columns, finite_column, read_table
+
     table = read_table(path)
     check_columns(table, ("goal_x", "goal_y"), str(path))
-    places = np.stack([finite_column(table, name, str(path)) for name in ("goal_x", "goal_y")], axis=1)
-    if len(places) < 2:
-        raise InputError(f"expected at least 2 candidates, found {len(places)}", source=path)
-    _refuse(~grid.contains(places), path, "expected a place on the map")
-    states = grid.states(places)
-    _refuse(grid.known.reshape(-1)[states] == Cell.OCCUPIED, path, "expected a place outside known obstacles")
+    positions = np.stack([finite_column(table, name, str(path)) for name in ("goal_x", "goal_y")], axis=1)
+    if len(positions) < 2:
+        raise InputError(f"expected at least 2 candidates, found {len(positions)}", source=path)
+    return GoalCandidates(positions, str(path))
+
+
+def candidate_states(candidates: GoalCandidates, grid: Grid, moves: Moves) -> Int[np.ndarray, " candidates"]:
+    """Return the states of candidates on a grid.
+
+    Raises:
+        InputError: With the row, for positions outside the map, in known obstacles or separated by these from a
+            move, and for a cell named twice.
+    """
+    positions = candidates.positions
+    _refuse(~grid.contains(positions), candidates, "expected a position on the map")
+    states = grid.states(positions)
+    _refuse(grid.known.reshape(-1)[states] == Cell.OCCUPIED, candidates, "expected a position outside known obstacles")
     part = connected_regions(grid)
-    _refuse(~(part[states][:, None] == part[moves.states]).all(axis=1), path, "expected a place that all can reach")
+    separated = ~(part[states][:, None] == part[moves.states]).all(axis=1)
+    _refuse(separated, candidates, "expected a position that every walk can reach")
     first = np.unique(states, return_index=True)[1]
-    _refuse(~np.isin(np.arange(len(states)), first), path, "expected a cell of its own for every candidate")
+    repeated = ~np.isin(np.arange(len(states)), first)
+    _refuse(repeated, candidates, "expected a cell of its own for every candidate")
     return states
 
 
-def _refuse(bad: np.ndarray, path: Path, expected: str) -> None:
+def _refuse(bad: Bool[np.ndarray, " candidates"], candidates: GoalCandidates, expected: str) -> None:
     if bad.any():
-        raise InputError(expected, source=path, row=int(np.argmax(bad)) + 1, field="goal_x, goal_y")
+        raise InputError(expected, source=candidates.source, row=int(np.argmax(bad)) + 1, field="goal_x, goal_y")
 
 
-def fit_candidates(
+def fit_with_unknown_goals(
     model: ObstacleGrid,
     grid: Grid,
     moves: Moves,
-    candidates: Int[np.ndarray, " candidates"],
-    settings: Settings,
-    prior: Normal | None = None,
-    report: Callable[[Progress], None] | None = None,
+    candidates: GoalCandidates,
+    labels: list[object],
+    config: MapConfig,
+    cell_prior: Normal | None = None,
+    callback: Callable[[Progress], None] | None = None,
 ) -> GoalPosterior:
-    """The map and the goals that make walks most probable, by expectation maximisation (`sidestep.inference.goals`).
+    """Fit a map and the goals of walks by expectation maximization (`sidestep.inference.goals`).
 
-    `report` is told of every round's fit. Raises `InputError` as `fit_goals` does.
+    Args:
+        model: The model from which the fit starts.
+        grid: The grid.
+        moves: The moves of all walks.
+        candidates: The goals that walks may have had.
+        labels: The label of every walk.
+        config: The configuration.
+        cell_prior: The prior of the cells' logits; by default that of the configuration.
+        callback: Called with the progress of every iteration of every fit.
+
+    Raises:
+        InputError: As `candidate_states` and `fit_goals` do.
     """
+    states = candidate_states(candidates, grid, moves)
     walks = np.unique(moves.walk)
-    tasks = [reach(grid, int(state), discount=settings.discount, step_cost=settings.step_cost) for state in candidates]
+    tasks = [config.reward.reach(grid, int(state)) for state in states]
 
-    def learn(present: ObstacleGrid, shown: Demonstrations) -> Fit[ObstacleGrid]:
-        return fit_map(present, shown, settings, report, each=prior, afresh=present is model)
+    def learn(current: ObstacleGrid, demonstrations: Demonstrations) -> Fit[ObstacleGrid]:
+        first = current is model
+        return fit_map(current, demonstrations, config, cell_prior=cell_prior, initialize=first, callback=callback)
 
-    found = fit_goals(model, moves.trajectories(), tasks, settings.behavior(), learn)
+    result = fit_goals(model, moves.trajectories(), tasks, behavior_of(config.behavior), learn)
     goals = moves.goals.copy()
-    goals[walks] = candidates[found.posterior.argmax(axis=1)]
-    return GoalPosterior(found, walks, candidates, replace(moves, goals=goals))
+    goals[walks] = states[result.posterior.argmax(axis=1)]
+    return GoalPosterior(result, walks, states, replace(moves, goals=goals), [labels[walk] for walk in walks.tolist()])
 
 
-def write_posterior(path: Path, guessed: GoalPosterior, labels: list[object], grid: Grid) -> None:
-    """A table of `walk, goal_x, goal_y, probability`: a row for every walk and candidate."""
-    count, places = len(guessed.candidates), grid.centres(guessed.candidates)
-    own = [labels[walk] for walk in np.repeat(guessed.walks, count).tolist()]
-    goal_x, goal_y = np.tile(places, (len(guessed.walks), 1)).T
-    columns = {"walk": own, "goal_x": goal_x, "goal_y": goal_y, "probability": guessed.found.posterior.ravel()}
-    write_table(path, pa.table(columns))
+def write_goal_posterior(path: Path, posterior: GoalPosterior, grid: Grid) -> None:
+    """Write a table of `walk, goal_x, goal_y, probability`, one row for each walk and candidate."""
+    import pyarrow as pa
+
+    from sidestep.io.tables import write_table
+
+    count, positions = len(posterior.candidates), grid.centres(posterior.candidates)
+    goal_x, goal_y = np.tile(positions, (len(posterior.walks), 1)).T
+    labels = [label for label in posterior.labels for _ in range(count)]
+    probability = posterior.fit.posterior.ravel()
+    write_table(path, pa.table({"walk": labels, "goal_x": goal_x, "goal_y": goal_y, "probability": probability}))

@@ -1,15 +1,16 @@
-"""Learned maps on disk: the folder that `sidestep learn` writes and that `plan` and `evaluate` read.
+"""A learned map: its numbers, a robot that plans in it, and its folder.
 
-| file           | what it holds                                                                            |
-|----------------|------------------------------------------------------------------------------------------|
-| `map.yaml`, `map.pgm` | the learned map for ROS (`map_server`, mode scale)                                 |
-| `blocked.npy`  | P(blocked) of each cell, row 0 at the top; exactly 0 or 1 where the map knew             |
-| `visited.npy`  | the (state, goal) pairs of all that people passed whose walks it was learned from        |
-| `summary.json` | settings, the final objective and its parts, the convergence of every task, time, memory |
-| `learned.png`  | the picture                                                                              |
+| file           | content                                                                          |
+|----------------|----------------------------------------------------------------------------------|
+| `map.yaml`, `map.pgm` | the map for ROS (`map_server`, mode scale)                                |
+| `blocked.npy`  | P(blocked) of each cell, row 0 at the top; exactly 0 or 1 where the map knew     |
+| `visited.npy`  | the (state, goal) pairs that the walks passed                                    |
+| `posterior.csv`| P(goal) of each walk, where the walks did not name their goals                   |
+| `summary.json` | settings, the final objective and its parts, convergence, time, memory           |
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,71 +19,145 @@ from jaxtyping import Bool, Float, Int
 
 from sidestep._files import read_array, read_json, write_array, write_json
 from sidestep.errors import InputError
+from sidestep.evaluation.evaluate import Evaluation, StageCallback, evaluate
 from sidestep.io.maps import read_map, write_map
+from sidestep.maps.goal_candidates import write_goal_posterior
+from sidestep.maps.learning import Learning
 from sidestep.robots.planners import ModelPlanner
 from sidestep.robots.robot import BUMP_COST, risk_averse_robot
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 from sidestep.tabular.models import ObstacleGrid
-from sidestep.tabular.tasks import Reward
+from sidestep.tabular.reward import Reward
+
+Position = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedPath:
+    """A path that was planned in a learned map.
+
+    Attributes:
+        states: The states along the path, the start first.
+        positions: x, y of their centers in metres.
+        blocked: P(blocked) of each.
+        length: The length of the path in metres.
+    """
+
+    states: Int[np.ndarray, " steps"]
+    positions: Float[np.ndarray, "steps 2"]
+    blocked: Float[np.ndarray, " steps"]
+    length: float
 
 
 @dataclass(frozen=True, eq=False)
 class LearnedMap:
-    """A learned map with what later steps need to know of how it was learned.
+    """A learned map.
 
-    - `grid`: geometry and moves, and what was known beforehand.
-    - `blocked`: P(blocked), exactly 0 or 1 where the map knew.
-    - `visited`: the (state, goal) pairs of all that people passed whose walks it was learned from.
-    - `reward`: what the walkers were taken to pursue.
+    Attributes:
+        grid: The geometry, the moves, and what was known of each cell beforehand.
+        blocked: P(blocked) of each cell, row 0 at the top; exactly 0 or 1 where the map knew.
+        visited: The (state, goal) pairs that the walks passed.
+        reward: The reward that the agents pursued.
+        learning: How the map was learned; None for a map that was loaded from a folder.
     """
 
     grid: Grid
     blocked: Float[np.ndarray, "rows columns"]
     visited: Int[np.ndarray, "visits 2"]
     reward: Reward
+    learning: Learning | None = None
 
     @property
     def unknown(self) -> Bool[np.ndarray, "rows columns"]:
         """The cells that had to be learned."""
         return self.grid.known == Cell.UNKNOWN
 
+    @property
+    def converged(self) -> bool | None:
+        """Whether the fit converged; None for a map that was loaded from a folder."""
+        return None if self.learning is None else self.learning.fit.converged
+
+    @cached_property
     def model(self) -> ObstacleGrid:
-        """The transition model of the learned map."""
+        """The transition model of the map."""
         with np.errstate(divide="ignore"):
             logits = np.log(self.blocked) - np.log1p(-self.blocked)
         return ObstacleGrid(self.grid, np.where(self.unknown, logits, 0.0).reshape(-1))
 
     def robot(self, bump_cost: float = BUMP_COST) -> ModelPlanner:
-        """Who knows the learned map, and where people walked (see `sidestep.robots.robot`)."""
-        return risk_averse_robot(self.model(), self.visited[:, 0], bump_cost)
+        """Return a robot that knows the map and where the walks went (`risk_averse_robot`).
+
+        Args:
+            bump_cost: The cost of the first bump at a place in cell sides, at least 0.
+        """
+        return risk_averse_robot(self.model, self.visited[:, 0], bump_cost)
+
+    def plan(self, start: Position, goal: Position, *, bump_cost: float = BUMP_COST) -> PlannedPath:
+        """Plan a path as a robot does.
+
+        Args:
+            start: x, y in metres.
+            goal: x, y in metres.
+            bump_cost: As for `robot`.
+
+        Raises:
+            InputError: For positions outside the map or in known obstacles, and where there is no path.
+        """
+        first, last = _state(self.grid, start, "start"), _state(self.grid, goal, "goal")
+        states = self.robot(bump_cost).plan_to(last).paths_from(np.array([first]))[0]
+        if states[-1] != last:
+            raise InputError(f"expected a path from {start} to {goal} in the learned map, found none", field="goal")
+        positions = self.grid.centres(states)
+        length = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+        return PlannedPath(states, positions, self.blocked.reshape(-1)[states], length)
+
+    def evaluate(
+        self, truth: Grid, *, seed: int = 0, bump_cost: float = BUMP_COST, callback: StageCallback = lambda *_: None
+    ) -> Evaluation:
+        """Score the map and the paths of its robot against the true map, as `sidestep.evaluate` does.
+
+        Args:
+            truth: The true map, of the same shape.
+            seed: Draws starts and goals on maps too large for all pairs.
+            bump_cost: As for `robot`.
+            callback: Called with a stage, what is done of it and what there is to do.
+        """
+        return evaluate(self.robot(bump_cost), self.blocked, truth, self.unknown, self.visited, seed, callback)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the numbers of `summary.json`."""
+        reward = {"reward": {"discount": self.reward.discount, "step_cost": self.reward.step_cost}}
+        summary = {"settings": reward} if self.learning is None else self.learning.summary()
+        return {"connectivity": self.grid.connectivity, **summary}
+
+    def save(self, folder: str | Path, **entries: Any) -> None:
+        """Write the map to a folder, each file whole or not at all, `summary.json` last.
+
+        A learned probability is never written as exactly 0 or 1: that would say that the cell had been known.
+
+        Args:
+            folder: The folder; it is created.
+            **entries: More entries of `summary.json`.
+
+        Raises:
+            InputError: Where the file system refuses.
+        """
+        folder, smallest = Path(folder), np.finfo(np.float64).epsneg
+        blocked = np.where(self.unknown, np.clip(self.blocked, smallest, 1 - smallest), self.blocked)
+        write_map(folder / "map.yaml", blocked, self.grid)
+        write_array(folder / "blocked.npy", blocked)
+        write_array(folder / "visited.npy", self.visited)
+        if self.learning is not None and self.learning.goals is not None:
+            write_goal_posterior(folder / "posterior.csv", self.learning.goals, self.grid)
+        write_json(folder / "summary.json", {**entries, **self.summary()})
 
 
-def write_learned_map(folder: Path, learned: LearnedMap, summary: dict[str, Any]) -> None:
-    """Writes the numbers of a learned map, each file whole or not at all, `summary.json` last.
+def load_map(folder: str | Path) -> LearnedMap:
+    """Load a learned map from the folder that `LearnedMap.save` or `sidestep learn` has written.
 
-    What is learned is never written as exactly 0 or 1, which would say that it had been known.
+    Raises:
+        InputError: For a file that is missing or does not fit.
     """
-    smallest = np.finfo(np.float64).epsneg
-    blocked = np.where(learned.unknown, np.clip(learned.blocked, smallest, 1 - smallest), learned.blocked)
-    write_map(folder / "map.yaml", blocked, learned.grid)
-    write_array(folder / "blocked.npy", blocked)
-    write_array(folder / "visited.npy", learned.visited)
-    write_json(folder / "summary.json", summary)
-
-
-def add_to_summary(folder: Path, out: Path, key: str | None, summary: dict[str, Any]) -> None:
-    """Writes the summary of a later step to `out`; into the learned map's own where that is the same folder.
-
-    There it stands under `key`, or at the top level without one.
-    """
-    path = out / "summary.json"
-    if out.resolve() == folder.resolve():
-        summary = {**read_json(path), **(summary if key is None else {key: summary})}
-    write_json(path, summary)
-
-
-def read_learned_map(folder: Path | str) -> LearnedMap:
-    """A learned map back from its folder; raises `InputError` for a file that is missing or does not fit."""
     folder = Path(folder)
     connectivity, reward = _settings(folder / "summary.json")
     geometry = read_map(folder / "map.yaml", connectivity=connectivity)
@@ -99,27 +174,49 @@ def read_learned_map(folder: Path | str) -> LearnedMap:
             source=folder / "visited.npy",
         )
     known = np.where(blocked == 0, Cell.FREE, np.where(blocked == 1, Cell.OCCUPIED, Cell.UNKNOWN))
-    return LearnedMap(
-        replace(geometry, known=known.astype(np.int64)),
-        blocked.astype(np.float64),
-        visited.astype(np.int64),
-        reward,
-    )
+    grid = replace(geometry, known=known.astype(np.int64))
+    return LearnedMap(grid, blocked.astype(np.float64), visited.astype(np.int64), reward)
+
+
+def add_to_summary(folder: Path, out: Path, key: str | None, summary: dict[str, Any]) -> None:
+    """Write the summary of a later step to `out`; into that of the learned map where this is the same folder.
+
+    Args:
+        folder: The folder of the learned map.
+        out: The folder to write to.
+        key: The entry of the learned map's summary; None for its top level.
+        summary: The summary of the step.
+    """
+    path = out / "summary.json"
+    if out.resolve() == folder.resolve():
+        summary = {**read_json(path), **(summary if key is None else {key: summary})}
+    write_json(path, summary)
 
 
 def _settings(path: Path) -> tuple[Connectivity, Reward]:
-    """The connectivity and the reward that a map was learned with, from its summary."""
+    """Read the connectivity and the reward that a map was learned with."""
     summary = read_json(path)
     settings = summary.get("settings") if isinstance(summary, dict) else None
-    if not isinstance(settings, dict) or not {"connectivity", "discount", "step_cost"} <= set(settings):
+    reward = settings.get("reward") if isinstance(settings, dict) else None
+    if not isinstance(reward, dict) or not {"discount", "step_cost"} <= set(reward) or "connectivity" not in summary:
         raise InputError(
-            "expected settings with connectivity, discount and step_cost, as `sidestep learn` writes them", source=path
+            "expected connectivity and settings.reward with discount and step_cost, as `sidestep learn` writes them",
+            source=path,
         )
-    if settings["connectivity"] not in (4, 8):
-        raise InputError(f"expected 4 or 8, found {settings['connectivity']!r}", source=path, field="connectivity")
-    discount, step_cost = settings["discount"], settings["step_cost"]
+    if summary["connectivity"] not in (4, 8):
+        raise InputError(f"expected 4 or 8, found {summary['connectivity']!r}", source=path, field="connectivity")
+    discount, step_cost = reward["discount"], reward["step_cost"]
     if not isinstance(discount, int | float) or not 0 < discount <= 1:
         raise InputError(f"expected a number above 0 and at most 1, found {discount!r}", source=path, field="discount")
     if step_cost is not None and not (isinstance(step_cost, int | float) and 0 < step_cost < np.inf):
         raise InputError(f"expected a number above 0, found {step_cost!r}", source=path, field="step_cost")
-    return settings["connectivity"], Reward(float(discount), None if step_cost is None else float(step_cost))
+    return summary["connectivity"], Reward(float(discount), None if step_cost is None else float(step_cost))
+
+
+def _state(grid: Grid, position: Position, name: str) -> int:
+    if not grid.contains(np.array([position], dtype=np.float64))[0]:
+        raise InputError(f"{position} lies outside the map", field=name)
+    state = grid.state(position)
+    if grid.known.flat[state] == Cell.OCCUPIED:
+        raise InputError(f"{position} lies in a known obstacle", field=name)
+    return state

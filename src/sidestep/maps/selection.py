@@ -1,18 +1,17 @@
-"""`--behavior auto`: what people pursue and how sharply, chosen by walks that were not learned from.
+"""Selection of the behavior by cross-validation: the reward, β, and the weight of the actions.
 
-Maps are learned from two thirds of the walks at a time and judged by the others.
+Maps are learned from two thirds of the walks at a time and scored by the others.
 
-1. **Reward.** A goal that pays 1 with the discount of the settings, or a cost of 1 a cell without one, each with the β
-   to begin with or four times that, whichever suits it better. Where no values are found for one of them, other than
-   the settings' own, it is passed over. The reward of the settings stays unless the other makes held-out actions and
-   transitions more probable by a fifth of a nat a move: what predicts actions a little better may find walls worse.
-2. **Sharpness.** β is doubled as long as people are more regular than they are taken to be (κ above 1, see
-   `sidestep.inference.calibration`) and held-out walks become more probable by it.
-3. **Tempering.** Where their steps say less than as many independent ones (κ below 1), the actions' likelihood counts
-   by the share κ, so that walls are not put where people were only wrong together.
+1. **Reward.** Two kinds are compared: a goal that pays 1 with the discount of the configuration, and a cost of 1 a cell
+   without one. Each has its own first β or four times that, whichever is better. A kind without values is passed over,
+   unless it is the configuration's own. The configured reward stays unless the other makes held-out actions and
+   transitions more probable by a fifth of a nat a move: better prediction of actions does not always find walls better.
+2. **Inverse temperature.** β is doubled while agents are more regular than the model expects (κ above 1, see
+   `sidestep.inference.calibration`) and held-out walks become more probable.
+3. **Tempering.** Where actions say less than independent ones would (κ below 1), their likelihood is raised to the
+   power κ. Walls then do not explain errors that the walks have in common.
 
-What differs counts beyond three standard errors, so that the settings stay unless the walks speak against them. Lapses
-are learned with every map.
+A difference counts beyond three standard errors. Lapses are learned with every map.
 """
 
 from collections.abc import Callable
@@ -27,194 +26,224 @@ from sidestep.inference.calibration import doubtful, effective_sample_ratio, sco
 from sidestep.inference.priors import Normal
 from sidestep.io.demonstrations import demonstrations_from_moves
 from sidestep.io.gridding import Moves
-from sidestep.maps.config import Settings, fit_map
+from sidestep.maps.config import BehaviorConfig, MapConfig
+from sidestep.maps.fit import fit_map
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import transition_probabilities
 from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.reward import Reward
 from sidestep.tabular.solve import SolveOptions
 
 FOLDS = 3
-"""Into how many parts the walks are cut."""
-_SHARPER = 4.0
-"""Kinds of reward are compared by the β to begin with and by so many times that."""
-_SURELY = 3.0
-"""How many standard errors a difference must have to count."""
+"""The number of folds of the cross-validation."""
+_BETA_FACTOR = 4.0
+"""The kinds of reward are compared with the first β and with this many times it."""
+_STANDARD_ERRORS = 3.0
+"""The number of standard errors beyond which a difference counts."""
 _WORTH = 0.2
-"""By how many nats a move another kind of reward must be better."""
-_DOUBLINGS = 6
-"""How often β is doubled at most."""
-_SHARPNESS_BY_STEPS = 0.5
-"""β to begin with where a cell costs 1 and the settings say something else."""
+"""The gain in nats a move that another kind of reward must have."""
+_MAX_DOUBLINGS = 6
+"""The most doublings of β."""
+_STEP_COST_BETA = 0.5
+"""The first β where a cell costs 1 and the configuration has another reward."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What held-out walks say of settings: the nats of every walk's actions and transitions, κ, the share of lapses.
+    """The score of one configuration by held-out walks.
 
-    κ is infinite where the walks do not vary.
+    Attributes:
+        config: The configuration.
+        actions: The log-likelihood of the actions of each walk, in nats.
+        transitions: The log-likelihood of the transitions of each walk, in nats.
+        moves: The number of moves.
+        ratio: κ; infinite where the walks do not vary.
+        lapse: The learned probability of a random action, averaged over folds.
     """
 
-    settings: Settings
+    config: MapConfig
     actions: Float[np.ndarray, " walks"]
     transitions: Float[np.ndarray, " walks"]
     moves: int
-    share: float
+    ratio: float
     lapse: float
 
     @property
-    def nats(self) -> Float[np.ndarray, " walks"]:
-        """Of actions and transitions."""
+    def log_likelihood(self) -> Float[np.ndarray, " walks"]:
+        """The log-likelihood of each walk, in nats."""
         return self.actions + self.transitions
 
-    def told(self) -> dict[str, Any]:
-        """For a summary."""
-        names = ("beta", "discount", "step_cost")
+    def summary(self) -> dict[str, Any]:
+        """Return the numbers of `summary.json`."""
+        reward = self.config.reward
         return {
-            **{name: getattr(self.settings, name) for name in names},
+            "beta": self.config.behavior.beta,
+            "discount": reward.discount,
+            "step_cost": reward.step_cost,
             "heldout_actions": float(self.actions.sum() / self.moves),
             "heldout_transitions": float(self.transitions.sum() / self.moves),
-            "effective_share": self.share if np.isfinite(self.share) else None,
-            "lapses": self.lapse,
+            "effective_sample_ratio": self.ratio if np.isfinite(self.ratio) else None,
+            "lapse": self.lapse,
         }
 
 
 @dataclass(frozen=True)
-class Choice:
-    """Settings that were chosen, why, and all trials."""
+class Selection:
+    """A selected configuration, the reasons for it, and all trials."""
 
-    settings: Settings
+    config: MapConfig
     reasons: list[str]
     trials: list[Trial]
 
+    def summary(self) -> dict[str, Any]:
+        """Return the entries of `summary.json`."""
+        return {"reasons": self.reasons, "trials": [trial.summary() for trial in self.trials]}
 
-def choose_behavior(
+
+def select_behavior(
     grid: Grid,
     moves: Moves,
-    settings: Settings,
-    prior: Normal | None = None,
-    report: Callable[[str], None] = lambda _: None,
-) -> Choice:
-    """The settings with the reward, the β and the tempering that held-out walks speak for; lapses are to be learned.
+    config: MapConfig,
+    cell_prior: Normal | None = None,
+    notify: Callable[[str], None] | None = None,
+) -> Selection:
+    """Select the reward, β and tempering that held-out walks support.
 
-    `prior` is that of cells' logits where it is not the settings' own. Raises `InputError` for fewer than two walks,
-    for what is chosen here and given too, and as a fit does.
+    Args:
+        grid: The grid.
+        moves: The moves of at least two walks.
+        config: The configuration from which the selection starts.
+        cell_prior: The prior of the cells' logits; by default that of the configuration.
+        notify: Called with a line of text for every fit.
+
+    Raises:
+        InputError: For fewer than two walks, for settings that are selected here and set too, and as a fit does.
     """
-    for field, given in (("unknown", settings.unknown), ("tempering", settings.tempering != 1)):
-        if given:
-            raise InputError("cannot be given where behavior is chosen by held-out walks", field=field)
-    settings = replace(settings, unknown=("lapses",))
+    for field, is_set in (("learn", config.behavior.learn), ("tempering", config.behavior.tempering != 1)):
+        if is_set:
+            raise InputError("cannot be set where the behavior is selected by held-out walks", field=field)
+    config = replace(config, behavior=replace(config.behavior, learn=("lapse",), select=False))
     trials: list[Trial] = []
     passed_over: list[str] = []
 
-    def tried(some: Settings) -> Trial:
-        shown = demonstrations_from_moves(moves, grid, discount=some.discount, step_cost=some.step_cost)
-        trials.append(_tried(ObstacleGrid(grid, some.prior_mean), shown, some, prior, report))
+    def attempt(candidate: MapConfig) -> Trial:
+        reward = candidate.reward
+        shown = demonstrations_from_moves(moves, grid, discount=reward.discount, step_cost=reward.step_cost)
+        trials.append(_cross_validate(ObstacleGrid(grid, candidate.prior.mean), shown, candidate, cell_prior, notify))
         return trials[-1]
 
-    def attempted(some: Settings) -> list[Trial]:
-        """The trial, where there is one: what people would do of whom no values are found, cannot be told."""
+    def attempt_if_proper(candidate: MapConfig) -> list[Trial]:
+        """Return the trial, or nothing where the task has no values."""
         try:
-            return [tried(some)]
+            return [attempt(candidate)]
         except (ImproperTask, NotConverged) as error:
-            passed_over.append(f"{_named(some)} with β = {some.beta:g} was passed over: {error}")
+            name, beta = _reward_name(candidate.reward), candidate.behavior.beta
+            passed_over.append(f"{name} with β = {beta:g} was passed over: {error}")
             return []
 
-    own = [tried(settings), *attempted(replace(settings, beta=_SHARPER * settings.beta))]
-    kind = _of_the_other_kind(settings)
-    other = [*attempted(kind), *attempted(replace(kind, beta=_SHARPER * kind.beta))]
-    gains = _best(other).nats - _best(own).nats if other else None
-    found = (other if gains is not None and _is_worth_it(gains, own[0].moves) else own)[0]
-    found = _sharpened(found, attempted)
-    below, _ = doubtful(found.share, len(found.nats), _SURELY)
-    chosen = replace(found.settings, tempering=found.share if below else 1.0)
-    return Choice(chosen, [*_reasons(chosen, found, gains, settings), *passed_over], trials)
+    own = [attempt(config), *attempt_if_proper(_with_beta(config, _BETA_FACTOR * config.behavior.beta))]
+    kind = _other_reward(config)
+    other = [
+        *attempt_if_proper(kind),
+        *attempt_if_proper(_with_beta(kind, _BETA_FACTOR * kind.behavior.beta)),
+    ]
+    gains = _best(other).log_likelihood - _best(own).log_likelihood if other else None
+    trial = (other if gains is not None and _is_worth_it(gains, own[0].moves) else own)[0]
+    trial = _raise_beta(trial, attempt_if_proper)
+    below, _ = doubtful(trial.ratio, len(trial.log_likelihood), _STANDARD_ERRORS)
+    behavior = replace(trial.config.behavior, tempering=trial.ratio if below else 1.0)
+    selected = replace(trial.config, behavior=behavior)
+    return Selection(selected, [*_reasons(selected, trial, gains, config), *passed_over], trials)
 
 
-def _sharpened(found: Trial, attempted: Callable[[Settings], list[Trial]]) -> Trial:
-    """The trial with β doubled for as long as that is called for."""
-    for _ in range(_DOUBLINGS):
-        if not doubtful(found.share, len(found.nats), _SURELY)[1]:
+def _with_beta(config: MapConfig, beta: float) -> MapConfig:
+    return replace(config, behavior=replace(config.behavior, beta=beta))
+
+
+def _raise_beta(trial: Trial, attempt: Callable[[MapConfig], list[Trial]]) -> Trial:
+    """Double β for as long as κ is above 1 and held-out walks become more probable."""
+    for _ in range(_MAX_DOUBLINGS):
+        if not doubtful(trial.ratio, len(trial.log_likelihood), _STANDARD_ERRORS)[1]:
             break
-        after = attempted(replace(found.settings, beta=2 * found.settings.beta))
-        if not after or after[0].nats.sum() <= found.nats.sum():
+        doubled = attempt(_with_beta(trial.config, 2 * trial.config.behavior.beta))
+        if not doubled or doubled[0].log_likelihood.sum() <= trial.log_likelihood.sum():
             break
-        found = after[0]
-    return found
+        trial = doubled[0]
+    return trial
 
 
 def _is_worth_it(gains: Float[np.ndarray, " walks"], moves: int) -> bool:
-    return bool(gains.sum() > max(_SURELY * _error(gains), _WORTH * moves))
+    return bool(gains.sum() > max(_STANDARD_ERRORS * _standard_error(gains), _WORTH * moves))
 
 
-def _error(differences: Float[np.ndarray, " walks"]) -> float:
-    """The standard error of a sum over walks."""
+def _standard_error(differences: Float[np.ndarray, " walks"]) -> float:
+    """Return the standard error of a sum over walks."""
     return float(differences.std(ddof=1) * len(differences) ** 0.5)
 
 
 def _best(trials: list[Trial]) -> Trial:
-    return max(trials, key=lambda trial: trial.nats.sum())
+    return max(trials, key=lambda trial: trial.log_likelihood.sum())
 
 
-def _of_the_other_kind(settings: Settings) -> Settings:
-    if settings.step_cost is None:
-        return replace(settings, discount=1.0, step_cost=1.0, beta=_SHARPNESS_BY_STEPS)
-    return replace(settings, discount=Settings.discount, step_cost=None, beta=Settings.beta)
+def _other_reward(config: MapConfig) -> MapConfig:
+    if config.reward.step_cost is None:
+        return _with_beta(replace(config, reward=Reward(1.0, 1.0)), _STEP_COST_BETA)
+    return _with_beta(replace(config, reward=Reward()), BehaviorConfig.beta)
 
 
-def _tried(
+def _cross_validate(
     model: ObstacleGrid,
-    shown: Demonstrations,
-    settings: Settings,
-    prior: Normal | None,
-    report: Callable[[str], None],
+    demonstrations: Demonstrations,
+    config: MapConfig,
+    cell_prior: Normal | None,
+    notify: Callable[[str], None] | None,
 ) -> Trial:
-    """Learns from each part's complement, and looks at how probable the part is."""
-    count = shown.trajectories
+    """Learn from the complement of each fold, and score the fold."""
+    count = demonstrations.trajectories
     if count < 2:
-        raise InputError(f"expected at least 2 walks to choose by, found {count}", field="behavior")
-    part = np.random.default_rng(settings.seed).permutation(count) % min(FOLDS, count)
-    actions, transitions, held_out, lapses = np.zeros(count), np.zeros(count), [], []
-    for fold in range(part.max() + 1):
-        kind = "goal reward" if settings.step_cost is None else "step cost"
-        report(f"choosing: {kind}, β = {settings.beta:g}, part {fold + 1} of {part.max() + 1}")
-        found = fit_map(model, shown.with_only(part != fold), settings, each=prior)
-        others, people = shown.with_only(part == fold), found.people.behavior_of()
-        of_fold = scores(found.model, others, people, options=SolveOptions(horizon=settings.horizon))
-        held_out.append(of_fold)
-        lapses.append(0.0 if people.lapse is None else float(people.lapse))
-        arrived = np.log(np.asarray(transition_probabilities(found.model, others)))[np.asarray(others.weights) > 0]
+        raise InputError(f"expected at least 2 walks to select by, found {count}", field="select_behavior")
+    fold_of = np.random.default_rng(config.seed).permutation(count) % min(FOLDS, count)
+    actions, transitions, statistics, lapses = np.zeros(count), np.zeros(count), [], []
+    for fold in range(fold_of.max() + 1):
+        if notify:
+            kind, beta = "goal reward" if config.reward.step_cost is None else "step cost", config.behavior.beta
+            notify(f"selecting: {kind}, β = {beta:g}, fold {fold + 1} of {fold_of.max() + 1}")
+        fit = fit_map(model, demonstrations.with_only(fold_of != fold), config, cell_prior=cell_prior)
+        held_out, behavior = demonstrations.with_only(fold_of == fold), fit.people.behavior_of()
+        of_fold = scores(fit.model, held_out, behavior, options=SolveOptions(horizon=config.behavior.horizon))
+        statistics.append(of_fold)
+        lapses.append(0.0 if behavior.lapse is None else float(behavior.lapse))
+        weights = np.asarray(held_out.weights)
+        log_transitions = np.log(np.asarray(transition_probabilities(fit.model, held_out)))[weights > 0]
         actions += np.bincount(of_fold.trajectory, of_fold.log_policy, minlength=count)
-        transitions += np.bincount(of_fold.trajectory, arrived, minlength=count)
-    return Trial(settings, actions, transitions, len(shown), effective_sample_ratio(held_out), float(np.mean(lapses)))
+        transitions += np.bincount(of_fold.trajectory, log_transitions, minlength=count)
+    ratio, moves = effective_sample_ratio(statistics), len(demonstrations)
+    return Trial(config, actions, transitions, moves, ratio, float(np.mean(lapses)))
 
 
-def _named(settings: Settings) -> str:
-    return "a goal that pays 1" if settings.step_cost is None else "a cost of every cell"
+def _reward_name(reward: Reward) -> str:
+    return "a goal that pays 1" if reward.step_cost is None else "a cost of every cell"
 
 
-def _reasons(chosen: Settings, found: Trial, gains: Float[np.ndarray, " walks"] | None, given: Settings) -> list[str]:
-    """What was chosen and why, for people; `gains` are those of the other kind of reward, if it has values."""
-    kind, other = _named(chosen), _named(_of_the_other_kind(given))
+def _reasons(
+    selected: MapConfig, trial: Trial, gains: Float[np.ndarray, " walks"] | None, configured: MapConfig
+) -> list[str]:
+    """Say what was selected and why; `gains` are those of the other kind of reward, if it has values."""
+    kind, other = _reward_name(selected.reward), _reward_name(_other_reward(configured).reward)
     against = (
-        f"with {other} no values were found"
+        f"{other} has no values"
         if gains is None
-        else f"{other} makes held-out moves more probable by {gains.sum() / found.moves:.2g} ± "
-        f"{_error(gains) / found.moves:.1g} nats each, and {_WORTH:g} would be worth it"
+        else f"{other} makes held-out moves more probable by {gains.sum() / trial.moves:.2g} ± "
+        f"{_standard_error(gains) / trial.moves:.1g} nats each, and {_WORTH:g} would be worth it"
     )
+    beta, tempering = selected.behavior.beta, selected.behavior.tempering
     reasons = [
-        f"people pursue {kind}: {against}",
-        f"β = {chosen.beta:g}: held-out steps are worth {found.share:.3g} times as many independent ones"
-        if np.isfinite(found.share)
-        else f"β = {chosen.beta:g}: held-out walks do not vary",
+        f"the reward is {kind}: {against}",
+        f"β = {beta:g}: held-out actions are worth {trial.ratio:.3g} times as many independent ones"
+        if np.isfinite(trial.ratio)
+        else f"β = {beta:g}: held-out walks do not vary",
     ]
-    if chosen.tempering < 1:
-        reasons.append(
-            f"actions count by {chosen.tempering:.2g}, for steps are less independent than they are taken to be"
-        )
+    if tempering < 1:
+        reasons.append(f"actions count by {tempering:.2g}, because they are less independent than the model expects")
     return reasons
-
-
-def told(choice: Choice) -> dict[str, Any]:
-    """A choice, for a summary."""
-    return {"reasons": choice.reasons, "trials": [trial.told() for trial in choice.trials]}

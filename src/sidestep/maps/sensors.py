@@ -1,51 +1,56 @@
-"""What a robot's sensors have seen, as a prior of `sidestep learn`."""
+"""What a robot's sensors have seen, as a prior of the cells."""
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from sidestep.inference.priors import Normal, sensor_prior
 from sidestep.io.sensors import read_sensor_map, read_sensor_variance
+from sidestep.maps.config import PriorConfig
 from sidestep.tabular.grid import Cell, Grid
 
 
-class Sensor(NamedTuple):
-    """A map of what sensors have seen, and how surely they saw it.
+@dataclass(frozen=True, eq=False)
+class SensorMap:
+    """P(occupied) of each cell as sensors saw it, and the certainty of it.
 
-    `variance` is that of each cell's logit: one number, or a `.npy` file of one a cell.
+    Attributes:
+        probability: P(occupied), row 0 at the top; NaN where the sensors saw nothing.
+        variance: The variance of each cell's logit, above 0; one number or one a cell.
+        source: Where it comes from, for the summary.
     """
 
-    map_file: Path
-    variance: float | Path = 0.5
-
-    def told(self) -> dict[str, str | float]:
-        """What a summary says of it."""
-        variance = self.variance
-        return {"map": str(self.map_file), "variance": str(variance) if isinstance(variance, Path) else variance}
+    probability: Float[np.ndarray, "rows columns"]
+    variance: float | Float[np.ndarray, "rows columns"] = 0.5
+    source: str = ""
 
 
-class Known(NamedTuple):
-    """What is known of cells before anybody walks.
+def read_sensor(map_file: str | Path, grid: Grid, variance: float | str | Path = 0.5) -> SensorMap:
+    """Read what sensors saw of a grid.
 
-    - `prior`: of each cell's logit.
-    - `seen`: P(occupied) of the unknown cells that sensors have seen; NaN for all others.
+    Args:
+        map_file: A ROS map in mode `scale` or `raw`, of the grid's size, resolution and origin.
+        grid: The grid.
+        variance: The variance of each logit, above 0, or a `.npy` file with one number a cell.
+
+    Raises:
+        InputError: For files that do not fit the grid.
     """
+    certainty = float(variance) if isinstance(variance, float | int) else read_sensor_variance(variance, grid)
+    return SensorMap(read_sensor_map(map_file, grid), certainty, source=f"{map_file}, variance {variance}")
 
-    prior: Normal
-    seen: Float[np.ndarray, "rows columns"]
 
-
-def known_by(sensor: Sensor | None, grid: Grid, elsewhere: Normal) -> Known:
-    """What sensors tell of a grid's unknown cells; `elsewhere` is the prior of those that they have not seen.
-
-    Raises `InputError` for files that do not fit the grid.
-    """
+def seen_cells(sensor: SensorMap | None, grid: Grid) -> Float[np.ndarray, "rows columns"]:
+    """Return P(occupied) of the unknown cells that sensors have seen, and NaN elsewhere."""
     if sensor is None:
-        return Known(elsewhere, np.full(grid.shape, np.nan))
-    probability, variance = read_sensor_map(sensor.map_file, grid), sensor.variance
-    if isinstance(variance, Path):
-        variance = read_sensor_variance(variance, grid)
-    seen = np.isfinite(variance) & (grid.known == Cell.UNKNOWN)
-    return Known(sensor_prior(probability, variance, elsewhere), np.where(seen, probability, np.nan))
+        return np.full(grid.shape, np.nan)
+    seen = np.isfinite(sensor.variance) & (grid.known == Cell.UNKNOWN)
+    return np.where(seen, sensor.probability, np.nan)
+
+
+def cell_prior(sensor: SensorMap | None, config: PriorConfig) -> Normal:
+    """Return the prior of the cells' logits; unseen cells have that of the configuration."""
+    elsewhere = Normal(config.mean, config.variance)
+    return elsewhere if sensor is None else sensor_prior(sensor.probability, sensor.variance, elsewhere)

@@ -5,7 +5,6 @@ reward once. The paper's reward R(s) "1 at the goal and 0 elsewhere" is a final 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -91,18 +90,6 @@ def reach(
     if step_cost is None:
         return Task(jnp.zeros((1, 1)), jnp.ones(1), terminal, gamma)
     return Task(-step_cost * jnp.atleast_2d(jnp.asarray(world.lengths)), jnp.zeros(1), terminal, gamma)
-
-
-@dataclass(frozen=True)
-class Reward:
-    """The reward that planned paths pursue: `discount` and `step_cost` as in `reach`."""
-
-    discount: float = 0.95
-    step_cost: float | None = None
-
-    def reach(self, grid: Grid, goal: int) -> Task:
-        """The task of reaching a state."""
-        return reach(grid, goal, discount=self.discount, step_cost=self.step_cost)
 
 
 def stack_tasks(tasks: Sequence[Task]) -> Task:

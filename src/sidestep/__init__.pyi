@@ -1,0 +1,96 @@
+# The public names in groups. `__init__.py` reads this file and imports each name at its first use.
+# ruff: noqa: I001
+
+# errors
+from .errors import (
+    ImproperTask as ImproperTask,
+    InputError as InputError,
+    NotConverged as NotConverged,
+    SidestepError as SidestepError,
+)
+from ._version import __version__ as __version__
+
+# data: maps, walks and demonstrations
+from .io.demonstrations import demonstrations_from_walks as demonstrations_from_walks
+from .io.gymnasium import collect as collect, from_gymnasium as from_gymnasium, slip_of as slip_of, slippery as slippery
+from .io.maps import read_map as read_map, write_map as write_map
+from .io.minari.demonstrations import (
+    read_demonstrations as read_demonstrations,
+    write_demonstrations as write_demonstrations,
+)
+from .io.sensors import read_sensor_map as read_sensor_map, read_sensor_variance as read_sensor_variance
+from .io.walks import Walks as Walks, read_walks as read_walks, write_walks as write_walks
+from .tabular.demonstrations import Demonstrations as Demonstrations, Trajectory as Trajectory, gather as gather
+from .tabular.graph import Graph as Graph, graph as graph, grid_graph as grid_graph
+from .tabular.grid import Cell as Cell, Grid as Grid
+from .tabular.reward import Reward as Reward
+from .tabular.simulation import simulate as simulate
+from .tabular.tasks import Task as Task, reach as reach, stack_tasks as stack_tasks, task as task
+
+# models: transition models of discrete worlds
+from .tabular.models import (
+    FeaturedGrid as FeaturedGrid,
+    ObstacleGrid as ObstacleGrid,
+    SlipperyGrid as SlipperyGrid,
+    TabularModel as TabularModel,
+    TiedModel as TiedModel,
+    TransitionModel as TransitionModel,
+    borders as borders,
+    closed as closed,
+    road_network as road_network,
+    true_model as true_model,
+    walled_grid as walled_grid,
+)
+
+# behavior: how agents choose their actions
+from .tabular.backups import (
+    Behavior as Behavior,
+    BoltzmannAverage as BoltzmannAverage,
+    HardMax as HardMax,
+    LogSumExp as LogSumExp,
+    Mellowmax as Mellowmax,
+)
+from .tabular.behavior_model import BehaviorModel as BehaviorModel, behavior_model as behavior_model
+from .tabular.likelihood import LogLikelihood as LogLikelihood, log_likelihood as log_likelihood
+from .tabular.solve import (
+    Solution as Solution,
+    SolveOptions as SolveOptions,
+    check_proper as check_proper,
+    solve as solve,
+)
+from .tabular.solvers.gauss_seidel import GaussSeidel as GaussSeidel
+from .tabular.solvers.jacobi import Jacobi as Jacobi
+
+# learning: maps from walks, and any model from demonstrations
+from .inference.calibration import effective_sample_ratio as effective_sample_ratio, scores as scores
+from .inference.fit import Fit as Fit, fit as fit
+from .inference.goals import GoalFit as GoalFit, fit_goals as fit_goals, goal_posterior as goal_posterior
+from .inference.maximize import Progress as Progress
+from .inference.objective import tasks_mesh as tasks_mesh
+from .inference.optimizers import LBFGS as LBFGS, Adam as Adam, Rprop as Rprop
+from .inference.priors import (
+    FreeCellEvidence as FreeCellEvidence,
+    GaussianMRF as GaussianMRF,
+    Normal as Normal,
+    Prior as Prior,
+    WallPrior as WallPrior,
+    sensor_prior as sensor_prior,
+)
+from .maps.annotations import WalkAnnotations as WalkAnnotations
+from .maps.config import (
+    BehaviorConfig as BehaviorConfig,
+    FitConfig as FitConfig,
+    MapConfig as MapConfig,
+    PriorConfig as PriorConfig,
+)
+from .maps.goal_candidates import GoalCandidates as GoalCandidates, read_goal_candidates as read_goal_candidates
+from .maps.learn import learn_map as learn_map
+from .maps.learned_map import LearnedMap as LearnedMap, load_map as load_map
+from .maps.sensors import SensorMap as SensorMap, read_sensor as read_sensor
+
+# planning
+from .robots.robot import risk_averse_robot as risk_averse_robot
+from .tabular.planning import Plan as Plan, RollOuts as RollOuts, plan as plan, roll_out as roll_out
+
+# evaluation
+from .evaluation.evaluate import evaluate as evaluate, plan_paths as plan_paths

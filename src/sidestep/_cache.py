@@ -1,0 +1,59 @@
+"""Compiled code that is kept from process to process.
+
+The environment variable `SIDESTEP_CACHE` names the folder; `off` keeps nothing. Without it the folder is that of the
+user's caches.
+"""
+
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+_OFF = "off"
+_UNREADABLE = "Error reading persistent compilation cache entry for '"
+"""The beginning of JAX's warning of a damaged entry."""
+
+
+def cache_folder() -> Path | None:
+    """Return the folder for compiled code; None where it is turned off or cannot be written."""
+    setting = os.environ.get("SIDESTEP_CACHE")
+    if setting == _OFF:
+        return None
+    if setting:
+        folder = Path(setting)
+    else:
+        from platformdirs import user_cache_path
+
+        folder = user_cache_path("sidestep")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return folder if os.access(folder, os.W_OK) else None
+
+
+def keep_compiled_code() -> None:
+    """Make JAX keep compiled code in `cache_folder`, for the command line; a library leaves JAX's settings alone.
+
+    JAX recompiles a damaged entry but does not replace it. So its warning removes the entry, and JAX writes it anew.
+    """
+    folder = cache_folder()
+    if folder is None:
+        return
+    import jax
+
+    jax.config.update("jax_compilation_cache_dir", str(folder / "jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    show = warnings.showwarning
+
+    def remove_damaged(message: Warning | str, *arguments: Any, **options: Any) -> None:
+        text = str(message)
+        if not text.startswith(_UNREADABLE):
+            show(message, *arguments, **options)
+            return
+        name = text.removeprefix(_UNREADABLE).partition("'")[0]
+        for entry in (folder / "jax").glob(f"{name}-*"):
+            entry.unlink(missing_ok=True)
+
+    warnings.showwarning = remove_damaged

@@ -1,0 +1,194 @@
+"""Comparison of behavior-aware modeling with its baselines on the same walks, by the same scores."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from sidestep.baselines.behavior_cloning import behavior_cloning
+from sidestep.baselines.constraint_inference import constraint_inference
+from sidestep.baselines.interface import Method, ModelResult, model_result, transitions_only, visit_counts
+from sidestep.baselines.joint import joint_estimation
+from sidestep.baselines.maxent_irl import maxent_irl
+from sidestep.errors import ImproperTask, InputError, NotConverged
+from sidestep.evaluation import study
+from sidestep.evaluation.study import Problem, Record, run_method
+from sidestep.inference.goals import goal_posterior
+from sidestep.io.gridding import Moves, grid_walks
+from sidestep.io.walks import Walks
+from sidestep.maps.annotations import NO_ANNOTATIONS, WalkAnnotations
+from sidestep.maps.config import MapConfig
+from sidestep.maps.fit import behavior_of
+from sidestep.maps.learn import demonstrations_of, learn_map, sample_walks
+from sidestep.maps.learned_map import LearnedMap
+from sidestep.maps.sensors import SensorMap
+from sidestep.tabular.demonstrations import Demonstrations
+from sidestep.tabular.grid import Grid
+
+BASELINES: Mapping[str, Method] = MappingProxyType(
+    {
+        "transitions": transitions_only,
+        "visits": visit_counts,
+        "constraints": constraint_inference,
+        "costs": maxent_irl,
+        "joint": joint_estimation,
+        "cloning": behavior_cloning,
+    }
+)
+"""The baselines by name."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """The scores of all methods on the same walks.
+
+    Attributes:
+        problem: The map, the true map, what was learned from and what was held out.
+        config: The configuration, with what the selection chose.
+        records: The scores of each method, behavior-aware modeling first.
+        learned: The map of behavior-aware modeling; None if it failed.
+    """
+
+    problem: Problem
+    config: MapConfig
+    records: list[Record]
+    learned: LearnedMap | None
+
+    @property
+    def reasons(self) -> list[str]:
+        """The reasons for the selected behavior, if it was selected."""
+        selection = self.learned.learning.selection if self.learned and self.learned.learning else None
+        return selection.reasons if selection else []
+
+    def scores(self) -> dict[str, dict[str, Any]]:
+        """Return the scores of each method by name."""
+        return {record.method: {k: v for k, v in record.to_dict().items() if k != "problem"} for record in self.records}
+
+    def summary(self) -> dict[str, Any]:
+        """Return the content of `summary.json`."""
+        learning, heldout = self.learned.learning if self.learned else None, self.problem.heldout
+        return {
+            "settings": asdict(self.config),
+            "connectivity": self.problem.grid.connectivity,
+            "behavior": learning.selection.summary() if learning and learning.selection else {},
+            "data": {
+                "walks": self.problem.demonstrations.trajectories,
+                "moves": len(self.problem.demonstrations),
+                "heldout_walks": heldout.trajectories if heldout else 0,
+                "heldout_moves": len(heldout) if heldout else 0,
+            },
+            "methods": self.scores(),
+        }
+
+
+def compare_methods(
+    grid: Grid,
+    truth: Grid,
+    walks: Walks,
+    config: MapConfig,
+    *,
+    hold_out: float = 0.2,
+    baselines: Mapping[str, Method] = BASELINES,
+    sensor: SensorMap | None = None,
+    annotations: WalkAnnotations = NO_ANNOTATIONS,
+    notify: Callable[[str], None] = lambda _: None,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+) -> Comparison:
+    """Learn by every method from some of the walks, and evaluate the results.
+
+    Behavior-aware modeling is `learn_map` with all that is known. Its selected behavior, and the most probable goals of
+    walks that do not name theirs, hold for the baselines too. The baselines know nothing of sensors and persons.
+
+    Args:
+        grid: What is known of the map.
+        truth: The true map.
+        walks: The walks.
+        config: The configuration.
+        hold_out: The fraction of walks, drawn by the seed, that are scored and not learned from; may be 0.
+        baselines: The baselines by name.
+        sensor: As for `learn_map`.
+        annotations: As for `learn_map`.
+        notify: Called with a line of text at each stage.
+        checkpoint: As for `learn_map`.
+        resume: As for `learn_map`.
+
+    Raises:
+        InputError: For a fraction that leaves no walk to learn from, or none to score though it is above 0; and as
+            `learn_map` does.
+    """
+    walks, config = sample_walks(walks, config), replace(config, max_walks=None)
+    train, test = _split(walks, hold_out, config.seed)
+    notify("behavior learns")
+    try:
+        learned, failure = (
+            learn_map(
+                grid,
+                train,
+                config,
+                sensor=sensor,
+                annotations=annotations,
+                notify=notify,
+                checkpoint=checkpoint,
+                resume=resume,
+            ),
+            None,
+        )
+    except (ImproperTask, NotConverged) as error:
+        learned, failure = None, str(error)
+    learning = learned.learning if learned else None
+    moves = learning.goals.moves if learning and learning.goals else grid_walks(train, grid)
+    config = learning.config if learning else config
+    demonstrations, heldout = demonstrations_of(moves, grid, config), None
+    if len(test):
+        heldout_moves = grid_walks(annotations.without_goals(test), grid)
+        heldout = demonstrations_of(_with_probable_goals(heldout_moves, learned), grid, config)
+    problem = Problem("map", grid, truth, demonstrations, heldout)
+    if learned and learning:
+        result = _result_of(learned, demonstrations)
+        own = run_method(problem, "behavior", lambda *_: result, seed=config.seed, callback=notify)
+        records = [replace(own, seconds=learning.seconds)]
+    else:
+        records = [Record(problem.name, "behavior", failure=failure)]
+    for name, baseline in baselines.items():
+        records.append(run_method(problem, name, _configured(baseline, config), seed=config.seed, callback=notify))
+    return Comparison(problem, config, records, learned)
+
+
+def _configured(baseline: Method, config: MapConfig) -> study.Method:
+    return lambda grid, demonstrations: baseline(grid, demonstrations, config)
+
+
+def _split(walks: Walks, hold_out: float, seed: int) -> tuple[Walks, Walks]:
+    """Split walks into those to learn from and those held out."""
+    held = round(hold_out * len(walks))
+    if not 0 <= held < len(walks) or (held == 0) != (hold_out == 0):
+        raise InputError(f"expected a fraction of the {len(walks)} walks, found {hold_out}", field="hold_out")
+    drawn = np.random.default_rng(seed).permutation(len(walks))
+    return walks.select(np.sort(drawn[held:])), walks.select(np.sort(drawn[:held]))
+
+
+def _result_of(learned: LearnedMap, demonstrations: Demonstrations) -> ModelResult:
+    """Return a learned map as the result of a method."""
+    learning = learned.learning
+    assert learning is not None
+    result = model_result(learned.model, demonstrations, learning.config)
+    behavior = learning.fit.people.behavior_of()
+    return result._replace(behavior=behavior, converged=learning.fit.converged, planner=learned.robot())
+
+
+def _with_probable_goals(moves: Moves, learned: LearnedMap | None) -> Moves:
+    """Return held-out moves; where walks do not name their goals, with the most probable candidate of each."""
+    learning = learned.learning if learned else None
+    if learned is None or learning is None or learning.goals is None:
+        return moves
+    posterior, config = learning.goals, learning.config
+    tasks = [config.reward.reach(learned.grid, int(state)) for state in posterior.candidates]
+    behavior, walks = behavior_of(config.behavior), moves.trajectories()
+    probability, _ = goal_posterior(learned.model, walks, tasks, behavior, posterior.fit.shares)
+    goals = moves.goals.copy()
+    goals[np.unique(moves.walk)] = posterior.candidates[probability.argmax(axis=1)]
+    return replace(moves, goals=goals)

@@ -1,0 +1,63 @@
+"""`sidestep demo`, `sidestep reproduce` and `sidestep experiment`: the demonstration and the experiments."""
+
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from sidestep.cli.options import Folder, Seed
+
+Experiment = Literal["room", "pendulum", "representations", "motivation"]
+
+
+def demo(out: Folder = Path("sidestep-demo"), seed: Seed = 0) -> None:
+    """Simulate agents in an office, learn its map from their walks alone, plan to new goals, and draw it all."""
+    from sidestep.cli.display import print_lines, print_scores, working
+    from sidestep.experiments.demo import demo
+
+    with working("simulating, learning, planning") as notify:
+        summary = demo(out, seed, notify)
+    print_scores({"learned map": summary["scores"]})
+    print_lines(f"pictures and numbers in {out}")
+
+
+def reproduce(out: Folder = Path("sidestep-reproduce"), seed: Seed = 0) -> None:
+    """Reproduce the paper's figures 1-4 as PNG, and the numbers behind them."""
+    from sidestep.cli.display import print_lines, print_scores, working
+    from sidestep.experiments.reproduce import reproduce
+
+    with working("starting") as notify:
+        summary = reproduce(out, seed, notify)
+    rows = {
+        f"{name} {variant}": scores
+        for name, variants in summary["maps"].items()
+        for variant, scores in variants.items()
+    }
+    print_scores(rows)
+    print_lines(f"figures and numbers in {out}")
+
+
+def experiment(
+    name: Annotated[
+        Experiment,
+        typer.Argument(
+            help="room: a wall that no walk touches; pendulum: gravity from actions alone; representations: three "
+            "models of the room; motivation: costs of cells against a transition model, when the reward changes."
+        ),
+    ],
+    out: Annotated[Path | None, typer.Option("--out", help="The folder to write to.", metavar="DIR")] = None,
+    seed: Seed = 0,
+) -> None:
+    """Run an experiment beyond the paper's figures: a picture and summary.json."""
+    from sidestep.cli.display import print_lines, working
+
+    out = out or Path(f"sidestep-{name}")
+    with working("starting") as notify:
+        summary = import_module(f"sidestep.experiments.{name}").run(out, seed, notify)
+    for key, value in summary.items():
+        if isinstance(value, float):
+            print_lines(f"{key.replace('_', ' ')}: {value:.4g}")
+        elif isinstance(value, int | str) and key != "command":
+            print_lines(f"{key.replace('_', ' ')}: {value}")
+    print_lines(f"picture and numbers in {out}")

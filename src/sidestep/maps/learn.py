@@ -1,0 +1,209 @@
+"""Learning a map from walks: the one function that makes learned maps.
+
+The command line, the comparison, the demo and the benchmarks call `learn_map`.
+"""
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from sidestep.errors import InputError
+from sidestep.inference.fit import Fit
+from sidestep.inference.maximize import Progress
+from sidestep.inference.priors import Normal
+from sidestep.io.demonstrations import demonstrations_from_moves
+from sidestep.io.gridding import Moves, grid_walks
+from sidestep.io.walks import Walks
+from sidestep.maps.annotations import NO_ANNOTATIONS, WalkAnnotations, persons_of
+from sidestep.maps.config import MapConfig
+from sidestep.maps.fit import behavior_model_of, fit_map
+from sidestep.maps.goal_candidates import GoalPosterior, fit_with_unknown_goals
+from sidestep.maps.learned_map import LearnedMap
+from sidestep.maps.learning import DataCounts, Learning
+from sidestep.maps.selection import select_behavior
+from sidestep.maps.sensors import SensorMap, cell_prior, seen_cells
+from sidestep.tabular.demonstrations import Demonstrations, split_by_person
+from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.models import ObstacleGrid
+
+_NEGLIGIBLE_PREFERENCE = 0.05
+"""A difference of two actions' log-probabilities (nats) that says next to nothing."""
+
+
+def learn_map(
+    grid: Grid,
+    walks: Walks,
+    config: MapConfig | None = None,
+    *,
+    sensor: SensorMap | None = None,
+    annotations: WalkAnnotations = NO_ANNOTATIONS,
+    callback: Callable[[Progress], None] | None = None,
+    notify: Callable[[str], None] | None = None,
+    checkpoint: str | Path | None = None,
+    resume: bool = False,
+) -> LearnedMap:
+    """Learn the obstacles of a map from walks.
+
+    Args:
+        grid: The geometry, the moves, and what is known of each cell.
+        walks: Positions and goals in metres in the map's frame.
+        config: The reward, behavior, prior and fit; by default those of `sidestep learn`.
+        sensor: What sensors saw of unknown cells.
+        annotations: The persons of the walks, and candidates for goals that walks do not name.
+        callback: Called with the progress of every iteration of the fit.
+        notify: Called with a line of text at each stage of the selection of the behavior.
+        checkpoint: A file that is kept up to date while the fit runs.
+        resume: Continue from the checkpoint. The result is that of an uninterrupted run.
+
+    Returns:
+        The learned map, with a record of how it was learned.
+
+    Raises:
+        InputError: For walks, settings or a checkpoint that do not fit the map or each other.
+        ImproperTask: For a reward without finite values.
+        NotConverged: Where values do not converge.
+
+    Example:
+        >>> import numpy as np, pyarrow as pa
+        >>> from sidestep.io.walks import walks_from_table
+        >>> table = pa.table({"walk": [0, 0], "step": [0, 1], "x": [0.5, 2.5], "y": [0.5, 0.5]})
+        >>> learned = learn_map(Grid.unknown(rows=1, columns=3), walks_from_table(table))
+        >>> bool((learned.blocked < 0.5).all())
+        True
+
+    References:
+        `docs/equations.md`, equations (1) and (6).
+    """
+    started = time.monotonic()
+    config = config or MapConfig()
+    annotations.check(config.behavior, resume)
+    walks = annotations.without_goals(sample_walks(walks, config))
+    moves = grid_walks(walks, grid)
+    prior = cell_prior(sensor, config.prior)
+    checkpoint = None if checkpoint is None else Path(checkpoint)
+    resumed = resume and checkpoint is not None and checkpoint.exists()
+    selection = select_behavior(grid, moves, config, prior, notify) if config.behavior.select else None
+    config = selection.config if selection else config
+    model = ObstacleGrid(grid, np.broadcast_to(np.asarray(prior.mean), grid.size))
+    result = _fit_walks(model, grid, walks, moves, annotations, config, prior, callback, checkpoint, resume)
+    blocked = np.asarray(result.fit.model.blocked, dtype=np.float64)
+    learning = Learning(
+        **result._asdict(),
+        data=_counts(grid, moves, result.demonstrations, sensor),
+        selection=selection,
+        sensor=sensor,
+        notes=_notes(result.demonstrations, config, resume and not resumed),
+        resumed=resumed,
+        seconds=round(time.monotonic() - started, 3),
+        peak_memory_bytes=peak_memory(),
+    )
+    return LearnedMap(grid, blocked, result.demonstrations.visited_state_goals(), config.reward, learning)
+
+
+def sample_walks(walks: Walks, config: MapConfig) -> Walks:
+    """Return the walks, or `config.max_walks` of them drawn by the seed.
+
+    Raises:
+        InputError: For a number of walks below 1 or above all.
+    """
+    if config.max_walks is None:
+        return walks
+    if not 1 <= config.max_walks <= len(walks):
+        raise InputError(f"expected 1…{len(walks)} walks, found {config.max_walks}", field="max_walks")
+    drawn = np.random.default_rng(config.seed).choice(len(walks), config.max_walks, replace=False)
+    return walks.select(np.sort(drawn))
+
+
+def demonstrations_of(moves: Moves, grid: Grid, config: MapConfig) -> Demonstrations:
+    """Return the demonstrations of gridded walks with the reward of a configuration."""
+    return demonstrations_from_moves(moves, grid, discount=config.reward.discount, step_cost=config.reward.step_cost)
+
+
+def peak_memory() -> int | None:
+    """Return the most memory that this process has held in bytes; None where the system does not say."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
+
+
+class _WalkFit(NamedTuple):
+    config: MapConfig
+    fit: Fit[ObstacleGrid]
+    demonstrations: Demonstrations
+    persons: dict[str, float]
+    goals: GoalPosterior | None
+
+
+def _fit_walks(
+    model: ObstacleGrid,
+    grid: Grid,
+    walks: Walks,
+    moves: Moves,
+    annotations: WalkAnnotations,
+    config: MapConfig,
+    prior: Normal,
+    callback: Callable[[Progress], None] | None,
+    checkpoint: Path | None,
+    resume: bool,
+) -> _WalkFit:
+    """Fit with unknown goals, with a β for each person, or with walks that are alike."""
+    candidates = annotations.goal_candidates
+    if candidates is not None:
+        posterior = fit_with_unknown_goals(model, grid, moves, candidates, walks.labels, config, prior, callback)
+        demonstrations = demonstrations_of(posterior.moves, grid, config)
+        return _WalkFit(config, posterior.fit.fit, demonstrations, {}, posterior)
+    demonstrations = demonstrations_of(moves, grid, config)
+    behavior, names = None, None
+    if annotations.person_column is not None:
+        names, person = persons_of(walks, moves, annotations.person_column)
+        demonstrations, person_of_task = split_by_person(demonstrations, person)
+        learn = tuple(dict.fromkeys((*config.behavior.learn, "beta")))
+        config = replace(config, behavior=replace(config.behavior, learn=learn))
+        behavior = behavior_model_of(config, person_of_task)
+    fit = fit_map(
+        model,
+        demonstrations,
+        config,
+        cell_prior=prior,
+        behavior=behavior,
+        callback=callback,
+        checkpoint=checkpoint,
+        resume=resume,
+    )
+    betas = {str(name): float(fit.people.behavior_of(index).beta) for index, name in enumerate(names or ())}
+    return _WalkFit(config, fit, demonstrations, betas, None)
+
+
+def _counts(grid: Grid, moves: Moves, demonstrations: Demonstrations, sensor: SensorMap | None) -> DataCounts:
+    return DataCounts(
+        walks=demonstrations.trajectories,
+        walks_left_out=len(moves.goals) - demonstrations.trajectories,
+        moves=len(demonstrations),
+        moves_left_out=len(moves.states) - len(demonstrations),
+        goals=len(np.unique(demonstrations.visited_state_goals()[:, 1])),
+        unknown_cells=int((grid.known == Cell.UNKNOWN).sum()),
+        sensed_cells=int(np.isfinite(seen_cells(sensor, grid)).sum()),
+    )
+
+
+def _notes(demonstrations: Demonstrations, config: MapConfig, nothing_to_resume: bool) -> tuple[str, ...]:
+    """Return what one should know before one trusts the numbers."""
+    notes = ["there was no checkpoint to resume from, so the fit started anew"] if nothing_to_resume else []
+    moves = int(np.median(np.bincount(np.asarray(demonstrations.trajectory))))
+    discount = config.reward.discount
+    preference = config.behavior.beta * (1 - discount**2) * discount**moves
+    if config.reward.step_cost is None and preference < _NEGLIGIBLE_PREFERENCE:
+        notes.append(
+            f"half of the walks have {moves} moves or more; so far from the goal a step towards it and one away "
+            f"differ by {preference:.1g} in log-probability, and walks say next to nothing: "
+            "consider --step-cost 1 --discount 1"
+        )
+    return tuple(notes)
