@@ -16,18 +16,18 @@ from sidestep.errors import InputError, check_count, check_positive
         (None, "'moves': expected a whole number, at least 2, found None"),
     ],
 )
-def test_counts_that_are_none_are_refused(value, message):
+def test_check_count_of_other_values_raises(value, message):
     with pytest.raises(InputError, match=message):
         check_count(value, 2, "moves")
 
 
 @pytest.mark.parametrize("value", [2, 7, np.int32(2)])
-def test_counts_pass(value):
+def test_check_count_accepts_counts(value):
     assert check_count(value, 2, "moves") is None
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
-def test_only_finite_numbers_above_0_are_positive(value):
+def test_check_positive_accepts_finite_numbers_above_0_only(value):
     with pytest.raises(InputError, match="'rate': expected a finite number above 0, found"):
         check_positive(value, "rate")
     assert check_positive(1e-300, "rate") is None

@@ -1,4 +1,4 @@
-"""Reading a file in full, and writing a file or a folder so that it appears whole or not at all."""
+"""Reading a whole file, and writing a file or a folder atomically: it appears whole or not at all."""
 
 import io
 import json
@@ -16,7 +16,7 @@ from sidestep.errors import InputError
 
 
 def read_whole(path: str | Path) -> bytes:
-    """The bytes of a file; raises `InputError` for one that is missing, a folder, unreadable or empty."""
+    """Return the bytes of a file; raise `InputError` for one that is missing, a folder, unreadable or empty."""
     try:
         content = Path(path).read_bytes()
     except (OSError, ValueError) as error:
@@ -29,11 +29,15 @@ def read_whole(path: str | Path) -> bytes:
 def write_whole(path: str | Path, write: Callable[[BinaryIO], object]) -> None:
     """Write a file that appears whole or not at all.
 
-    `write` is called with an open binary file beside `path`, which takes the name `path` once `write` has
-    returned; if anything fails before that, what stood at `path` stands there still. The folder is created.
-    Raises `InputError` where the file system refuses, and passes on what `write` raises.
+    A temporary file beside `path` gets the name `path` after `write` has returned; after an error, an old file
+    at `path` is unchanged. The folder is created.
 
-    >>> write_whole("out/note.txt", lambda file: file.write(b"done"))  # doctest: +SKIP
+    Args:
+        path: the file.
+        write: writes to the open binary file that it is called with; its errors are passed on.
+
+    Raises:
+        InputError: if the file system refuses.
     """
     path = Path(path)
     partial = _beside(path)
@@ -45,7 +49,7 @@ def write_whole(path: str | Path, write: Callable[[BinaryIO], object]) -> None:
             os.fsync(file.fileno())
         os.replace(partial, path)
     except BaseException as error:
-        with suppress(OSError):  # The first error is the one to tell of.
+        with suppress(OSError):  # the first error is the one to report
             partial.unlink(missing_ok=True)
         if isinstance(error, OSError):
             raise InputError(f"cannot be written: {_reason(error)}", source=path) from error
@@ -55,15 +59,20 @@ def write_whole(path: str | Path, write: Callable[[BinaryIO], object]) -> None:
 def write_whole_folder(path: str | Path, fill: Callable[[Path], object]) -> None:
     """Write a folder that appears whole or not at all.
 
-    `fill` is called with an empty folder beside `path`, which takes the name `path` once `fill` has returned; if
-    anything fails before that, it is removed. Raises `InputError` for a folder that is there already, or where the file
-    system refuses, and passes on what `fill` raises.
+    A temporary folder beside `path` gets the name `path` after `fill` has returned; after an error it is removed.
+
+    Args:
+        path: the folder.
+        fill: writes into the empty folder that it is called with; its errors are passed on.
+
+    Raises:
+        InputError: for a folder that exists already, or if the file system refuses.
     """
     path = Path(path)
     partial = _beside(path)
     try:
         if path.exists():
-            raise InputError("is there already: expected a name that is free", source=path)
+            raise InputError("exists already: expected a new name", source=path)
         partial.mkdir(parents=True)
         fill(partial)
         os.rename(partial, path)
@@ -75,11 +84,10 @@ def write_whole_folder(path: str | Path, fill: Callable[[Path], object]) -> None
 
 
 def write_json(path: str | Path, data: Any) -> None:
-    """Write `data` as JSON, indented, in its own order, whole or not at all; NumPy numbers and arrays are
-    welcome.
+    """Write data, which may contain NumPy numbers and arrays, as indented JSON, whole or not at all.
 
-    JSON has no NaN and no infinity: pass None for what has no value. Raises `InputError` for either, and
-    for data that JSON cannot hold.
+    Raises:
+        InputError: for NaN, infinity and other data that JSON cannot represent; None is a missing value.
     """
     try:
         text = json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False, default=_plain)
@@ -89,7 +97,7 @@ def write_json(path: str | Path, data: Any) -> None:
 
 
 def read_json(path: str | Path) -> Any:
-    """What a JSON file holds; raises `InputError` for a file that is missing or not JSON."""
+    """Return the data in a JSON file; raise `InputError` for a file that is missing or not JSON."""
     try:
         return json.loads(read_whole(path))
     except ValueError as error:
@@ -102,14 +110,19 @@ def write_array(path: str | Path, array: np.ndarray) -> None:
 
 
 def read_array(path: str | Path, kinds: str) -> np.ndarray:
-    """The array in a `.npy` file; `kinds` are those of its dtype ("f" floats, "iu" whole numbers).
+    """Return the array in a `.npy` file.
 
-    Raises `InputError` for a file that holds no such array.
+    Args:
+        path: the file.
+        kinds: the accepted kinds of its dtype ("f" floats, "iu" whole numbers).
+
+    Raises:
+        InputError: for a file without such an array.
     """
     content = read_whole(path)
     try:
         array = np.load(io.BytesIO(content), allow_pickle=False)
-    except Exception as error:  # what is not an array raises errors of many kinds
+    except Exception as error:  # NumPy raises errors of many kinds
         raise InputError(f"expected a NumPy array: {error}", source=path) from error
     if not isinstance(array, np.ndarray) or array.dtype.kind not in kinds:
         raise InputError("expected a NumPy array of numbers", source=path)
@@ -117,18 +130,18 @@ def read_array(path: str | Path, kinds: str) -> np.ndarray:
 
 
 def _beside(path: Path) -> Path:
-    """A hidden name beside a path, for what is not whole yet."""
-    # Not `tempfile`, whose files nobody else may read: this one gets the permissions that any new file gets.
+    """Return a hidden temporary name beside a path."""
+    # Files of `tempfile` are readable by their owner only; this one gets the permissions of any new file.
     return path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
 
 
 def _plain(value: object) -> object:
-    """A NumPy number or array as the Python one that JSON knows."""
+    """Convert a NumPy number or array for JSON."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise TypeError(f"expected plain values, found {type(value).__name__}")
 
 
 def _reason(error: Exception) -> str:
-    """What went wrong, in the system's words and without the path, which the error names already."""
+    """Return the system's message without the path, which `InputError` has already."""
     return (isinstance(error, OSError) and error.strerror) or str(error)

@@ -1,31 +1,28 @@
-"""Everything that `sidestep` refuses, and why: each error says what was wrong, where, and what was expected."""
+"""Errors of `sidestep`: each names the place, the expectation and the actual value."""
 
 from math import isfinite
 from numbers import Integral
 
 
 class SidestepError(Exception):
-    """The base of all errors that the library raises on purpose; the command line prints it and exits with 1."""
+    """The base class of all errors of the library; the command line prints it and exits with 1."""
 
 
 class InputError(SidestepError):
     """Data or a setting that cannot be used.
 
-    `message` says what was wrong and what was expected; `source` names the file (or the argument), `row` the
-    data row as a person counts it (the first row under the header is 1) and `field` the column or key.
+    Attributes:
+        message: what was expected, and what is there instead.
+        source: the file or the argument.
+        row: the data row; the first row below the header is 1.
+        field: the column or key.
 
-    >>> print(InputError("expected a number, found 'abc'", source="walks.csv", row=3, field="x"))
-    walks.csv, row 3, field 'x': expected a number, found 'abc'
+    Example:
+        >>> print(InputError("expected a number, found 'abc'", source="walks.csv", row=3, field="x"))
+        walks.csv, row 3, field 'x': expected a number, found 'abc'
     """
 
-    def __init__(
-        self,
-        message: str,
-        *,
-        source: object | None = None,
-        row: int | None = None,
-        field: str | None = None,
-    ):
+    def __init__(self, message: str, *, source: object | None = None, row: int | None = None, field: str | None = None):
         self.message, self.source, self.row, self.field = message, source, row, field
         place = [str(source)] if source is not None else []
         place += [f"row {row}"] if row is not None else []
@@ -33,26 +30,26 @@ class InputError(SidestepError):
         super().__init__(f"{', '.join(place)}: {message}" if place else message)
 
     def of(self, source: object) -> "InputError":
-        """The same complaint, about something that `source` holds."""
+        """Return the same error with another source and without a row."""
         return InputError(self.message, source=source, field=self.field)
 
 
 def check_count(value: object, least: int, field: str) -> None:
-    """Raises `InputError` unless a setting is a whole number, at least so large."""
+    """Raise `InputError` unless a setting is a whole number, at least `least`."""
     if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
         what = f"at least {least}" if isinstance(value, Integral) else f"a whole number, at least {least}"
         raise InputError(f"expected {what}, found {value}", field=field)
 
 
 def check_positive(value: float, field: str) -> None:
-    """Raises `InputError` unless a setting is a finite number above 0."""
+    """Raise `InputError` unless a setting is a finite number above 0."""
     if not (isfinite(value) and value > 0):
         raise InputError(f"expected a finite number above 0, found {value}", field=field)
 
 
 class ImproperTask(SidestepError):
-    """A task whose values are infinite or not unique, such as a soft walker who never wants to arrive."""
+    """A task whose values are infinite or not unique, such as one in which continuing is better than arriving."""
 
 
 class NotConverged(SidestepError):
-    """A solve that stopped before its values settled; its numbers must not be used."""
+    """A solution whose values had not converged; its numbers must not be used."""

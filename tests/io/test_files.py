@@ -9,14 +9,14 @@ from sidestep._files import read_whole, write_array, write_json, write_whole, wr
 from sidestep.errors import InputError
 
 
-def test_a_file_is_written_into_a_new_folder(tmp_path):
+def test_write_whole_creates_the_folder(tmp_path):
     write_whole(tmp_path / "new" / "note.txt", lambda file: file.write(b"done"))
     assert (tmp_path / "new" / "note.txt").read_bytes() == b"done"
     assert [entry.name for entry in (tmp_path / "new").iterdir()] == ["note.txt"]
 
 
 @pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
-def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, failure):
+def test_write_whole_that_fails_keeps_the_old_file(tmp_path, failure):
     path = tmp_path / "note.txt"
     path.write_bytes(b"old")
 
@@ -30,33 +30,33 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, failu
     assert [entry.name for entry in tmp_path.iterdir()] == ["note.txt"]
 
 
-def test_a_folder_in_the_way_is_an_error_and_leaves_nothing(tmp_path):
+def test_write_whole_onto_a_folder_raises(tmp_path):
     (tmp_path / "taken").mkdir()
     with pytest.raises(InputError, match=r"taken: cannot be written"):
         write_whole(tmp_path / "taken", lambda file: file.write(b"done"))
     assert [entry.name for entry in tmp_path.iterdir()] == ["taken"]
 
 
-def test_a_file_in_the_place_of_the_folder_is_an_error(tmp_path):
+def test_write_whole_below_a_file_raises(tmp_path):
     (tmp_path / "file").write_bytes(b"x")
     with pytest.raises(InputError, match="cannot be written"):
         write_whole(tmp_path / "file" / "note.txt", lambda file: file.write(b"done"))
 
 
-def test_a_whole_folder_takes_its_name_when_it_is_full(tmp_path):
+def test_write_whole_folder_appears_when_full(tmp_path):
     def fill(folder):
         assert not (tmp_path / "new").exists()
         (folder / "note.txt").write_bytes(b"done")
 
     write_whole_folder(tmp_path / "new", fill)
     assert (tmp_path / "new" / "note.txt").read_bytes() == b"done"
-    with pytest.raises(InputError, match="new: is there already: expected a name that is free"):
+    with pytest.raises(InputError, match="new: exists already: expected a new name"):
         write_whole_folder(tmp_path / "new", fill)
     assert [entry.name for entry in tmp_path.iterdir()] == ["new"]
 
 
 @pytest.mark.parametrize(("failure", "expected"), [(KeyboardInterrupt, KeyboardInterrupt), (OSError, InputError)])
-def test_a_folder_that_could_not_be_filled_is_gone(tmp_path, failure, expected):
+def test_write_whole_folder_that_fails_leaves_nothing(tmp_path, failure, expected):
     def fail(folder):
         (folder / "note.txt").write_bytes(b"half")
         raise failure
@@ -66,7 +66,7 @@ def test_a_folder_that_could_not_be_filled_is_gone(tmp_path, failure, expected):
     assert not list(tmp_path.iterdir())
 
 
-def test_json_keeps_its_order_and_takes_numpy_numbers(tmp_path):
+def test_write_json_keeps_order_and_converts_numpy(tmp_path):
     data = {"z": np.float32(0.5), "a": np.int64(3), "list": np.arange(2), "none": None, "is": np.bool_(True)}
     write_json(tmp_path / "summary.json", data)
     read = json.loads((tmp_path / "summary.json").read_text())
@@ -74,18 +74,18 @@ def test_json_keeps_its_order_and_takes_numpy_numbers(tmp_path):
 
 
 @pytest.mark.parametrize("value", [float("nan"), np.float32("inf"), object()])
-def test_json_refuses_what_it_cannot_hold(tmp_path, value):
+def test_write_json_of_unrepresentable_data_raises(tmp_path, value):
     with pytest.raises(InputError, match=r"summary\.json: cannot be written as JSON"):
         write_json(tmp_path / "summary.json", {"loss": value})
     assert not list(tmp_path.iterdir())
 
 
-def test_an_array_comes_back(tmp_path):
+def test_write_array_is_read_back(tmp_path):
     write_array(tmp_path / "blocked.npy", np.array([[0.25, 1.0]]))
     np.testing.assert_array_equal(np.load(tmp_path / "blocked.npy"), [[0.25, 1.0]])
 
 
-def test_files_that_cannot_be_read(tmp_path):
+def test_read_whole_of_unreadable_files_raises(tmp_path):
     (tmp_path / "empty").write_bytes(b" \n")
     for name, message in (
         ("absent", "No such file"),

@@ -30,13 +30,13 @@ blank = Grid.unknown(SIZE, SIZE)
 blank8 = Grid.unknown(SIZE, SIZE, connectivity=8)
 
 
-def test_every_crossed_cell_in_turn():
+def test_grid_walks_visits_every_crossed_cell_in_order():
     assert cells_along(blank, (0.5, 0.5), (3.5, 0.5)) == [(0, 0), (1, 0), (2, 0), (3, 0)]
     assert cells_along(blank, (0.5, 0.25), (2.5, 1.5)) == [(0, 0), (1, 0), (1, 1), (2, 1)]
     assert cells_along(blank, (2.5, 3.5), (2.5, 1.5)) == [(2, 3), (2, 2), (2, 1)]
 
 
-def test_states_actions_and_goals():
+def test_grid_walks_returns_states_actions_and_goals():
     moves = grid_walks(walk_along([(0.5, 0.5), (1.5, 0.5), (1.5, 1.5)], [(1.5, 1.5), (0.5, 1.5)]), Grid.unknown(2, 2))
     assert moves.states.tolist() == [2, 3, 1]
     assert moves.next_states.tolist() == [3, 1, 0]
@@ -47,13 +47,13 @@ def test_states_actions_and_goals():
     assert moves.source == "walks.csv"
 
 
-def test_rows_name_where_a_move_ends():
+def test_grid_walks_rows_are_those_where_moves_end():
     moves = grid_walks(walk_along([(0.5, 0.5), (0.6, 0.5), (2.5, 0.5), (2.6, 0.5), (3.5, 0.5)]), blank)
     assert moves.rows.tolist() == [3, 3, 5]
     assert grid_walks(walk_along([(0.5, 0.5), (0.6, 0.6), (1.5, 1.5)]), blank).rows.tolist() == [3, 3]
 
 
-def test_dwelling_is_dropped():
+def test_grid_walks_drops_dwelling():
     assert cells_along(blank, (0.5, 0.5), (0.5, 0.5), (0.7, 0.6), (0.2, 0.9), (1.5, 0.5), (1.5, 0.5)) == [
         (0, 0),
         (1, 0),
@@ -61,19 +61,19 @@ def test_dwelling_is_dropped():
 
 
 @pytest.mark.parametrize("grid", [blank, blank8])
-def test_touching_a_border_is_not_entering(grid):
+def test_grid_walks_touching_a_border_enters_no_cell(grid):
     assert cells_along(grid, (0.5, 0.5), (1.0, 0.5), (0.5, 1.0), (0.5, 1.5)) == [(0, 0), (0, 1)]
     assert cells_along(grid, (1.0, 1.0), (0.5, 0.5), (0.5, 1.5)) == [(0, 0), (0, 1)]
 
 
-def test_through_a_corner_with_four_neighbours_goes_sideways_first():
+def test_grid_walks_4_connected_through_a_corner_goes_sideways_first():
     assert cells_along(blank, (0.5, 0.5), (1.5, 1.5)) == [(0, 0), (1, 0), (1, 1)]
     assert cells_along(blank, (1.5, 1.5), (0.5, 0.5)) == [(1, 1), (0, 1), (0, 0)]
     assert cells_along(blank, (0.5, 1.5), (1.0, 1.0), (1.5, 0.5)) == [(0, 1), (1, 1), (1, 0)]
 
 
 @pytest.mark.parametrize("connectivity", [4, 8])
-def test_through_a_corner_goes_around_a_known_obstacle(connectivity):
+def test_grid_walks_through_a_corner_avoids_a_known_obstacle(connectivity):
     beside = grid_of("??", "?#", connectivity=connectivity)
     assert cells_along(beside, (0.5, 0.5), (1.5, 1.5)) == [(0, 0), (0, 1), (1, 1)]
     above = grid_of("#?", "??", connectivity=connectivity)
@@ -81,33 +81,33 @@ def test_through_a_corner_goes_around_a_known_obstacle(connectivity):
 
 
 @pytest.mark.parametrize("connectivity", [4, 8])
-def test_squeezing_between_two_known_obstacles_is_refused(connectivity):
+def test_grid_walks_between_two_known_obstacles_raises(connectivity):
     grid = grid_of("#?", "?#", connectivity=connectivity)
     with pytest.raises(InputError, match=r"walks\.csv, row 2, field 'x': .*occupied"):
         grid_walks(walk_along([(0.5, 0.5), (1.5, 1.5)]), grid)
 
 
-def test_through_a_corner_with_eight_neighbours_is_a_diagonal():
+def test_grid_walks_8_connected_through_a_corner_is_diagonal():
     assert cells_along(blank8, (0.5, 0.5), (2.5, 2.5)) == [(0, 0), (1, 1), (2, 2)]
     assert cells_along(blank8, (0.5, 2.5), (1.0, 2.0), (2.5, 0.5)) == [(0, 2), (1, 1), (2, 0)]
     assert grid_walks(walk_along([(0.5, 0.5), (1.5, 1.5)]), blank8).actions.tolist() == [5]
 
 
 @pytest.mark.parametrize("offset", [0.001, 0.1, 0.3, 0.499999999, 0.5])
-def test_a_line_at_45_degrees_is_no_staircase(offset):
+def test_grid_walks_8_connected_at_45_degrees_is_no_staircase(offset):
     cells = cells_along(blank8, (0.5, 0.5 - offset), (5.5, 5.5 - offset))
     assert len(cells) in (6, 7)
     diagonals = [abs(x - u) == abs(y - v) for (x, y), (u, v) in pairwise(cells)]
     assert sum(diagonals) >= 5 - (offset >= 0.499)
 
 
-def test_the_clipped_cell_is_kept_where_the_diagonal_would_cut_a_known_corner():
+def test_grid_walks_keeps_a_clipped_cell_beside_a_known_corner():
     line = (0.5, 0.4), (1.6, 1.5)
     assert cells_along(grid_of("??", "??", connectivity=8), *line) == [(0, 0), (1, 1)]
     assert cells_along(grid_of("#?", "??", connectivity=8), *line) == [(0, 0), (1, 0), (1, 1)]
 
 
-def test_only_short_clips_are_cut():
+def test_grid_walks_leaves_out_short_clips_only():
     short, long = 0.707 / 2, 0.708 / 2
     for reach, expected in ((short, [(0, 1), (1, 0)]), (long, [(0, 1), (1, 1), (1, 0)])):
         # In through the left side of cell (1, 1), 2 · reach of path inside it, out through its bottom.
@@ -115,28 +115,28 @@ def test_only_short_clips_are_cut():
         assert cells_along(blank8, *line) == expected
 
 
-def test_the_length_of_a_clip_adds_up_over_pieces():
+def test_grid_walks_adds_up_the_length_of_a_clip():
     line = (0.5, 1.3), (1.1, 1.3), (1.1, 1.6), (1.3, 1.6), (1.3, 0.5)
     assert cells_along(blank8, *line) == [(0, 1), (1, 1), (1, 0)]
 
 
-def test_cuts_do_not_overlap():
+def test_grid_walks_leaves_out_every_other_clipped_cell():
     # Every cell is crossed along half a diagonal: of the four between the ends, the first and third go.
     line = (0.5, 0.0), (3.5, 3.0)
     assert cells_along(blank, *line) == [(0, 0), (1, 0), (1, 1), (2, 1), (2, 2), (3, 2)]
     assert cells_along(blank8, *line) == [(0, 0), (1, 1), (2, 2), (3, 2)]
 
 
-def test_in_and_out_by_the_same_side_is_no_clip():
+def test_grid_walks_in_and_out_by_one_side_is_no_clip():
     assert cells_along(blank8, (0.5, 0.5), (1.1, 0.5), (0.5, 0.6)) == [(0, 0), (1, 0), (0, 0)]
 
 
-def test_straight_through_a_cell_is_no_clip_even_at_the_rim():
+def test_grid_walks_straight_through_a_cell_is_no_clip():
     grid = Grid.unknown(1, 3, connectivity=8)
     assert cells_along(grid, (0.5, 0.5), (2.5, 0.5)) == [(0, 0), (1, 0), (2, 0)]
 
 
-def test_along_a_border_keeps_off_known_obstacles():
+def test_grid_walks_along_a_border_avoids_known_obstacles():
     right_is_wall = grid_of("?#?", "?#?", "?#?")
     assert cells_along(right_is_wall, (1.0, 0.5), (1.0, 2.5)) == [(0, 0), (0, 1), (0, 2)]
     assert cells_along(blank, (1.0, 0.5), (1.0, 2.5)) == [(1, 0), (1, 1), (1, 2)]
@@ -144,11 +144,11 @@ def test_along_a_border_keeps_off_known_obstacles():
     assert cells_along(wall_above, (0.5, 2.0), (2.5, 2.0)) == [(0, 2), (0, 1), (1, 1), (2, 1), (2, 2)]
 
 
-def test_the_rim_of_the_map_is_inside():
+def test_grid_walks_on_the_edge_of_the_map_is_inside():
     assert cells_along(Grid.unknown(2, 2), (0.0, 2.0), (2.0, 2.0), (2.0, 0.0)) == [(0, 1), (1, 1), (1, 0)]
 
 
-def test_resolution_origin_and_yaw():
+def test_grid_walks_uses_resolution_origin_and_yaw():
     turned = Grid(np.full((2, 3), -1), resolution=0.1, origin=(5.0, -3.0, np.pi / 2))
     # The map's columns run along y, its rows (from the bottom) along −x.
     assert cells_along(turned, (4.95, -2.95), (4.95, -2.75), (4.85, -2.75)) == [
@@ -160,7 +160,7 @@ def test_resolution_origin_and_yaw():
 
 
 @pytest.mark.parametrize("grid", [blank, blank8])
-def test_failed_moves_stay(grid):
+def test_grid_walks_failed_moves_stay(grid):
     line = [(0.5, 0.5), (0.5, 0.5), (1.5, 0.5), (1.5, 0.5), (1.5, 0.5), (2.5, 0.5)]
     moves = grid_walks(walk_along(line, failed={(0, 1): (0.5, -0.5), (0, 3): (1.5, 1.5), (0, 4): (2.5, 0.5)}), grid)
     first, second, third = 42, 43, 44
@@ -170,25 +170,25 @@ def test_failed_moves_stay(grid):
     assert moves.rows.tolist() == [2, 3, 4, 5, 6]
 
 
-def test_a_failed_diagonal_move():
+def test_grid_walks_failed_diagonal_move_stays():
     moves = grid_walks(walk_along([(0.5, 0.5), (0.5, 0.5)], failed={(0, 1): (1.5, 1.5)}), blank8)
     assert (moves.actions.tolist(), moves.next_states.tolist()) == ([5], [42])
 
 
-def test_a_failed_move_in_the_first_row_and_on_a_border():
+def test_grid_walks_failed_move_in_the_first_row_or_on_a_border():
     line = [(1.0, 0.5), (0.5, 0.5), (0.5, 1.5)]
     moves = grid_walks(walk_along(line, failed={(0, 0): (1.5, 0.5)}), blank)
     assert (moves.states.tolist(), moves.next_states.tolist()) == ([42, 42], [42, 35])
 
 
-def test_a_clipped_cell_where_a_move_failed_is_kept():
+def test_grid_walks_keeps_a_clipped_cell_of_a_failed_move():
     line = [(0.5, 0.4), (1.05, 0.95), (1.6, 1.5)]
     assert cells_along(blank8, *line) == [(0, 0), (1, 1)]
     assert cells_along(blank8, *line, failed={(0, 1): (2.5, 0.5)}) == [(0, 0), (1, 0), (1, 0), (1, 1)]
 
 
 @pytest.mark.parametrize("target", [(0.6, 0.5), (2.5, 0.5), (1.5, 1.5), (-1.5, 0.5)])
-def test_a_failed_move_to_no_adjacent_cell_is_refused(target):
+def test_grid_walks_failed_move_to_no_adjacent_cell_raises(target):
     walks = walk_along([(0.5, 0.5), (1.5, 0.5), (0.5, 0.5)], failed={(0, 2): target})
     with pytest.raises(
         InputError, match=r"walks\.csv, row 3, field 'failed_x': expected a failed move to one of the 4"
@@ -196,12 +196,12 @@ def test_a_failed_move_to_no_adjacent_cell_is_refused(target):
         grid_walks(walks, blank)
 
 
-def test_goals_on_a_border_count_where_the_walk_ends():
+def test_grid_walks_goal_on_a_border_is_where_the_walk_ends():
     walks = walk_along([(0.5, 0.5), (1.5, 0.5), (2.0, 0.5)], [(3.5, 0.5), (2.5, 0.5), (2.0, 0.5)])
     assert grid_walks(walks, blank).goals.tolist() == [43, 44]
 
 
-def test_goals_of_their_own():
+def test_grid_walks_reads_explicit_goals():
     walks = walk_along([(0.5, 0.5), (1.5, 0.5)], goals=[(6.5, 6.5)])
     assert grid_walks(walks, blank).goals.tolist() == [6]
 
@@ -209,7 +209,7 @@ def test_goals_of_their_own():
 @pytest.mark.parametrize(
     ("position", "field"), [((-0.1, 0.5), "x"), ((7.1, 0.5), "x"), ((0.5, -0.1), "y"), ((0.5, 7.1), "y")]
 )
-def test_positions_outside_the_map(position, field):
+def test_grid_walks_outside_the_map_raises(position, field):
     with pytest.raises(InputError, match=rf"walks\.csv, row 4, field '{field}': expected a position on the map"):
         grid_walks(walk_along([(0.5, 0.5), (1.5, 0.5)], [(0.5, 0.5), position]), blank)
     with pytest.raises(InputError, match=rf"walks\.csv, row 3, field 'goal_{field}': expected a position on the map"):
@@ -217,37 +217,37 @@ def test_positions_outside_the_map(position, field):
 
 
 @pytest.mark.parametrize("connectivity", [4, 8])
-def test_walks_through_known_obstacles(connectivity):
+def test_grid_walks_through_known_obstacles_raises(connectivity):
     grid = grid_of("???", "?#?", "???", connectivity=connectivity)
     walks = walk_along([(0.5, 0.5), (2.5, 0.5)], [(0.5, 1.5), (0.7, 1.5), (2.5, 1.5)])
     with pytest.raises(InputError, match=r"walks\.csv, row 5, field 'x': .*\(image row 1, column 1, from 0\)"):
         grid_walks(walks, grid)
 
 
-def test_a_clip_of_a_known_obstacle_is_refused():
+def test_grid_walks_clipping_a_known_obstacle_raises():
     with pytest.raises(InputError, match=r"walks\.csv, row 2, field 'x': .*occupied"):
         grid_walks(walk_along([(0.5, 0.4), (1.6, 1.5)]), grid_of("??", "?#", connectivity=8))
 
 
-def test_goals_in_known_obstacles():
+def test_grid_walks_goal_in_a_known_obstacle_raises():
     walks = walk_along([(0.5, 0.5), (1.5, 0.5)], [(0.5, 0.5), (1.5, 0.5)], goals=[(NAN, NAN), (2.5, 0.5)])
     with pytest.raises(InputError, match=r"walks\.csv, row 3, field 'goal_x': the goal \(2\.5, 0\.5\) lies in a cell"):
         grid_walks(walks, grid_of("??#"))
 
 
-def test_walks_of_one_cell():
+def test_grid_walks_within_one_cell_raises():
     walks = walk_along([(0.5, 0.5), (1.5, 0.5)], [(0.2, 0.5), (0.7, 0.5), (1.0, 0.5)])
     with pytest.raises(InputError, match=r"walks\.csv, row 3, field 'walk': .* walk 1 never leaves its cell"):
         grid_walks(walks, blank)
 
 
-def test_no_walks_at_all():
+def test_grid_walks_without_walks_raises():
     walks = walk_along([(0.5, 0.5), (1.5, 0.5)]).select(np.array([False]))
     with pytest.raises(InputError, match=r"walks\.csv: expected at least one walk"):
         grid_walks(walks, blank)
 
 
-def test_rows_are_those_of_the_file_even_when_walks_interleave():
+def test_grid_walks_of_interleaved_walks_names_rows_of_the_file():
     table = pa.table(
         {
             "walk": ["a", "b", "a", "b"],
@@ -265,7 +265,7 @@ def interleaved(**columns):
     return walks_from_table(pa.table({"walk": ["a", "b", "b", "a"], "step": [0, 0, 1, 1], **columns}))
 
 
-def test_the_first_bad_row_of_the_file_is_named():
+def test_grid_walks_names_the_first_bad_row():
     outside = interleaved(x=[0.5, 0.5, 9.0, 9.0], y=[0.5] * 4)
     with pytest.raises(InputError, match="row 3, field 'x': expected a position on the map"):
         grid_walks(outside, blank)
@@ -276,7 +276,7 @@ def test_the_first_bad_row_of_the_file_is_named():
 
 @needs_data
 @pytest.mark.parametrize("world", ["blank", "truth"])
-def test_people_in_the_tartarus_maze_move_cell_by_cell(world):
+def test_grid_walks_of_people_in_the_tartarus_maze_moves_cell_by_cell(world):
     folder = DATA / "tartarus" / "maze_01"
     walks, grid = read_walks(folder / "humans.csv"), read_map(folder / f"{world}.yaml")
     moves = grid_walks(walks, grid)
@@ -286,7 +286,7 @@ def test_people_in_the_tartarus_maze_move_cell_by_cell(world):
 
 
 @needs_data
-def test_a_rat_over_a_hole_is_refused():
+def test_grid_walks_of_a_rat_over_a_hole_raises():
     folder = DATA / "tartarus" / "maze_12"
     with pytest.raises(InputError, match=r"rats\.csv, row 80, field 'x': .*\(image row 7, column 3, from 0\)"):
         grid_walks(read_walks(folder / "rats.csv"), read_map(folder / "truth.yaml"))
@@ -294,7 +294,7 @@ def test_a_rat_over_a_hole_is_refused():
 
 @needs_data
 @pytest.mark.parametrize("town", "ABCD")
-def test_drives_among_buildings(town):
+def test_grid_walks_of_drives_among_buildings(town):
     folder = DATA / "magellan" / f"town_{town}"
     walks = read_walks(folder / "drives.csv")
     four, eight = (grid_walks(walks, read_map(folder / "truth.yaml", connectivity)) for connectivity in (4, 8))

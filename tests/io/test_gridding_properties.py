@@ -35,7 +35,7 @@ def moves_along(line, connectivity):
 
 
 @given(st.lists(lines(anywhere | centre | lattice), min_size=1, max_size=3), connectivities)
-def test_moves_are_what_their_actions_say(many, connectivity):
+def test_grid_walks_moves_follow_their_actions(many, connectivity):
     grid = Grid.unknown(SIZE, SIZE, connectivity=connectivity)
     moves = grid_walks(walk_along(*many), grid)
     cell, following = (np.stack(np.divmod(states, SIZE), axis=1) for states in (moves.states, moves.next_states))
@@ -53,7 +53,7 @@ def test_moves_are_what_their_actions_say(many, connectivity):
     st.sets(st.integers(0, SIZE**2 - 1), max_size=12),
     connectivities,
 )
-def test_positions_on_borders_and_corners_keep_the_rules(line, obstacles, connectivity):
+def test_grid_walks_on_borders_and_corners_follows_the_rules(line, obstacles, connectivity):
     known = np.full((SIZE, SIZE), int(Cell.UNKNOWN))
     known.flat[list(obstacles)] = Cell.OCCUPIED
     grid = Grid(known, connectivity=connectivity)
@@ -75,7 +75,7 @@ def test_positions_on_borders_and_corners_keep_the_rules(line, obstacles, connec
 
 
 @given(st.lists(lines(anywhere | centre), min_size=2, max_size=3), connectivities)
-def test_walks_do_not_influence_each_other(many, connectivity):
+def test_grid_walks_treats_walks_independently(many, connectivity):
     together = grid_walks(walk_along(*many), Grid.unknown(SIZE, SIZE, connectivity=connectivity))
     split_by_person = [moves_along(line, connectivity) for line in many]
     for field in ("states", "actions", "next_states", "goals"):
@@ -85,7 +85,7 @@ def test_walks_do_not_influence_each_other(many, connectivity):
 
 
 @given(lines(anywhere | centre), connectivities)
-def test_mirrored_walks_give_mirrored_moves(line, connectivity):
+def test_grid_walks_of_mirrored_walks_are_mirrored(line, connectivity):
     moves, mirrored = (moves_along(one, connectivity) for one in (line, [(SIZE - x, y) for x, y in line]))
     row, column = np.divmod(moves.states, SIZE)
     np.testing.assert_array_equal(mirrored.states, row * SIZE + SIZE - 1 - column)
@@ -93,7 +93,7 @@ def test_mirrored_walks_give_mirrored_moves(line, connectivity):
 
 
 @given(lines(anywhere | centre | lattice), st.lists(st.floats(0, 1), max_size=4), connectivities)
-def test_more_positions_on_the_same_line_change_nothing(line, fractions, connectivity):
+def test_grid_walks_ignores_more_positions_on_a_line(line, fractions, connectivity):
     refined = [line[0]]
     for start, end in pairwise(np.asarray(line)):
         refined += [tuple(start + fraction * (end - start)) for fraction in sorted(fractions)] + [tuple(end)]
@@ -103,14 +103,14 @@ def test_more_positions_on_the_same_line_change_nothing(line, fractions, connect
 
 
 @given(lines(anywhere))
-def test_a_walk_back_visits_the_same_cells(line):
+def test_grid_walks_backward_visits_the_same_cells(line):
     there, back = moves_along(line, 4), moves_along(line[::-1], 4)
     np.testing.assert_array_equal(back.states[::-1], there.next_states)
 
 
 @settings(deadline=None)
 @given(lines(anywhere))
-def test_the_cells_are_those_of_a_dense_sampling(line):
+def test_grid_walks_agrees_with_dense_sampling(line):
     grid, spacing = Grid.unknown(SIZE, SIZE), 2**-9
     fractions = np.linspace(0, 1, int(2 * SIZE / spacing))[:, None]
     samples = np.concatenate([start + fractions * (end - start) for start, end in pairwise(np.asarray(line))])
@@ -128,14 +128,14 @@ def test_the_cells_are_those_of_a_dense_sampling(line):
 
 
 @given(lines(anywhere | centre))
-def test_eight_neighbours_only_leave_cells_out(line):
+def test_grid_walks_8_connected_only_leaves_out_cells(line):
     full, fewer = moves_along(line, 4), moves_along(line, 8)
     remaining = iter(np.append(full.states[0], full.next_states).tolist())
     assert all(state in remaining for state in fewer.next_states.tolist())
     assert len(full.states) <= 2 * len(fewer.states)
 
 
-def test_a_million_positions_take_seconds():
+def test_grid_walks_of_a_million_positions_takes_seconds():
     noise = np.random.default_rng(0).normal(0, 0.3, (1_000_000, 2))
     line = np.abs((np.cumsum(noise, axis=0) + 500) % 2000 - 1000)
     moves = grid_walks(walk_along(line), Grid.unknown(1000, 1000, connectivity=8))

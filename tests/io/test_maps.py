@@ -38,67 +38,67 @@ def grey(*values):
     return np.array([values], dtype=np.uint8)
 
 
-def test_geometry_and_orientation(tmp_path):
+def test_read_map_reads_geometry_and_orientation(tmp_path):
     grid = read_map(make_map(tmp_path, np.array([[0, 254], [205, 254], [254, 254]], dtype=np.uint8)), connectivity=8)
     assert (grid.resolution, grid.origin, grid.connectivity) == (0.05, (1.0, -2.5, 0.25), 8)
     np.testing.assert_array_equal(grid.known, [[OCCUPIED, FREE], [UNKNOWN, FREE], [FREE, FREE]])
 
 
 @pytest.mark.parametrize("mode", [None, "trinary", "scale"])
-def test_thresholds_are_strict(tmp_path, mode):
+def test_read_map_thresholds_are_strict(tmp_path, mode):
     path = make_map(tmp_path, grey(203, 204, 205, 50, 51, 52), mode=mode, free_thresh=0.2, occupied_thresh=0.8)
     assert read_map(path).known.tolist() == [[UNKNOWN, UNKNOWN, FREE, OCCUPIED, UNKNOWN, UNKNOWN]]
 
 
 @pytest.mark.parametrize("negate", [1, True])
-def test_negate_swaps_black_and_white(tmp_path, negate):
+def test_read_map_negate_swaps_black_and_white(tmp_path, negate):
     assert read_map(make_map(tmp_path, grey(0, 255, 128), negate=negate)).known.tolist() == [[FREE, OCCUPIED, UNKNOWN]]
 
 
 @pytest.mark.parametrize("negate", [0, 1])
-def test_raw_mode_reads_percent(tmp_path, negate):
+def test_read_map_raw_mode_is_percent(tmp_path, negate):
     path = make_map(tmp_path, grey(0, 19, 20, 65, 66, 100, 101, 255), mode="raw", negate=negate)
     expected = [[FREE, FREE, UNKNOWN, UNKNOWN, OCCUPIED, OCCUPIED, UNKNOWN, UNKNOWN]]
     assert read_map(path).known.tolist() == expected
 
 
-def test_png_in_colour_counts_the_mean_of_the_channels(tmp_path):
+def test_read_map_of_color_png_uses_the_mean_of_channels(tmp_path):
     pixels = np.array([[[255, 0, 0], [255, 255, 250], [0, 0, 0]]], dtype=np.uint8)
     assert read_map(make_map(tmp_path, pixels, image="map.png")).known.tolist() == [[OCCUPIED, FREE, OCCUPIED]]
 
 
-def test_transparent_pixels_are_unknown(tmp_path):
+def test_read_map_transparent_pixels_are_unknown(tmp_path):
     colour = np.array([[[0, 0, 0, 0], [0, 0, 0, 255], [255, 255, 255, 255]]], dtype=np.uint8)
     assert read_map(make_map(tmp_path, colour, image="map.png")).known.tolist() == [[UNKNOWN, OCCUPIED, FREE]]
     two = Image.fromarray(np.array([[[0, 0], [0, 255], [255, 255]]], dtype=np.uint8), "LA")
     assert read_map(make_map(tmp_path, two, image="map.png")).known.tolist() == [[UNKNOWN, OCCUPIED, FREE]]
 
 
-def test_a_palette_is_looked_up(tmp_path):
+def test_read_map_looks_up_a_palette(tmp_path):
     image = Image.fromarray(grey(0, 1))
     image.putpalette([255, 255, 255, 0, 0, 0])
     assert read_map(make_map(tmp_path, image, image="map.png")).known.tolist() == [[FREE, OCCUPIED]]
 
 
 @pytest.mark.parametrize("name", ["map.png", "map.pgm"])
-def test_sixteen_bits_are_scaled(tmp_path, name):
+def test_read_map_scales_sixteen_bits(tmp_path, name):
     pixels = np.array([[0, 65535, 205 * 257]], dtype=np.uint16)
     assert read_map(make_map(tmp_path, pixels, image=name)).known.tolist() == [[OCCUPIED, FREE, UNKNOWN]]
 
 
-def test_an_image_of_one_bit(tmp_path):
+def test_read_map_reads_one_bit_images(tmp_path):
     image = Image.fromarray(grey(0, 255)).convert("1")
     assert read_map(make_map(tmp_path, image, image="map.png")).known.tolist() == [[OCCUPIED, FREE]]
 
 
-def test_numbers_that_yaml_takes_for_text(tmp_path):
+def test_read_map_reads_numbers_that_yaml_reads_as_text(tmp_path):
     path = make_map(tmp_path, grey(0))
     path.write_text(path.read_text().replace("resolution: 0.05", "resolution: 5e-2"))
     assert read_map(path).resolution == 0.05
 
 
 @pytest.mark.parametrize("key", sorted(SETTINGS))
-def test_a_missing_key_is_named(tmp_path, key):
+def test_read_map_without_a_key_names_it(tmp_path, key):
     with pytest.raises(InputError, match=rf"map\.yaml, field '{key}': the key is missing"):
         read_map(make_map(tmp_path, grey(0), **{key: None}))
 
@@ -124,7 +124,7 @@ def test_a_missing_key_is_named(tmp_path, key):
         ("mode", ["raw"], "trinary, scale or raw"),
     ],
 )
-def test_a_wrong_value_is_named(tmp_path, key, value, expected):
+def test_read_map_of_a_wrong_value_names_it(tmp_path, key, value, expected):
     with pytest.raises(InputError, match=rf"map\.yaml, field '{key}': expected {expected}"):
         read_map(make_map(tmp_path, grey(0), **{key: value}))
 
@@ -141,25 +141,25 @@ def test_a_wrong_value_is_named(tmp_path, key, value, expected):
         ("", "the file is empty"),
     ],
 )
-def test_text_that_is_no_map(tmp_path, text, message):
+def test_read_map_of_other_text_raises(tmp_path, text, message):
     (tmp_path / "map.yaml").write_text(text)
     with pytest.raises(InputError, match=rf"map\.yaml: {message}"):
         read_map(tmp_path / "map.yaml")
 
 
-def test_bytes_that_are_no_text(tmp_path):
+def test_read_map_of_bytes_raises(tmp_path):
     (tmp_path / "map.yaml").write_bytes(b"image: \xff\xfe\xfa")
     with pytest.raises(InputError, match=r"map\.yaml: expected YAML"):
         read_map(tmp_path / "map.yaml")
 
 
-def test_a_map_that_is_absent(tmp_path):
+def test_read_map_of_a_missing_file_raises(tmp_path):
     with pytest.raises(InputError, match=r"map\.yaml: cannot be read: No such file"):
         read_map(tmp_path / "map.yaml")
 
 
 @pytest.mark.parametrize("image", ["../map.pgm", "below/../../map.pgm", "link.pgm", "{absolute}"])
-def test_an_image_outside_the_folder_is_refused(tmp_path, image):
+def test_read_map_of_an_image_outside_the_folder_raises(tmp_path, image):
     Image.fromarray(grey(0)).save(tmp_path / "map.pgm")
     folder = tmp_path / "folder"
     folder.mkdir()
@@ -171,20 +171,20 @@ def test_an_image_outside_the_folder_is_refused(tmp_path, image):
         read_map(path)
 
 
-def test_an_image_in_a_folder_below_is_fine(tmp_path):
+def test_read_map_of_an_image_in_a_subfolder(tmp_path):
     (tmp_path / "images").mkdir()
     assert read_map(make_map(tmp_path, grey(0), image="images/map.pgm")).shape == (1, 1)
 
 
 @pytest.mark.parametrize("image", ["absent.pgm", ".", 3, "nul\0.pgm", ""])
-def test_an_image_that_is_none(tmp_path, image):
+def test_read_map_without_an_image_raises(tmp_path, image):
     path = make_map(tmp_path, grey(0))
     path.write_text(yaml.safe_dump(SETTINGS | {"image": image}))
     with pytest.raises(InputError, match=r"map\.yaml, field 'image'"):
         read_map(path)
 
 
-def test_a_link_that_leads_to_itself(tmp_path):
+def test_read_map_of_a_circular_link_raises(tmp_path):
     path = make_map(tmp_path, grey(0))
     (tmp_path / "map.pgm").unlink()
     (tmp_path / "map.pgm").symlink_to("map.pgm")
@@ -196,14 +196,14 @@ def test_a_link_that_leads_to_itself(tmp_path):
     "content",
     [b"not an image", b"P5\n4 4\n255\nab", b"P2\n2 1\n255\nx y\n", b"\x89PNG\r\n\x1a\n", b"P5\n0 0\n255\n"],
 )
-def test_an_image_that_is_broken(tmp_path, content):
+def test_read_map_of_a_broken_image_raises(tmp_path, content):
     path = make_map(tmp_path, grey(0))
     (tmp_path / "map.pgm").write_bytes(content)
     with pytest.raises(InputError, match=r"map\.pgm: expected"):
         read_map(path)
 
 
-def test_an_image_of_fractions_is_refused(tmp_path):
+def test_read_map_of_an_image_of_fractions_raises(tmp_path):
     path = make_map(tmp_path, grey(0))
     (tmp_path / "map.pgm").write_bytes(b"Pf\n1 1\n-1.0\n" + np.float32(0.5).tobytes())
     with pytest.raises(InputError, match=r"map\.pgm: expected an image in PGM or PNG"):
@@ -211,14 +211,14 @@ def test_an_image_of_fractions_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("size", ["10001 10000", "30000 30000"])
-def test_an_absurd_size_is_refused_before_decoding(tmp_path, size):
+def test_read_map_of_a_huge_image_raises_before_decoding(tmp_path, size):
     path = make_map(tmp_path, grey(0))
     (tmp_path / "map.pgm").write_bytes(f"P5\n{size}\n255\n".encode())
     with pytest.raises(InputError, match=r"map\.pgm: expected (from 1 to|at most) 100,000,000 pixels"):
         read_map(path)
 
 
-def test_an_unknown_connectivity(tmp_path):
+def test_read_map_of_unknown_connectivity_raises(tmp_path):
     with pytest.raises(Exception, match="connectivity"):
         read_map(make_map(tmp_path, grey(0)), connectivity=6)  # pyright: ignore[reportArgumentType]
 
@@ -233,7 +233,7 @@ numbers = st.floats(-1e6, 1e6, allow_nan=False)
     st.floats(1e-6, 1e3),
     st.tuples(numbers, numbers, numbers),
 )
-def test_a_learned_map_comes_back(tmp_path_factory, rows, resolution, origin):
+def test_write_map_is_read_back(tmp_path_factory, rows, resolution, origin):
     folder, blocked = tmp_path_factory.mktemp("maps"), np.array(rows)
     grid = Grid(np.full(blocked.shape, -1), resolution, origin)
     write_map(folder / "learned.yaml", blocked, grid)
@@ -246,7 +246,7 @@ def test_a_learned_map_comes_back(tmp_path_factory, rows, resolution, origin):
     np.testing.assert_array_equal(read.known[sure], expected[sure])
 
 
-def test_a_learned_map_says_what_nav2_needs(tmp_path):
+def test_write_map_writes_the_keys_of_nav2(tmp_path):
     write_map(tmp_path / "new" / "learned.yaml", np.array([[0.0, 1.0]]), Grid.unknown(1, 2))
     settings = yaml.safe_load((tmp_path / "new" / "learned.yaml").read_text())
     assert settings == {
@@ -262,24 +262,24 @@ def test_a_learned_map_says_what_nav2_needs(tmp_path):
 
 
 @pytest.mark.parametrize("value", [-0.01, 1.01, float("nan")])
-def test_values_that_are_no_probabilities_are_not_written(tmp_path, value):
+def test_write_map_of_other_values_raises(tmp_path, value):
     with pytest.raises(InputError, match="expected probabilities"):
         write_map(tmp_path / "map.yaml", np.array([[value]]), Grid.unknown(1, 1))
     assert not list(tmp_path.iterdir())
 
 
-def test_an_array_of_another_shape_is_not_written(tmp_path):
+def test_write_map_of_another_shape_raises(tmp_path):
     with pytest.raises(InputError, match=r"expected an array of shape \(1, 1\), found \(1, 2\)"):
         write_map(tmp_path / "map.yaml", np.zeros((1, 2)), Grid.unknown(1, 1))
 
 
-def test_a_map_needs_a_name_in_yaml(tmp_path):
+def test_write_map_needs_a_yaml_name(tmp_path):
     with pytest.raises(InputError, match=r"ends in \.yaml"):
         write_map(tmp_path / "map.pgm", np.zeros((1, 1)), Grid.unknown(1, 1))
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="needs the data folder beside the checkout")
-def test_maps_of_nav2():
+def test_read_map_reads_maps_of_nav2():
     depot, warehouse = read_map(DATA / "maps" / "depot.yaml"), read_map(DATA / "maps" / "warehouse.yaml")
     assert (depot.shape, warehouse.shape) == ((307, 604), (1674, 1006))
     assert warehouse.origin == (-15.1, -25.0, 0.0)

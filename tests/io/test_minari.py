@@ -68,7 +68,7 @@ def pursuits(states, actions, tasks, walks, seed):
 
 
 @given(sizes)
-def test_demonstrations_come_back_bit_by_bit(size):
+def test_write_demonstrations_is_read_back_bit_by_bit(size):
     world, demonstrations = pursuits(*size)
     dataset = fresh("ours/back")
     write_demonstrations(dataset, demonstrations, world)
@@ -76,7 +76,7 @@ def test_demonstrations_come_back_bit_by_bit(size):
 
 
 @given(sizes)
-def test_returns_are_what_tasks_pay(size):
+def test_write_demonstrations_returns_are_those_of_the_tasks(size):
     """Σ γ^t r_t of an episode: R of every move, and the final reward one move after the last."""
     world, demonstrations = pursuits(*size)
     dataset, tasks = fresh("ours/paid"), demonstrations.tasks
@@ -103,7 +103,7 @@ def towards(*goals, discount=0.95):
     return gather(walks, [reach(GRID, goal, discount=discount) for goal in goals])
 
 
-def test_others_see_states_actions_goals_and_discounts():
+def test_write_demonstrations_is_readable_by_minari():
     dataset = fresh("ours/seen")
     write_demonstrations(dataset, towards(2, 5), GRID)
     found = minari.load_dataset(dataset)
@@ -123,7 +123,7 @@ def lake_policy(world, people):
     return np.asarray(plan(world.model, world.task, people).policy)
 
 
-def test_a_lake_s_slip_is_learned_alike_from_what_was_read():
+def test_fit_of_stored_demonstrations_is_the_same():
     env, people = gymnasium.make("FrozenLake-v1"), Behavior(BoltzmannAverage(), 30.0)
     world = from_gymnasium(env, DISCOUNT)
     policy = lake_policy(world, people)
@@ -157,7 +157,7 @@ def record(env, act, episodes):
     return dataset
 
 
-def test_episodes_of_minari_s_collector_are_read_and_paid_as_the_environment_paid():
+def test_read_demonstrations_of_collected_episodes_keeps_rewards():
     env = gymnasium.make("FrozenLake-v1", max_episode_steps=30)
     world, draw = from_gymnasium(env, DISCOUNT), np.random.default_rng(0)
     policy = lake_policy(world, Behavior(BoltzmannAverage(), 30.0))
@@ -175,7 +175,7 @@ def test_episodes_of_minari_s_collector_are_read_and_paid_as_the_environment_pai
     assert told["goal"] == 15  # the present, though holes end the task too
 
 
-def test_ends_with_states_of_their_own_are_the_environment_s_in_datasets():
+def test_read_demonstrations_maps_separate_ends():
     name = max(name for name in gymnasium.registry if name.startswith("Taxi-"))
     env = gymnasium.make(name)
     world = from_gymnasium(env, DISCOUNT)
@@ -198,7 +198,7 @@ def test_ends_with_states_of_their_own_are_the_environment_s_in_datasets():
     assert path.tolist() == [state, state]  # time was up there, and nothing ended
 
 
-def test_the_example_of_the_docs_runs():
+def test_docs_minari_example_runs():
     section, found = DOCS.read_text().split("## Minari")[1], {}
     exec(section.split("```python\n")[1].split("```")[0], found)
     assert found["again"].trajectories == found["demos"].trajectories
@@ -210,7 +210,7 @@ WALK = buffer(np.array([0, 1, 2]), np.array([3, 3]))
 
 
 @pytest.mark.parametrize("data_format", ["hdf5", "arrow", "parquet"])
-def test_goals_and_discounts_of_others_are_tasks(data_format):
+def test_read_demonstrations_makes_tasks_of_goals_and_discounts(data_format):
     told = [{"goal": 2, "discount": 0.9}, {"goal": 5, "discount": 0.9}, {"goal": 2, "discount": 0.9}]
     dataset = store(SPACES, WALK, WALK, WALK, metadata=told, data_format=data_format)
     found = read_demonstrations(dataset, GRID, step_cost=1.0)
@@ -221,7 +221,7 @@ def test_goals_and_discounts_of_others_are_tasks(data_format):
     assert eqx.tree_equal(found.tasks, expected)
 
 
-def test_what_episodes_do_not_tell_comes_from_arguments():
+def test_read_demonstrations_uses_arguments_for_missing_metadata():
     dataset = store(SPACES, WALK, WALK, metadata=[{"goal": 2}, {"goal": 2, "discount": 0.5}])
     found = read_demonstrations(dataset, GRID, discount=0.9)
     np.testing.assert_allclose(found.tasks.discount, [0.9, 0.5])
@@ -230,7 +230,7 @@ def test_what_episodes_do_not_tell_comes_from_arguments():
     assert eqx.tree_equal(read_demonstrations(bare, GRID, task=own).tasks, stack_tasks([own]))
 
 
-def test_a_dataset_is_found_by_its_path(datasets, tmp_path, monkeypatch):
+def test_read_demonstrations_by_path(datasets, tmp_path, monkeypatch):
     dataset = store(SPACES, WALK, metadata=[{"goal": 2, "discount": 0.9}])
     os.rename(datasets / dataset, tmp_path / "moved")
     monkeypatch.chdir(tmp_path)
@@ -249,8 +249,8 @@ def refused(dataset, message, world=GRID, **arguments):
 @pytest.mark.parametrize(
     ("told", "message"),
     [
-        ({"discount": 0.9}, "field 'goal': the episode does not tell it, and nor did an argument"),
-        ({"goal": 2}, "field 'discount': the episode does not tell it, and nor did an argument"),
+        ({"discount": 0.9}, "field 'goal': neither the episode nor an argument has it"),
+        ({"goal": 2}, "field 'discount': neither the episode nor an argument has it"),
         ({"goal": 6, "discount": 0.9}, r"field 'goal': expected a state in 0…5, found 6"),
         ({"goal": -1, "discount": 0.9}, r"field 'goal': expected a state in 0…5, found -1"),
         ({"goal": 2.5, "discount": 0.9}, r"field 'goal': expected a whole number, found 2.5"),
@@ -264,13 +264,13 @@ def refused(dataset, message, world=GRID, **arguments):
         ({"goal": 1, "discount": 0.9}, "goes on after a terminal state of its task"),
     ],
 )
-def test_metadata_that_are_no_task_are_refused(told, message):
+def test_read_demonstrations_of_bad_metadata_raises(told, message):
     dataset = store(SPACES, WALK, WALK, metadata=[{"goal": 2, "discount": 0.9}, told])
     separator = ": " if "goes on" in message else ", "
     refused(dataset, f", episode 1{separator}{message}")
 
 
-def test_goals_in_known_obstacles_are_refused():
+def test_read_demonstrations_of_goals_in_obstacles_raises():
     known = np.full((2, 3), Cell.UNKNOWN)
     known[0, 2] = Cell.OCCUPIED
     dataset = store(SPACES, WALK, metadata=[{"goal": 2, "discount": 0.9}])
@@ -297,19 +297,19 @@ def test_goals_in_known_obstacles_are_refused():
         (buffer([0, 1, 2], [3, 4]), "field 'actions': expected a whole number in 0…3, found 4 at step 1"),
     ],
 )
-def test_episodes_that_do_not_fit_are_refused(walk, message):
+def test_read_demonstrations_of_bad_episodes_raises(walk, message):
     told = {"goal": 2, "discount": 0.9}
     dataset = store(SPACES, WALK, walk, metadata=[told, told])
     refused(dataset, f", episode 1, {message}")
 
 
-def test_an_episode_without_a_move_is_refused():
+def test_read_demonstrations_of_an_episode_without_moves_raises():
     nothing = buffer([0], [], rewards=np.zeros(0), terminations=np.zeros(0, bool), truncations=np.zeros(0, bool))
     dataset = store(SPACES, WALK, nothing, data_format="arrow")
     refused(dataset, ", episode 1, field 'rewards': expected at least one move, found none", task=reach(GRID, 2))
 
 
-def test_an_empty_dataset_is_refused():
+def test_read_demonstrations_of_an_empty_dataset_raises():
     refused(store(SPACES), ": expected at least one episode, found none")
 
 
@@ -322,17 +322,17 @@ def test_an_empty_dataset_is_refused():
         ((Discrete(6), Discrete(8)), r", field 'action_space': expected Discrete\(4\).*found Discrete\(8\)"),
     ],
 )
-def test_other_spaces_are_refused(spaces, message):
+def test_read_demonstrations_of_other_spaces_raises(spaces, message):
     seen = np.zeros((3, 1), np.float32) if isinstance(spaces[0], Box) else [1, 2, 3]
     refused(store(spaces, buffer(seen, [3, 3])), message, task=reach(GRID, 5))
 
 
-def test_a_task_of_another_world_is_refused():
+def test_read_demonstrations_with_a_task_of_another_world_raises():
     with pytest.raises(InputError, match=r"'task': expected one task of 6 states, found \(9,\)"):
         read_demonstrations(store(SPACES, WALK), GRID, task=reach(Grid.unknown(3, 3), 2))
 
 
-def test_what_is_no_dataset_is_refused(datasets, tmp_path):
+def test_read_demonstrations_of_no_dataset_raises(datasets, tmp_path):
     refused("nowhere/walks-v0", ": there is no such dataset here: expected one that `minari list local` shows")
     refused(tmp_path, ": there is no such dataset here")
     broken = store(SPACES, WALK)
@@ -370,10 +370,10 @@ def set_in_task(**values):
         (set_in_task(reward=[[0.0, 1.0]]), r", task 1, field 'reward': .*\(6, 4\), found shape \(1, 2\)"),
         (set_in_task(reward=[[float("nan")]]), ", task 1, field 'reward': expected finite numbers"),
         (set_in_task(reward=[[0], [0, 1]]), ", task 1, field 'reward': expected a table of numbers"),
-        (set_in_task(terminal_reward=[[1.0]]), r", task 1, field 'final_reward': .*\(6,\), found shape \(1, 1\)"),
+        (set_in_task(terminal_reward=[[1.0]]), r", task 1, field 'terminal_reward': .*\(6,\), found shape \(1, 1\)"),
     ],
 )
-def test_tasks_that_were_spoiled_are_refused(datasets, edit, message):
+def test_read_demonstrations_of_bad_tasks_raises(datasets, edit, message):
     dataset = fresh("ours/spoiled")
     write_demonstrations(dataset, towards(2, 5), GRID)
     edited(datasets, dataset, edit)
@@ -384,21 +384,21 @@ def test_tasks_that_were_spoiled_are_refused(datasets, edit, message):
 
 
 @pytest.mark.parametrize("dataset", ["office", "office/../walks-v0", "/walks-v0", "", "a b-v0", "walks-v", "x//y-v0"])
-def test_ids_that_are_none_are_refused(dataset):
+def test_write_demonstrations_to_a_malformed_id_raises(dataset):
     with pytest.raises(InputError, match=f"^{re.escape(dataset)}: expected an id with a version"):
         write_demonstrations(dataset, towards(2), GRID)
 
 
-def test_a_dataset_that_is_there_stays_as_it_is():
+def test_write_demonstrations_keeps_an_existing_dataset():
     dataset = fresh("ours/kept")
     write_demonstrations(dataset, towards(2), GRID)
-    with pytest.raises(InputError, match=f"{dataset}: is there already: expected a name that is free"):
+    with pytest.raises(InputError, match=f"{dataset}: exists already: expected a new name"):
         write_demonstrations(dataset, towards(5), GRID)
     found = read_demonstrations(dataset, GRID)
     assert found.visited_state_goals()[:, 1].tolist() == [2, 2, 2]
 
 
-def test_demonstrations_of_another_world_are_refused():
+def test_write_demonstrations_of_another_world_raises():
     message = "expected demonstrations in a world of 9 states and 4 actions, found 6 states and action 3"
     with pytest.raises(InputError, match=message):
         write_demonstrations(fresh(), towards(2), Grid.unknown(3, 3))
@@ -406,18 +406,18 @@ def test_demonstrations_of_another_world_are_refused():
         write_demonstrations(fresh(), towards(2), complete(6, 2))
 
 
-def test_trajectories_with_gaps_are_refused_and_leave_nothing(datasets):
+def test_write_demonstrations_with_gaps_raises_and_leaves_nothing(datasets):
     walks = towards(2, 5)
     gap = eqx.tree_at(lambda each: each.next_states, walks, jnp.asarray([1, 2, 4, 2]))
     turn = eqx.tree_at(lambda each: each.task, walks, jnp.asarray([0, 0, 0, 1]))
-    message = "trajectory, row 2: expected moves that each start where the last one led, towards one task"
+    message = "trajectory, row 2: expected moves that each start where the one before ended, and one task"
     for broken in (gap, turn):
         with pytest.raises(InputError, match=message):
             write_demonstrations(fresh("gaps/gap"), broken, GRID)
     assert not (datasets / "gaps").exists()
 
 
-def test_without_minari_the_error_says_how_to_install_it(monkeypatch):
+def test_demonstrations_without_minari_raise_with_advice(monkeypatch):
     monkeypatch.setitem(sys.modules, "minari", None)
     for call in (lambda: read_demonstrations("a-v0", GRID), lambda: write_demonstrations("a-v0", towards(2), GRID)):
         with pytest.raises(InputError, match=r"^a-v0: .*Minari is not installed.*pip install 'sidestep\[minari\]'"):

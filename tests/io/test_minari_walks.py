@@ -25,7 +25,7 @@ LINE = np.array([[0.5, 0.5], [1.5, 0.5], [1.5, 1.5]])
 
 
 @given(walk_tables())
-def test_walks_come_back(table):
+def test_write_walks_to_minari_is_read_back(table):
     walks, dataset = walks_from_table(table), "minari:" + fresh("ours/walks")
     write_walks(dataset, walks)
     read = read_walks(dataset)
@@ -36,7 +36,7 @@ def test_walks_come_back(table):
 
 
 @pytest.mark.parametrize("labels", [["b", "b", "a", "a"], [7, 7, -2, -2], [0.5, 0.5, 0.25, 0.25]])
-def test_labels_steps_times_and_metadata_come_back(labels):
+def test_write_walks_to_minari_keeps_labels_steps_and_metadata(labels):
     columns = {
         "t": [0.0, 0.5, 0.0, 2.0],
         "group": pa.array(["x", "y", "", "x"]).dictionary_encode(),
@@ -52,7 +52,7 @@ def test_labels_steps_times_and_metadata_come_back(labels):
     assert read.metadata.to_pydict() == walks.metadata.to_pydict()
 
 
-def test_to_others_walks_are_a_point_maze():
+def test_write_walks_to_minari_is_a_point_maze():
     walks = walk_along(LINE, LINE[[0, 0, 1]], goals=[(1.5, 1.5), (9.0, 9.0)], failed={(1, 1): (0.5, 1.5)})
     dataset = fresh("ours/maze")
     write_walks(f"minari:{dataset}", walks)
@@ -81,7 +81,7 @@ def maze(positions=LINE, goals=(3.0, 2.0), **infos):
 
 
 @pytest.mark.parametrize("data_format", ["hdf5", "arrow", "parquet"])
-def test_a_point_maze_of_others_is_walks(data_format):
+def test_read_walks_of_a_point_maze(data_format):
     episodes = maze(success=[False, False, True]), maze(LINE[:2], goals=(0.0, 1.0), success=[True, False])
     walks = read_walks("minari:" + store((MAZE, FORCE), *episodes, data_format=data_format))
     assert [walk.tolist() for walk in walks] == [LINE.tolist(), LINE[:2].tolist()]
@@ -92,7 +92,7 @@ def test_a_point_maze_of_others_is_walks(data_format):
     assert walks.metadata.to_pydict() == {"success": [False, False, True, True, False]}
 
 
-def test_infos_that_are_not_of_positions_are_left_out():
+def test_read_walks_leaves_out_infos_that_are_not_of_positions():
     """Vectors, other lengths, and what observations tell."""
     infos = {"force": LINE, "short": np.zeros(2), "x": np.ones(3), "more": {"left": np.ones(3)}, "left": np.ones(3)}
     walks = read_walks("minari:" + store((MAZE, FORCE), maze(**infos), maze()))
@@ -100,7 +100,7 @@ def test_infos_that_are_not_of_positions_are_left_out():
     assert walks.metadata.to_pydict() == {"left": [1.0, 1.0, 1.0, None, None, None]}
 
 
-def test_observations_that_are_positions_are_walks():
+def test_read_walks_of_box_observations():
     """The first two numbers of a box are x and y; metadata tell the goal, or else the walk ends there."""
     box = Box(-np.inf, np.inf, (3,), np.float64)
     seen = np.hstack([LINE, np.full((3, 1), 7.0)])
@@ -110,7 +110,7 @@ def test_observations_that_are_positions_are_walks():
     assert walks.goals.tolist() == [[4.0, 5.0], [1.5, 1.5]]
 
 
-def test_a_dataset_is_found_by_its_path(datasets, tmp_path, monkeypatch):
+def test_read_walks_by_minari_path(datasets, tmp_path, monkeypatch):
     dataset = store((MAZE, FORCE), maze())
     (datasets / dataset).rename(tmp_path / "moved")
     monkeypatch.chdir(tmp_path)
@@ -132,11 +132,11 @@ def refused(dataset, message):
         (maze(goals=[[3, 2], [3, 2], [3, 1]]), "'desired_goal': expected one goal, found another at step 2"),
     ],
 )
-def test_positions_that_are_none_are_refused(walk, message):
+def test_read_walks_of_bad_positions_raises(walk, message):
     refused(store((MAZE, FORCE), maze(), walk), f", episode 1, field {message}")
 
 
-def test_lengths_that_do_not_fit_are_refused():
+def test_read_walks_of_other_lengths_raises():
     walk = buffer({"achieved_goal": LINE, "desired_goal": LINE[:2]}, np.zeros((2, 2), np.float32))
     dataset = store((Dict({"achieved_goal": PLANE, "desired_goal": PLANE}), FORCE), walk)
     refused(dataset, ", episode 0, field 'desired_goal': expected 3 observations around 2 moves, found 2")
@@ -151,7 +151,7 @@ def test_lengths_that_do_not_fit_are_refused():
         ([np.nan, 1.0], r"expected finite numbers, found \[nan, 1.0\]"),
     ],
 )
-def test_goals_that_are_none_are_refused(goal, message):
+def test_read_walks_of_bad_goals_raises(goal, message):
     walk = buffer(LINE, np.zeros((2, 2), np.float32))
     dataset = store((PLANE, FORCE), walk, walk, metadata=[{"goal": [1.0, 1.0]}, {"goal": goal}])
     refused(dataset, f", episode 1, field 'goal': {message}")
@@ -173,23 +173,23 @@ def test_goals_that_are_none_are_refused(goal, message):
         ),
     ],
 )
-def test_observations_without_positions_are_refused(space, message):
+def test_read_walks_without_positions_raises(space, message):
     seen = [space.sample() for _ in range(3)]
     stacked = {name: np.stack([each[name] for each in seen]) for name in seen[0]} if isinstance(space, Dict) else seen
     refused(store((space, FORCE), buffer(stacked, np.zeros((2, 2), np.float32))), message)
 
 
-def test_two_walks_of_one_label_are_refused():
+def test_read_walks_with_one_label_twice_raises():
     dataset = store((MAZE, FORCE), maze(), maze(), metadata=[{"walk": "a"}, {"walk": "a"}])
     refused(dataset, ", field 'walk': expected different walks, found 'a' more than once")
 
 
-def test_infos_of_two_kinds_are_refused():
+def test_read_walks_of_mixed_infos_raises():
     dataset = store((MAZE, FORCE), maze(mood=np.arange(3)), maze(mood=["a", "b", "c"]))
     refused(dataset, ", field 'infos': expected infos of the same kind in all episodes")
 
 
-def test_a_dataset_that_is_empty_or_not_there_is_refused():
+def test_read_walks_of_an_empty_or_missing_dataset_raises():
     refused(store((MAZE, FORCE)), ": expected at least one episode, found none")
     refused("nowhere/walks-v0", ": there is no such dataset here")
 
@@ -199,30 +199,30 @@ def test_a_dataset_that_is_empty_or_not_there_is_refused():
     [
         (pa.array([[1], [2], [3]]), ", field 'extra': expected numbers or text, found list"),
         (pa.array([0, 1, 2], pa.timestamp("s")), ", field 'extra': expected numbers or text, found timestamp"),
-        (pa.array([1, None, 3]), ", row 2, field 'extra': a Minari dataset holds no empty cells"),
-        (pa.array(["a", "b", None]), ", row 3, field 'extra': a Minari dataset holds no empty cells"),
+        (pa.array([1, None, 3]), ", row 2, field 'extra': a Minari dataset has no empty cells"),
+        (pa.array(["a", "b", None]), ", row 3, field 'extra': a Minari dataset has no empty cells"),
     ],
 )
-def test_columns_that_minari_cannot_hold_are_refused_and_leave_nothing(datasets, column, message):
+def test_write_walks_of_unrepresentable_columns_raises_and_leaves_nothing(datasets, column, message):
     walks = replace(walk_along(LINE), metadata=pa.table({"extra": column}))
     with pytest.raises(InputError, match=f"^lost/walks-v0{message}"):
         write_walks("minari:lost/walks-v0", walks)
     assert not (datasets / "lost").exists()
 
 
-def test_no_walks_are_no_dataset():
+def test_write_walks_without_walks_raises():
     with pytest.raises(InputError, match=r"^lost/walks-v0: expected at least one walk, found none"):
         write_walks("minari:lost/walks-v0", walk_along(LINE).select(np.array([False])))
 
 
-def test_what_hdf5_cannot_hold_leaves_nothing(datasets):
+def test_write_walks_that_hdf5_refuses_leaves_nothing(datasets):
     walks = replace(walk_along(LINE), metadata=pa.table({"extra": ["a", "b\0", "c"]}))
     with pytest.raises(InputError, match=r"^lost/walks-v0: the dataset cannot be written: ValueError"):
         write_walks("minari:lost/walks-v0", walks)
     assert not list(datasets.glob("lost/*")) + list(datasets.glob("lost/.*"))
 
 
-def test_without_minari_the_error_says_how_to_install_it(monkeypatch):
+def test_walks_without_minari_raise_with_advice(monkeypatch):
     monkeypatch.setitem(sys.modules, "minari", None)
     message = r"^a-v0: .*Minari is not installed.*pip install 'sidestep\[minari\]'"
     with pytest.raises(InputError, match=message):

@@ -43,7 +43,7 @@ def files(tmp_path):
     return write
 
 
-def test_links_are_numbered_in_order_and_turns_join_them(files):
+def test_read_roads_numbers_links_and_joins_turns(files):
     links, turns, _ = files()
     roads = read_roads(links, turns)
     assert (len(roads), roads.labels) == (4, ["a", "b", "c", "007"])
@@ -60,7 +60,7 @@ def test_links_are_numbered_in_order_and_turns_join_them(files):
     ]
 
 
-def test_labels_that_are_numbers_may_come_in_any_order(files):
+def test_read_roads_with_numeric_labels_in_any_order(files):
     links, turns, trips = files()
     number = {"a": "10", "b": "2", "c": "0", "007": "30"}
     for path in (links, turns, trips):
@@ -90,7 +90,7 @@ def test_labels_that_are_numbers_may_come_in_any_order(files):
         ("turns", "a,0,c", "a,0.5,c", r"turns\.csv, row 2, field 'action': expected a whole number, 0…7"),
     ],
 )
-def test_road_networks_that_are_none_are_refused(files, table, old, new, match):
+def test_read_roads_of_bad_tables_raises(files, table, old, new, match):
     links, turns, _ = files(table, old, new)
     with pytest.raises(InputError, match=match):
         read_roads(links, turns)
@@ -110,14 +110,14 @@ def test_road_networks_that_are_none_are_refused(files, table, old, new, match):
         (TRIPS, "trip,origin,destination,links\n", r"trips\.csv: expected at least one row"),
     ],
 )
-def test_trips_that_cannot_be_are_refused(files, old, new, match):
+def test_read_trips_of_bad_tables_raises(files, old, new, match):
     links, turns, trips = files("trips", old, new)
     roads = read_roads(links, turns)
     with pytest.raises(InputError, match=match):
         read_trips(trips, roads)
 
 
-def test_trips_become_demonstrations_with_a_task_a_destination(files):
+def test_demonstrations_from_trips_have_one_task_per_destination(files):
     links, turns, trips = files()
     roads = read_roads(links, turns)
     graph = road_network(roads.turns, roads.lengths).graph
@@ -131,7 +131,7 @@ def test_trips_become_demonstrations_with_a_task_a_destination(files):
     assert paid.tolist() == [20, 15, 60.25, 60.25]
 
 
-def test_trips_without_a_turn_are_no_demonstrations(files):
+def test_demonstrations_from_trips_without_a_turn_raises(files):
     links, turns, _ = files()
     roads = read_roads(links, turns)
     graph = road_network(roads.turns, roads.lengths).graph

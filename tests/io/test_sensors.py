@@ -31,25 +31,25 @@ def sensor_map(folder, pixels, **changes):
 GREY = [[0, 51, 102], [153, 204, 255]]
 
 
-def test_a_pixel_is_a_probability_whatever_the_thresholds(tmp_path):
+def test_read_sensor_map_ignores_thresholds(tmp_path):
     expected = [[1, 0.8, 0.6], [0.4, 0.2, 0]]
     np.testing.assert_allclose(read_sensor_map(sensor_map(tmp_path, GREY), GRID), expected)
     path = sensor_map(tmp_path, GREY, negate=1, occupied_thresh=0.5, free_thresh=0.1)
     np.testing.assert_allclose(read_sensor_map(path, GRID), 1 - np.array(expected))
 
 
-def test_transparent_pixels_were_not_seen(tmp_path):
+def test_read_sensor_map_transparent_pixels_are_nan(tmp_path):
     pixels = np.stack([np.full((2, 3), 51)] * 3 + [[[255, 0, 255], [0, 255, 255]]], axis=-1)
     found = read_sensor_map(sensor_map(tmp_path, pixels), GRID)
     np.testing.assert_allclose(found, [[0.8, np.nan, 0.8], [np.nan, 0.8, 0.8]])
 
 
-def test_raw_maps_hold_percent_and_more_is_unknown(tmp_path):
+def test_read_sensor_map_raw_mode_is_percent(tmp_path):
     path = sensor_map(tmp_path, [[0, 35, 100], [101, 255, 50]], mode="raw")
     np.testing.assert_allclose(read_sensor_map(path, GRID), [[0, 0.35, 1], [np.nan, np.nan, 0.5]])
 
 
-def test_a_learned_map_can_be_a_sensor_s(tmp_path):
+def test_read_sensor_map_reads_a_learned_map(tmp_path):
     blocked = np.random.default_rng(0).random((2, 3))
     write_map(tmp_path / "learned.yaml", blocked, GRID)
     np.testing.assert_allclose(read_sensor_map(tmp_path / "learned.yaml", GRID), blocked, atol=0.5 / 255)
@@ -65,17 +65,17 @@ def test_a_learned_map_can_be_a_sensor_s(tmp_path):
         ({"image": "other.png"}, r"seen.yaml, field 'image': there is no image"),
     ],
 )
-def test_maps_that_do_not_fit(tmp_path, changes, match):
+def test_read_sensor_map_of_another_map_raises(tmp_path, changes, match):
     with pytest.raises(InputError, match=match):
         read_sensor_map(sensor_map(tmp_path, GREY, **changes), GRID)
 
 
-def test_a_map_of_another_shape(tmp_path):
+def test_read_sensor_map_of_another_shape_raises(tmp_path):
     with pytest.raises(InputError, match=r"seen.yaml, field 'image': expected the map's 2 × 3 cells, found 3 × 2"):
         read_sensor_map(sensor_map(tmp_path, np.transpose(GREY)), GRID)
 
 
-def test_variances_are_read(tmp_path):
+def test_read_sensor_variance_reads_numbers(tmp_path):
     given = np.array([[1.0, np.nan, 2.0], [np.inf, 0.5, 3.0]])
     np.save(tmp_path / "variance.npy", given)
     np.testing.assert_array_equal(read_sensor_variance(tmp_path / "variance.npy", GRID), given)
@@ -92,7 +92,7 @@ def test_variances_are_read(tmp_path):
         (np.full((2, 3), "much"), r"variance.npy: expected a NumPy array of numbers"),
     ],
 )
-def test_variances_that_are_none(tmp_path, array, match):
+def test_read_sensor_variance_of_other_arrays_raises(tmp_path, array, match):
     np.save(tmp_path / "variance.npy", array)
     with pytest.raises(InputError, match=match):
         read_sensor_variance(tmp_path / "variance.npy", GRID)

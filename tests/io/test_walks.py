@@ -25,7 +25,7 @@ def read_text(folder, text, name="walks.csv"):
     return read_walks(folder / name)
 
 
-def test_walks_are_grouped_in_order_of_appearance(tmp_path):
+def test_read_walks_groups_rows_in_order_of_appearance(tmp_path):
     walks = read_text(tmp_path, GOOD)
     assert (len(walks), walks.labels) == (2, ["b", "a"])
     assert walks.offsets.tolist() == [0, 2, 5]
@@ -40,7 +40,7 @@ def test_walks_are_grouped_in_order_of_appearance(tmp_path):
     assert walks.source == str(tmp_path / "walks.csv")
 
 
-def test_metadata_is_kept_as_it_was(tmp_path):
+def test_read_walks_keeps_metadata(tmp_path):
     metadata = read_text(tmp_path, GOOD).metadata
     assert metadata.column_names == ["t", "subject", "trial"]
     assert metadata["subject"].to_pylist() == ["003", "003", "001", "001", "001"]
@@ -60,37 +60,37 @@ def test_metadata_is_kept_as_it_was(tmp_path):
         ("nan,2", ["nan", "2"]),
     ],
 )
-def test_columns_become_numbers_only_where_nothing_is_lost(tmp_path, cells, expected):
+def test_read_walks_makes_numbers_where_nothing_is_lost(tmp_path, cells, expected):
     first, second = cells.split(",")
     walks = read_text(tmp_path, f"walk,step,x,y,note\n0,0,0,0,{first}\n0,1,1,0,{second}\n")
     assert walks.metadata["note"].to_pylist() == expected
 
 
-def test_labels_that_differ_as_text_are_different_walks(tmp_path):
+def test_read_walks_keeps_labels_that_differ_as_text(tmp_path):
     text = "walk,step,x,y\n1.10,0,0,0\n1.1,0,0,0\n1.10,1,1,0\n1.1,1,1,0\n"
     assert read_text(tmp_path, text).labels == ["1.10", "1.1"]
 
 
-def test_byte_order_marks_blank_lines_and_line_ends_do_no_harm(tmp_path):
+def test_read_walks_accepts_byte_order_marks_and_blank_lines(tmp_path):
     text = b'\xef\xbb\xbfwalk,step,x,y,note\r\n0,0,0,0,"two\nlines"\r\n\r\n0,1,1.5,0,b\r\n'
     walks = read_text(tmp_path, text)
     assert walks.positions.tolist() == [[0, 0], [1.5, 0]]
     assert walks.metadata["note"].to_pylist() == ["two\nlines", "b"]
 
 
-def test_failed_moves(tmp_path):
+def test_read_walks_reads_failed_moves(tmp_path):
     text = "walk,step,x,y,failed_x,failed_y\n0,0,0.5,0.5,,\n0,1,0.5,0.5,1.5,0.5\n0,2,0.5,1.5,nan,nan\n"
     failed = read_text(tmp_path, text).failed_moves
     np.testing.assert_array_equal(failed, [[np.nan, np.nan], [1.5, 0.5], [np.nan, np.nan]])
 
 
-def test_steps_may_be_nanoseconds():
+def test_walks_from_table_keeps_nanosecond_steps():
     start = 2**62
     table = pa.table({"walk": [0, 0], "step": [start, start + 1], "x": [0, 1], "y": [0, 0]})
     assert walks_from_table(table).steps.tolist() == [start, start + 1]
 
 
-def test_rows_keep_their_order_in_large_tables():
+def test_walks_from_table_keeps_row_order_in_large_tables():
     walk = np.random.default_rng(0).integers(0, 3, 10_000)
     zeros = np.zeros(len(walk))
     walks = walks_from_table(pa.table({"walk": walk, "step": np.arange(len(walk)), "x": zeros, "y": zeros}))
@@ -100,20 +100,20 @@ def test_rows_keep_their_order_in_large_tables():
 
 
 @pytest.mark.parametrize("labels", ["abba", "abab"])
-def test_the_first_bad_row_of_the_file_is_named(labels):
+def test_walks_from_table_names_the_first_bad_row(labels):
     table = pa.table({"walk": list(labels), "step": [0, 0, 0, 0], "x": [0.0] * 4, "y": [0.0] * 4})
     with pytest.raises(InputError, match="row 3, field 'step'"):
         walks_from_table(table)
 
 
 @pytest.mark.parametrize("label", [None, float("nan")])
-def test_a_walk_without_a_label(label):
+def test_walks_from_table_without_a_label_raises(label):
     table = pa.table({"walk": [0.5, label], "step": [0, 1], "x": [0.0, 1.0], "y": [0.0, 0.0]})
     with pytest.raises(InputError, match="row 2, field 'walk': expected the label of a walk"):
         walks_from_table(table)
 
 
-def test_labels_in_a_dictionary_with_words_to_spare():
+def test_walks_from_table_ignores_unused_dictionary_labels():
     labels = pa.DictionaryArray.from_arrays(pa.array([2, 1, 2, 1]), pa.array(["unused", "a", "b"]))
     table = pa.table({"walk": labels, "step": [0, 0, 1, 1], "x": [0.0, 1, 2, 3], "y": [0.0, 0, 0, 0]})
     walks = walks_from_table(table)
@@ -122,7 +122,7 @@ def test_labels_in_a_dictionary_with_words_to_spare():
 
 
 @pytest.mark.parametrize("chosen", [np.array([False, True]), np.array([1]), np.array([-1])])
-def test_select_keeps_everything_aligned(tmp_path, chosen):
+def test_select_keeps_fields_aligned(tmp_path, chosen):
     walks = read_text(tmp_path, GOOD).select(chosen)
     assert (walks.labels, walks.offsets.tolist(), walks.goals.tolist()) == (["a"], [0, 3], [[2.5, 1.5]])
     assert walks.positions[:, 0].tolist() == [0.5, 1.5, 2.5]
@@ -131,7 +131,7 @@ def test_select_keeps_everything_aligned(tmp_path, chosen):
     assert walks.failed_moves.shape == (3, 2)
 
 
-def test_select_reorders(tmp_path):
+def test_select_reorders_walks(tmp_path):
     walks = read_text(tmp_path, GOOD)
     assert walks.select(np.array([1, 0])).rows.tolist() == [2, 4, 5, 1, 3]
     assert len(walks.select(np.array([False, False]))) == 0
@@ -148,14 +148,14 @@ def changed(line, column, value):
 @pytest.mark.parametrize(
     ("value", "found"), [("abc", "'abc'"), ("1;5", "'1;5'"), ("inf", "infinity"), ("-inf", "infinity")]
 )
-def test_a_cell_that_is_no_number_is_named(tmp_path, column, value, found):
+def test_read_walks_names_a_cell_that_is_no_number(tmp_path, column, value, found):
     with pytest.raises(InputError, match=rf"walks\.csv, row 3, field '{column}': expected a .*found {found}"):
         read_text(tmp_path, changed(3, column, value))
 
 
 @pytest.mark.parametrize("column", ["x", "y", "step", "t"])
 @pytest.mark.parametrize(("value", "found"), [("", "an empty cell"), ("nan", "NaN")])
-def test_a_cell_without_a_number_is_named(tmp_path, column, value, found):
+def test_read_walks_names_a_missing_number(tmp_path, column, value, found):
     with pytest.raises(
         InputError, match=rf"walks\.csv, row 4, field '{column}': expected a finite number, found {found}"
     ):
@@ -176,7 +176,7 @@ def test_a_cell_without_a_number_is_named(tmp_path, column, value, found):
         (2, "walk", "c", "row 2, field 'walk': expected at least two positions, found one in walk 'c'"),
     ],
 )
-def test_bad_rows_are_named(tmp_path, line, column, value, message):
+def test_read_walks_names_bad_rows(tmp_path, line, column, value, message):
     with pytest.raises(InputError, match=rf"walks\.csv, {message}"):
         read_text(tmp_path, changed(line, column, value))
 
@@ -207,18 +207,18 @@ def test_bad_rows_are_named(tmp_path, line, column, value, message):
         ),
     ],
 )
-def test_bad_tables_are_named(tmp_path, text, message):
+def test_read_walks_names_bad_tables(tmp_path, text, message):
     with pytest.raises(InputError, match=rf"walks\.csv(,|:) {message}"):
         read_text(tmp_path, text)
 
 
-def test_a_parquet_file_that_is_none(tmp_path):
+def test_read_walks_of_a_bad_parquet_file_raises(tmp_path):
     for content in (b"not parquet at all", b"PAR1 broken PAR1"):
         with pytest.raises(InputError, match=r"walks\.parquet: expected a table in Parquet"):
             read_text(tmp_path, content, "walks.parquet")
 
 
-def test_a_parquet_file_cut_short(tmp_path):
+def test_read_walks_of_a_truncated_parquet_file_raises(tmp_path):
     table = pa.table({"walk": [0, 0], "step": [0, 1], "x": [0.0, 1.0], "y": [0.0, 0.0]})
     pyarrow.parquet.write_table(table, tmp_path / "walks.parquet")
     whole = (tmp_path / "walks.parquet").read_bytes()
@@ -228,14 +228,14 @@ def test_a_parquet_file_cut_short(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["walks.txt", "walks", "walks.csv.gz"])
-def test_another_ending_is_refused(tmp_path, name):
+def test_walks_with_another_ending_raise(tmp_path, name):
     with pytest.raises(InputError, match=r"expected a file whose name ends in \.csv or \.parquet"):
         read_text(tmp_path, GOOD, name)
     with pytest.raises(InputError, match=r"expected a file whose name ends in \.csv or \.parquet"):
         write_walks(tmp_path / name, read_text(tmp_path, GOOD))
 
 
-def test_absent_files_and_folders(tmp_path):
+def test_read_walks_of_missing_files_and_folders_raises(tmp_path):
     (tmp_path / "folder.csv").mkdir()
     for name in ("absent.csv", "folder.csv", "absent.parquet"):
         with pytest.raises(InputError, match=rf"{name}: cannot be read"):
@@ -243,19 +243,19 @@ def test_absent_files_and_folders(tmp_path):
 
 
 @pytest.mark.parametrize("column", [pa.array([True, False]), pa.array([[0], [1]]), pa.array([0, 1], pa.timestamp("s"))])
-def test_columns_of_another_kind_are_refused(column):
+def test_walks_from_table_of_other_types_raises(column):
     table = pa.table({"walk": [0, 0], "step": [0, 1], "x": column, "y": [0, 0]})
     with pytest.raises(InputError, match="field 'x': expected numbers, found"):
         walks_from_table(table)
 
 
-def test_partition_names_in_the_path_are_no_columns(tmp_path):
+def test_read_walks_ignores_partition_names_in_the_path(tmp_path):
     (tmp_path / "site=3").mkdir()
     write_walks(tmp_path / "site=3" / "walks.parquet", read_text(tmp_path, GOOD))
     assert "site" not in read_walks(tmp_path / "site=3" / "walks.parquet").metadata.column_names
 
 
-def test_what_csv_cannot_hold_is_an_error_and_leaves_nothing(tmp_path):
+def test_write_walks_of_lists_to_csv_raises_and_leaves_nothing(tmp_path):
     table = pa.table({"walk": [0, 0], "step": [0, 1], "x": [0, 1], "y": [0, 0], "tags": [["a"], []]})
     with pytest.raises(InputError, match=r"walks\.csv: the table cannot be written"):
         write_walks(tmp_path / "walks.csv", walks_from_table(table))
@@ -265,7 +265,7 @@ def test_what_csv_cannot_hold_is_an_error_and_leaves_nothing(tmp_path):
 
 
 @given(walk_tables(), st.sampled_from(["csv", "parquet"]))
-def test_walks_come_back(tmp_path_factory, table, ending):
+def test_write_walks_is_read_back(tmp_path_factory, table, ending):
     walks, path = walks_from_table(table), tmp_path_factory.mktemp("walks") / f"walks.{ending}"
     write_walks(path, walks)
     read = read_walks(path)

@@ -1,11 +1,11 @@
-"""Gymnasium environments that tell their transition table: as models and tasks, and episodes collected in them.
+"""Gymnasium environments with a transition table: as models and tasks, and episodes collected in them.
 
 `env.unwrapped.P[s][a]` lists (probability, next state, reward, whether the episode ends), as in `FrozenLake-v1`,
-`CliffWalking-v1` and `Taxi`. A state in which an episode ends is terminal here. What ending there pays beyond the other
-outcomes of the same action is the terminal state's final reward (over γ, for it is paid one move later); all else is
-R(s, a). Outcomes of one action that pay differently without ending enter R(s, a) by their mean. Where an episode may
-end in a state that may also be passed (of a taxi whose passenger waits at the destination), the end has a state of its
-own, behind those of the environment.
+`CliffWalking-v1` and `Taxi`. A state in which an episode ends is terminal. The terminal reward is the reward of ending
+there beyond that of the other outcomes of the same action (divided by γ, because it is received one move later); the
+rest is R(s, a). If outcomes of one action have different rewards without ending, R(s, a) has their mean. If an episode
+may either end in a state or continue there (a taxi whose passenger waits at the destination), the end gets a separate
+state, after those of the environment.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,9 +23,12 @@ from sidestep.tabular.tasks import Task, check_discount
 
 
 class Environment(NamedTuple):
-    """An environment as the library sees it: the model of its table, and its task.
+    """The model and the task of an environment.
 
-    - `ends`: the states of their own that ends have, by the environment's state.
+    Attributes:
+        model: with the probabilities of the environment's table.
+        task: with the rewards of the environment's table.
+        ends: the separate states of ends, by the environment's state.
     """
 
     model: TabularModel
@@ -34,7 +37,7 @@ class Environment(NamedTuple):
 
 
 class _Outcome(NamedTuple):
-    """What an action may lead to, as Gymnasium's tables have it."""
+    """An outcome of an action, as in Gymnasium's tables."""
 
     probability: float
     state: int
@@ -43,21 +46,31 @@ class _Outcome(NamedTuple):
 
 
 _Table = list[list[list[_Outcome]]]
-"""Outcomes by state and action; those that cannot happen are left out."""
+"""Outcomes by state and action, without those of probability 0."""
 
 
 def from_gymnasium(env: Any, discount: float = 0.99) -> Environment:
-    """The model and the task of an environment that tells its transition table.
+    """Return the model and the task of an environment with a transition table.
 
-    Raises `InputError` for an environment without one, a discount outside (0, 1], and a terminal state that pays
-    differently beside different actions.
+    Args:
+        env: a Gymnasium environment with `env.unwrapped.P`.
+        discount: γ in (0, 1].
+
+    Raises:
+        InputError: for an environment without a table, a discount outside (0, 1], and a terminal state with different
+            rewards after different actions.
+
+    Example:
+        >>> import gymnasium
+        >>> from_gymnasium(gymnasium.make("FrozenLake-v1")).model.graph.states
+        16
     """
     check_discount(discount)
-    found = getattr(env.unwrapped, "P", None)
-    if found is None:
+    rows = getattr(env.unwrapped, "P", None)
+    if rows is None:
         raise InputError("expected an environment with a transition table, `P`", source=env)
-    table = [[[_Outcome(*each) for each in found[s][a] if each[0] > 0] for a in found[s]] for s in range(len(found))]
-    ends = _with_own_ends(table)
+    table = [[[_Outcome(*each) for each in rows[s][a] if each[0] > 0] for a in rows[s]] for s in range(len(rows))]
+    ends = _separate_ends(table)
     terminal = np.zeros(len(table), dtype=bool)
     width = 1
     for row in table:
@@ -65,28 +78,28 @@ def from_gymnasium(env: Any, discount: float = 0.99) -> Environment:
             width = max(width, len(outcomes))
             terminal[[outcome.state for outcome in outcomes if outcome.ends]] = True
     successors = np.tile(np.arange(len(table))[:, None, None], (1, len(table[0]), width))
-    chances = np.zeros(successors.shape)
+    probabilities = np.zeros(successors.shape)
     for s, row in enumerate(table):
         for a, outcomes in enumerate(row):
             for k, outcome in enumerate(outcomes):
-                successors[s, a, k], chances[s, a, k] = outcome.state, outcome.probability
-    logits = jnp.log(jnp.asarray(np.where(chances > 0, chances, 1.0)))
-    model = TabularModel(graph(successors), logits, jnp.asarray(chances > 0))
+                successors[s, a, k], probabilities[s, a, k] = outcome.state, outcome.probability
+    logits = jnp.log(jnp.asarray(np.where(probabilities > 0, probabilities, 1.0)))
+    model = TabularModel(graph(successors), logits, jnp.asarray(probabilities > 0))
     return Environment(model, _task(table, terminal, discount), ends)
 
 
-def _with_own_ends(table: _Table) -> dict[int, int]:
-    """Gives ends a state of their own where they need one, in the table, and returns these by the former ones."""
+def _separate_ends(table: _Table) -> dict[int, int]:
+    """Change a table so that ends have separate states where necessary; return these by the former states."""
     outcomes = [(s, outcome) for s, row in enumerate(table) for several in row for outcome in several]
     ending = {int(outcome.state) for _, outcome in outcomes if outcome.ends}
     passed = {int(outcome.state) for s, outcome in outcomes if not outcome.ends and s not in ending}
-    own = {state: len(table) + number for number, state in enumerate(sorted(ending & passed))}
+    ends = {state: len(table) + number for number, state in enumerate(sorted(ending & passed))}
     for several in (several for row in table for several in row):
         for number, outcome in enumerate(several):
             if outcome.ends:
-                several[number] = outcome._replace(state=own.get(int(outcome.state), outcome.state))
-    table += [[[_Outcome(1.0, state, 0.0, True)]] * len(table[0]) for state in own.values()]
-    return own
+                several[number] = outcome._replace(state=ends.get(int(outcome.state), outcome.state))
+    table += [[[_Outcome(1.0, state, 0.0, True)]] * len(table[0]) for state in ends.values()]
+    return ends
 
 
 def _task(table: _Table, terminal: Bool[np.ndarray, " states"], discount: float) -> Task:
@@ -94,21 +107,21 @@ def _task(table: _Table, terminal: Bool[np.ndarray, " states"], discount: float)
     reward = np.zeros((len(table), len(table[0])))
     final = np.full(len(table), np.nan)
     for s, a, outcomes in acting:
-        going_on = [(outcome.probability, outcome.reward) for outcome in outcomes if not outcome.ends]
-        if going_on:
-            chances, paid = np.array(going_on).T
-            reward[s, a] = chances @ paid / chances.sum()
-            _pay_at_ends(final, outcomes, reward[s, a])
+        continuing = [(outcome.probability, outcome.reward) for outcome in outcomes if not outcome.ends]
+        if continuing:
+            probabilities, rewards = np.array(continuing).T
+            reward[s, a] = probabilities @ rewards / probabilities.sum()
+            _set_terminal_rewards(final, outcomes, reward[s, a])
     final[np.isnan(final)] = 0.0
     for s, a, outcomes in acting:
         if all(outcome.ends for outcome in outcomes):
             reward[s, a] = outcomes[0].reward - final[outcomes[0].state]
-            _pay_at_ends(final, outcomes, reward[s, a])
+            _set_terminal_rewards(final, outcomes, reward[s, a])
     return Task(jnp.asarray(reward), jnp.asarray(final / discount), jnp.asarray(terminal), jnp.asarray(float(discount)))
 
 
-def _pay_at_ends(final: Float[np.ndarray, " states"], outcomes: list[_Outcome], reward: float) -> None:
-    """Notes what terminal states pay beyond the reward of an action."""
+def _set_terminal_rewards(final: Float[np.ndarray, " states"], outcomes: list[_Outcome], reward: float) -> None:
+    """Set the terminal rewards of the ends of an action: their rewards beyond `reward`."""
     for outcome in outcomes:
         if outcome.ends:
             beyond, known = outcome.reward - reward, final[outcome.state]
@@ -120,22 +133,31 @@ def _pay_at_ends(final: Float[np.ndarray, " states"], outcomes: list[_Outcome], 
 
 
 def slippery(environment: Environment, logit: float = 0.0) -> TiedModel:
-    """A model of an environment in which all actions slip alike: three outcomes, the middle one meant.
+    """Return a model in which all actions slip with one probability: three outcomes, the middle one intended.
 
-    Its one parameter θ is the logit of either side; P(slip) = 2 e^θ / (1 + 2 e^θ), see `slip_of`. Raises `InputError`
-    for an environment whose actions have another number of outcomes.
+    Args:
+        environment: with three outcomes per action, such as `FrozenLake-v1`.
+        logit: θ, the one parameter of the model; P(slip) = 2 e^θ / (1 + 2 e^θ), see `slip_of`.
+
+    Raises:
+        InputError: for an environment with another number of outcomes.
+
+    Example:
+        >>> import gymnasium
+        >>> slip_of(slippery(from_gymnasium(gymnasium.make("FrozenLake-v1"))))  # doctest: +ELLIPSIS
+        0.6666...
     """
     possible = np.asarray(environment.model.possible)
     if possible.shape[-1] != 3:
         raise InputError(f"expected three outcomes an action, found {possible.shape[-1]}", field="environment")
     index = np.tile([0, FIXED, 0], (*possible.shape[:2], 1))
-    alone = possible.sum(axis=-1) == 1
-    index[alone] = np.where(possible[alone], FIXED, IMPOSSIBLE)
+    certain = possible.sum(axis=-1) == 1
+    index[certain] = np.where(possible[certain], FIXED, IMPOSSIBLE)
     return TiedModel(environment.model.graph, index, logit)
 
 
 def slip_of(model: TiedModel) -> float:
-    """P(slip) under a model from `slippery`."""
+    """Return P(slip) of a model from `slippery`; see there for an example."""
     odds = 2 * float(jnp.exp(model.parameters[0]))
     return odds / (1 + odds)
 
@@ -149,12 +171,24 @@ def collect(
     seed: int = 0,
     task: int = 0,
 ) -> list[Trajectory]:
-    """Episodes in a Gymnasium environment, as trajectories of a task.
+    """Return episodes in a Gymnasium environment as trajectories; some may be truncated by a time limit.
 
-    - `world`: what `from_gymnasium` made of it. `act`: an action for a state.
-    - `seed`: of the environment's first episode, and of what `act` draws.
+    Args:
+        env: the environment.
+        world: `from_gymnasium(env)`.
+        act: chooses an action in a state, with a random generator.
+        episodes: the number of episodes, at least 1.
+        seed: of the environment's first episode, and of the random generator.
+        task: the index of the task of the trajectories.
 
-    Episodes that end because time is up are cut there.
+    Raises:
+        InputError: for a number of episodes below 1.
+
+    Example:
+        >>> import gymnasium
+        >>> env = gymnasium.make("FrozenLake-v1")
+        >>> len(collect(env, from_gymnasium(env), lambda state, random: int(random.integers(4)), episodes=3))
+        3
     """
     check_count(episodes, 1, "episodes")
     random, trajectories = np.random.default_rng(seed), []

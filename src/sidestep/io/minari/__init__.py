@@ -1,1 +1,1 @@
-"""Minari datasets of discrete worlds and of walks, in and out; `datasets` opens and writes them."""
+"""Minari datasets of discrete worlds and of walks; `datasets` reads and writes them."""

@@ -1,8 +1,8 @@
 """Minari datasets on this machine: read episode by episode, and written whole or not at all.
 
 A dataset has an id, `NAME-vVERSION` or `NAMESPACE/NAME-vVERSION`, under which Minari keeps it in the folder that
-`MINARI_DATASETS_PATH` names (by default `~/.minari/datasets`). One that lies elsewhere is named by its path: a `Path`,
-or text that is no id, such as `./office-v0`. Nothing is ever downloaded.
+`MINARI_DATASETS_PATH` names (by default `~/.minari/datasets`). The name of a dataset elsewhere is its path: a `Path`,
+or text that is not an id, such as `./office-v0`. Nothing is ever downloaded.
 """
 
 import re
@@ -21,12 +21,16 @@ _ID = re.compile(r"(?:(?P<namespace>[-\w]+(?:/[-\w]+)*)/)?[-\w]+?(?P<version>-v\
 
 
 class Episode(NamedTuple):
-    """One episode: what was seen, and between each two sights what was done and what it paid.
+    """One episode: observations, and the actions and rewards between them.
 
-    - `observations`: an array, or by name several, one row more than there are moves.
-    - `terminated`: whether it ended in a terminal state, rather than being cut.
-    - `infos`: what else is known of each observation; `metadata`: of the whole episode.
-    - `source`: the dataset and Minari's number of the episode (the first is 0), for error messages.
+    Attributes:
+        observations: an array, or several by name, with one row more than there are moves.
+        actions: one per move.
+        rewards: one per move.
+        terminated: whether the episode ended in a terminal state; otherwise it was truncated.
+        infos: other data of each observation.
+        metadata: other data of the whole episode.
+        source: the dataset and Minari's number of the episode (the first is 0), for error messages.
     """
 
     observations: Any
@@ -39,7 +43,14 @@ class Episode(NamedTuple):
 
 
 class Dataset(NamedTuple):
-    """A dataset in memory: Gymnasium's spaces, the metadata of the whole, and its episodes, at least one."""
+    """A dataset in memory.
+
+    Attributes:
+        observation_space: a space of Gymnasium.
+        action_space: a space of Gymnasium.
+        metadata: of the whole dataset.
+        episodes: at least one.
+    """
 
     observation_space: Any
     action_space: Any
@@ -48,7 +59,7 @@ class Dataset(NamedTuple):
 
 
 def require_minari(dataset: str | Path) -> None:
-    """Raises `InputError` where the library Minari is not installed."""
+    """Raise `InputError` if the library Minari is not installed."""
     try:
         import minari  # noqa: F401
     except ImportError as error:
@@ -57,15 +68,19 @@ def require_minari(dataset: str | Path) -> None:
 
 
 def read_dataset(dataset: str | Path, check_spaces: Callable[[Any, Any], None]) -> Dataset:
-    """A dataset on this machine, by its id or its path.
+    """Return a dataset on this machine.
 
-    - `check_spaces`: refuses spaces of observations and actions, before any episode is read (images fill the memory).
+    Args:
+        dataset: its id or its path.
+        check_spaces: is called with the spaces of observations and actions before any episode is read, and raises
+            `InputError` for wrong ones (images would fill the memory).
 
-    Raises `InputError` for a dataset that is not there, broken or empty, and for an episode without a move or with
-    another number of observations than one more than its moves.
+    Raises:
+        InputError: for a dataset that does not exist, is broken or empty, and for an episode without a move or with
+            another number of observations than one more than its moves.
     """
     require_minari(dataset)
-    with _told(dataset, "read"):
+    with _input_errors(dataset, "read"):
         from minari import MinariDataset
         from minari.storage import get_dataset_path
 
@@ -79,10 +94,10 @@ def read_dataset(dataset: str | Path, check_spaces: Callable[[Any, Any], None]) 
             )
         opened = MinariDataset(data)
         check_spaces(opened.observation_space, opened.action_space)
-        found = list(opened.iterate_episodes())
+        stored = list(opened.iterate_episodes())
         metadata = list(opened.storage.get_episode_metadata(opened.episode_indices))
-        spaces, about = (opened.observation_space, opened.action_space), opened.storage.metadata
-    if not found:
+        spaces, whole = (opened.observation_space, opened.action_space), opened.storage.metadata
+    if not stored:
         raise InputError("expected at least one episode, found none", source=dataset)
     episodes = [
         Episode(
@@ -91,48 +106,48 @@ def read_dataset(dataset: str | Path, check_spaces: Callable[[Any, Any], None]) 
             each.rewards,
             bool(each.terminations[-1:].any()),
             each.infos or {},
-            known,
+            own,
             f"{dataset}, episode {each.id}",
         )
-        for each, known in zip(found, metadata, strict=True)
+        for each, own in zip(stored, metadata, strict=True)
     ]
     for episode in episodes:
         _check_lengths(episode)
-    return Dataset(*spaces, about, episodes)
+    return Dataset(*spaces, whole, episodes)
 
 
-def write_dataset(dataset: str, found: Dataset) -> None:
+def write_dataset(dataset: str, content: Dataset) -> None:
     """Write a dataset under an id, whole or not at all.
 
-    Raises `InputError` for an id that is not one or is taken, and for what Minari cannot hold.
+    Raises:
+        InputError: for an id that is malformed or exists already, and for data that Minari cannot store.
     """
     require_minari(dataset)
     parts = _ID.fullmatch(dataset)
     if parts is None or parts["version"] is None:
         raise InputError("expected an id with a version, such as office/walks-v0", source=dataset)
-    with _told(dataset, "written"):
+    with _input_errors(dataset, "written"):
         from minari.namespace import create_namespace, list_local_namespaces
         from minari.storage import get_dataset_path
 
-        write_whole_folder(get_dataset_path(dataset), lambda partial: _fill(partial / "data", dataset, found))
+        write_whole_folder(get_dataset_path(dataset), lambda partial: _fill(partial / "data", dataset, content))
         if parts["namespace"] is not None and parts["namespace"] not in list_local_namespaces():
             create_namespace(parts["namespace"])
 
 
-def _fill(data: Path, dataset: str, found: Dataset) -> None:
-    """A new dataset in a folder."""
+def _fill(data: Path, dataset: str, content: Dataset) -> None:
     from minari import __version__
     from minari.data_collector import EpisodeBuffer
     from minari.dataset.minari_storage import MinariStorage
 
-    storage = MinariStorage.new(data, found.observation_space, found.action_space)
-    storage.update_metadata({"dataset_id": dataset, "minari_version": __version__, **found.metadata})
-    storage.update_episodes([EpisodeBuffer(**_buffered(episode)) for episode in found.episodes])
-    storage.update_episode_metadata([dict(episode.metadata) for episode in found.episodes])
+    storage = MinariStorage.new(data, content.observation_space, content.action_space)
+    storage.update_metadata({"dataset_id": dataset, "minari_version": __version__, **content.metadata})
+    storage.update_episodes([EpisodeBuffer(**_buffer_fields(episode)) for episode in content.episodes])
+    storage.update_episode_metadata([dict(episode.metadata) for episode in content.episodes])
 
 
-def _buffered(episode: Episode) -> dict[str, Any]:
-    """An episode in Minari's words: it is terminated or truncated at its last move."""
+def _buffer_fields(episode: Episode) -> dict[str, Any]:
+    """Return the fields of Minari's buffer of an episode, which is terminated or truncated at its last move."""
     last = np.arange(len(episode.rewards)) == len(episode.rewards) - 1
     return {
         "observations": episode.observations,
@@ -148,20 +163,22 @@ def _check_lengths(episode: Episode) -> None:
     moves = len(episode.rewards)
     if moves == 0:
         raise InputError("expected at least one move, found none", source=episode.source, field="rewards")
-    seen = episode.observations
-    for name, values in seen.items() if isinstance(seen, Mapping) else [("observations", seen)]:
+    several = (
+        episode.observations if isinstance(episode.observations, Mapping) else {"observations": episode.observations}
+    )
+    for name, values in several.items():
         if len(values) != moves + 1:
             message = f"expected {moves + 1} observations around {moves} moves, found {len(values)}"
             raise InputError(message, source=episode.source, field=name)
 
 
 @contextmanager
-def _told(dataset: str | Path, done: Literal["read", "written"]) -> Iterator[None]:
-    """Whatever Minari, its formats and their libraries raise (assertions among it), as `InputError`."""
+def _input_errors(dataset: str | Path, purpose: Literal["read", "written"]) -> Iterator[None]:
+    """Turn all errors of Minari, its formats and their libraries (even assertions) into `InputError`."""
     try:
         yield
     except SidestepError:
         raise
     except Exception as error:
-        message = f"the dataset cannot be {done}: {type(error).__name__}: {error}"
+        message = f"the dataset cannot be {purpose}: {type(error).__name__}: {error}"
         raise InputError(message, source=dataset) from error

@@ -1,9 +1,9 @@
-"""Tasks in the metadata of a Minari dataset, whole, so that a dataset is enough to learn from.
+"""Complete tasks in the metadata of a Minari dataset, so that it suffices for learning.
 
-The dataset's metadata hold `tasks`, one entry a task: `discount`, `terminal` (a list of states), and `reward` and
-`terminal_reward`, tables whose axes may have length 1 as in `Task`. Each episode's metadata hold `goal` (the terminal
-state that pays most; several are a list), `discount`, and `task`, the number of its entry. Where a dataset has no
-`tasks`, each episode pursues its `goal` at its `discount`, as `reach` has it.
+The metadata of the dataset have `tasks`, one entry per task: `discount`, `terminal` (a list of states), and `reward`
+and `terminal_reward`, tables whose axes may have length 1 as in `Task`. The metadata of each episode have `goal` (the
+terminal state with the largest reward, or a list of several), `discount`, and `task`, the number of its entry. In a
+dataset without `tasks`, the task of each episode is to reach its `goal` at its `discount`, as in `reach`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,8 +20,8 @@ from sidestep.tabular.grid import Grid
 from sidestep.tabular.tasks import Task, check_discount, reach
 
 
-def described(tasks: Task) -> list[dict[str, Any]]:
-    """Stacked tasks as plain values, one entry a task."""
+def describe_tasks(tasks: Task) -> list[dict[str, Any]]:
+    """Return stacked tasks as plain values, one entry per task."""
     return [
         {
             "discount": float(tasks.discount[index]),
@@ -33,23 +33,28 @@ def described(tasks: Task) -> list[dict[str, Any]]:
     ]
 
 
-def goals(entry: Mapping[str, Any]) -> list[int]:
-    """The terminal states of a task that pay most; none if nothing ends it."""
+def best_terminal_states(entry: Mapping[str, Any]) -> list[int]:
+    """Return the terminal states of a task with the largest reward; none if the task has no terminal state."""
     terminal = np.asarray(entry["terminal"], dtype=np.int64)
     final = np.asarray(entry["terminal_reward"])
     paid = final[terminal] if len(final) > 1 else np.repeat(final, len(terminal))
     return terminal[paid == paid.max(initial=-np.inf)].tolist()
 
 
-def pursued(
+def tasks_of_episodes(
     dataset: Dataset, source: object, world: Grid | Graph, discount: float | None, step_cost: float | None
 ) -> tuple[list[Task], list[int]]:
-    """The tasks of a dataset, and which of them each episode pursues.
+    """Return the tasks of a dataset, and the index of each episode's task.
 
-    - `source`: the dataset, for error messages. `discount`, `step_cost`: of tasks that metadata tell by their goal.
+    Args:
+        dataset: the dataset.
+        source: its name, for error messages.
+        world: gives the numbers of states and actions.
+        discount: of tasks whose metadata have only a goal.
+        step_cost: of tasks whose metadata have only goal and discount.
 
-    Raises `InputError`, naming the episode and the field, where metadata lack a task or tell one that does not fit the
-    world.
+    Raises:
+        InputError: naming the episode and the field, if metadata have no task or one that does not fit the world.
     """
     entries = dataset.metadata.get("tasks")
     if entries is None:
@@ -63,61 +68,61 @@ def pursued(
 def _towards_goals(
     episodes: Sequence[Episode], world: Grid | Graph, discount: float | None, step_cost: float | None
 ) -> tuple[list[Task], list[int]]:
-    """One task for each different goal and discount that episodes tell."""
+    """Return one task for each different goal and discount of episodes, and the index of each episode's task."""
     number: dict[tuple[int, float], int] = {}
-    tasks, own = [], []
+    tasks, indices = [], []
     for episode in episodes:
-        known = {"discount": discount} | dict(episode.metadata)
-        wanted = _whole(known, "goal", episode.source), _number(known, "discount", episode.source)
-        if wanted not in number:
-            number[wanted] = len(tasks)
+        metadata = {"discount": discount} | dict(episode.metadata)
+        goal, own_discount = _whole(metadata, "goal", episode.source), _number(metadata, "discount", episode.source)
+        if (goal, own_discount) not in number:
+            number[goal, own_discount] = len(tasks)
             try:
-                tasks.append(reach(world, wanted[0], discount=wanted[1], step_cost=step_cost))
+                tasks.append(reach(world, goal, discount=own_discount, step_cost=step_cost))
             except InputError as error:
                 raise error.of(episode.source) from error
-        own.append(number[wanted])
-    return tasks, own
+        indices.append(number[goal, own_discount])
+    return tasks, indices
 
 
 def _entry_of(episode: Episode, entries: Sequence[Mapping[str, Any]]) -> int:
-    """Which entry an episode pursues; its goal and discount, where it tells them, must be that entry's."""
+    """Return the entry of an episode; goal and discount of its metadata, if any, must be those of the entry."""
     index = _whole(episode.metadata, "task", episode.source)
     if not 0 <= index < len(entries):
         message = f"expected a task in 0…{len(entries) - 1}, found {index}"
         raise InputError(message, source=episode.source, field="task")
     entry = entries[index]
-    for field, expected in (("goal", goals(entry)), ("discount", entry["discount"])):
-        found = episode.metadata.get(field, expected)
-        if not np.array_equal(np.atleast_1d(found), np.atleast_1d(expected)):
-            message = f"expected {expected} as in task {index}, found {found}"
+    for field, expected in (("goal", best_terminal_states(entry)), ("discount", entry["discount"])):
+        own = episode.metadata.get(field, expected)
+        if not np.array_equal(np.atleast_1d(own), np.atleast_1d(expected)):
+            message = f"expected {expected} as in task {index}, found {own}"
             raise InputError(message, source=episode.source, field=field)
     return index
 
 
 def _number(metadata: Mapping[str, Any], field: str, source: str) -> float:
-    """A number that an episode's metadata tell."""
-    found = metadata.get(field)
-    if found is None:
-        message = "the episode does not tell it, and nor did an argument: expected a number, or a task for all episodes"
+    """Return a number in the metadata of an episode."""
+    value = metadata.get(field)
+    if value is None:
+        message = "neither the episode nor an argument has it: expected a number, or a task for all episodes"
         raise InputError(message, source=source, field=field)
-    if np.ndim(found) or np.asarray(found).dtype.kind not in "iuf":
-        raise InputError(f"expected a number, found {found!r}", source=source, field=field)
-    return float(found)
+    if np.ndim(value) or np.asarray(value).dtype.kind not in "iuf":
+        raise InputError(f"expected a number, found {value!r}", source=source, field=field)
+    return float(value)
 
 
 def _whole(metadata: Mapping[str, Any], field: str, source: str) -> int:
-    """A whole number that an episode's metadata tell."""
-    found = _number(metadata, field, source)
-    if not found.is_integer():
-        raise InputError(f"expected a whole number, found {found:g}", source=source, field=field)
-    return int(found)
+    """Return a whole number in the metadata of an episode."""
+    value = _number(metadata, field, source)
+    if not value.is_integer():
+        raise InputError(f"expected a whole number, found {value:g}", source=source, field=field)
+    return int(value)
 
 
 def _task(entry: Any, world: Grid | Graph, source: str) -> Task:
-    """The task that an entry describes; raises `InputError` for one that does not fit the world."""
-    states, actions = size_of(world)
+    """Return the task of an entry; raise `InputError` for one that does not fit the world."""
+    states, actions = world_size(world)
     if not isinstance(entry, Mapping) or not {"discount", "terminal", "terminal_reward", "reward"} <= entry.keys():
-        raise InputError("expected discount, terminal, final_reward and reward", source=source)
+        raise InputError("expected discount, terminal, terminal_reward and reward", source=source)
     discount = _number(entry, "discount", source)
     try:
         check_discount(discount)
@@ -128,12 +133,14 @@ def _task(entry: Any, world: Grid | Graph, source: str) -> Task:
         raise InputError(f"expected a list of states in 0…{states - 1}", source=source, field="terminal")
     terminal = jnp.asarray(np.isin(np.arange(states), ends))
     reward = _table(entry, "reward", (states, actions), source)
-    final = _table(entry, "terminal_reward", (states,), source)
-    return Task(jnp.asarray(reward), jnp.asarray(final), terminal, jnp.asarray(discount, jnp.result_type(float)))
+    terminal_reward = _table(entry, "terminal_reward", (states,), source)
+    return Task(
+        jnp.asarray(reward), jnp.asarray(terminal_reward), terminal, jnp.asarray(discount, jnp.result_type(float))
+    )
 
 
 def _table(entry: Mapping[str, Any], field: str, shape: tuple[int, ...], source: str) -> Float[np.ndarray, "..."]:
-    """A table of finite numbers with that shape; any axis may have length 1."""
+    """Return a table of finite numbers of a shape, of which any axis may have length 1."""
     try:
         table = np.asarray(entry[field], dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -147,6 +154,6 @@ def _table(entry: Mapping[str, Any], field: str, shape: tuple[int, ...], source:
     return table
 
 
-def size_of(world: Grid | Graph) -> tuple[int, int]:
-    """How many states and actions a world has."""
+def world_size(world: Grid | Graph) -> tuple[int, int]:
+    """Return the numbers of states and actions of a world."""
     return (world.size, len(world.steps)) if isinstance(world, Grid) else (world.states, world.actions)

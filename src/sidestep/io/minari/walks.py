@@ -1,42 +1,45 @@
 """Walks as Minari datasets, in the form of point mazes, and datasets of positions as tables of walks.
 
-Observations are a `Dict` with `achieved_goal`, the positions, and `desired_goal`, the goal, the same all along. Or they
-are a `Box`, the positions; the goal then is that of the episode's metadata (`goal`), and without one the last position.
-Of positions and goals, the first two numbers are x and y in metres, and others are left out. The metadata's `walk` is a
-walk's label, by default Minari's number of the episode. `infos` that hold one number or text for every position become
-columns of that name, meaning what they mean to `sidestep.io.walks`: `step` (by default 0, 1, …), `t`, `failed_x`,
-`failed_y`, or metadata.
+Observations are a `Dict` with `achieved_goal`, the positions, and `desired_goal`, the constant goal. Or they are a
+`Box`, the positions; the goal is then that in the metadata of the episode (`goal`), or else the last position. The
+first two numbers of positions and goals are x and y in metres, and others are left out. The label of a walk is `walk`
+in the metadata, by default Minari's number of the episode. `infos` with one number or text for every position become
+columns of the same name, with the meaning that they have in `sidestep.io.walks`: `step` (by default 0, 1, …), `t`,
+`failed_x`, `failed_y`, or metadata.
 
-Walks are written so that this gives them back. An action is how far the walker tried to go from a position, in metres;
-the last one pays 1 if it arrives at the goal, and nothing else is paid.
+Walks are written in this form. An action is the intended displacement from a position, in metres; the reward of the
+last action is 1 if it reaches the goal, and all other rewards are 0.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow as pa
 from jaxtyping import Float, Shaped
 
 from sidestep.errors import InputError
 from sidestep.io.minari.datasets import Dataset, Episode, read_dataset, require_minari, write_dataset
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 _OWN = ("walk", "x", "y", "goal_x", "goal_y")
 """Columns that are not from `infos`."""
 _FAILED = ("failed_x", "failed_y")
 
 
-def read_positions(dataset: str) -> pa.Table:
-    """The walks of a local Minari dataset, by its id or its path: a table as in `sidestep.io.walks`.
+def read_positions(dataset: str) -> "pa.Table":
+    """Return the walks of a local Minari dataset, by its id or its path, as a table for `sidestep.io.walks`.
 
-    Raises `InputError` for a dataset that is not there, broken or empty, has no positions in its observations, or
-    labels two walks alike, and, naming the episode and the field, for positions and goals that are not finite or of
-    another shape, and for goals that change.
+    Raises:
+        InputError: for a dataset that does not exist, is broken or empty, has no positions in its observations, or has
+            two walks with one label, and, naming the episode and the field, for positions and goals that are not finite
+            or of another shape, and for goals that change.
     """
-    found = read_dataset(dataset, lambda observed, _: _check_space(observed, dataset))
-    tables = [
-        _table(episode, label) for episode, label in zip(found.episodes, _labels(found.episodes, dataset), strict=True)
-    ]
+    import pyarrow as pa
+
+    episodes = read_dataset(dataset, lambda observation_space, _: _check_space(observation_space, dataset)).episodes
+    tables = [_table(episode, label) for episode, label in zip(episodes, _labels(episodes, dataset), strict=True)]
     try:
         return pa.concat_tables(tables, promote_options="permissive")
     except pa.ArrowException as error:
@@ -44,11 +47,12 @@ def read_positions(dataset: str) -> pa.Table:
         raise InputError(message, source=dataset, field="infos") from error
 
 
-def write_positions(dataset: str, table: pa.Table) -> None:
-    """Write a table of walks, as `table_from_walks` makes it, as a local Minari dataset, whole or not at all.
+def write_positions(dataset: str, table: "pa.Table") -> None:
+    """Write a table of walks from `table_from_walks` as a local Minari dataset, whole or not at all.
 
-    Raises `InputError` for an id that is malformed or taken, a table without rows, and a column that is neither numbers
-    nor text, or has gaps.
+    Raises:
+        InputError: for an id that is malformed or exists already, a table without rows, and a column that is neither
+            numbers nor text, or has empty cells.
     """
     require_minari(dataset)
     if len(table) == 0:
@@ -56,18 +60,18 @@ def write_positions(dataset: str, table: pa.Table) -> None:
     from gymnasium.spaces import Box, Dict
 
     plane = Box(-np.inf, np.inf, (2,), np.float64)
-    seen = Dict({"observation": plane, "achieved_goal": plane, "desired_goal": plane})
-    write_dataset(dataset, Dataset(seen, plane, {}, list(_episodes(table, dataset))))
+    observation_space = Dict({"observation": plane, "achieved_goal": plane, "desired_goal": plane})
+    write_dataset(dataset, Dataset(observation_space, plane, {}, list(_episodes(table, dataset))))
 
 
-def _episodes(table: pa.Table, dataset: str) -> Iterator[Episode]:
-    """The episode of each walk."""
+def _episodes(table: "pa.Table", dataset: str) -> Iterator[Episode]:
+    """Yield the episode of each walk."""
     infos = {name: _info(table[name], name, dataset) for name in table.column_names if name not in _OWN}
     positions, goals = _pair(table, "x", "y"), _pair(table, "goal_x", "goal_y")
-    aims = positions
+    targets = positions
     if _FAILED[0] in infos:
         failed = np.stack([infos[name] for name in _FAILED], axis=1)
-        aims = np.where(np.isnan(failed), positions, failed)
+        targets = np.where(np.isnan(failed), positions, failed)
     labels = table["walk"].to_pylist()
     starts = [row for row in range(1, len(labels)) if labels[row] != labels[row - 1]]
     for rows in np.split(np.arange(len(labels)), starts):
@@ -77,12 +81,14 @@ def _episodes(table: pa.Table, dataset: str) -> Iterator[Episode]:
         observations = {"observation": path, "achieved_goal": path, "desired_goal": goals[rows]}
         metadata = {"walk": labels[rows[0]], "goal": goal.tolist()}
         own = {name: values[rows] for name, values in infos.items()}
-        yield Episode(observations, aims[rows[1:]] - path[:-1], rewards, arrived, own, metadata)
+        yield Episode(observations, targets[rows[1:]] - path[:-1], rewards, arrived, own, metadata)
 
 
-def _info(column: pa.ChunkedArray, name: str, dataset: str) -> Shaped[np.ndarray, " rows"]:
-    """A column as `infos` hold it."""
-    if name in _FAILED:  # Empty but where a move failed, and NaN says so.
+def _info(column: "pa.ChunkedArray", name: str, dataset: str) -> Shaped[np.ndarray, " rows"]:
+    """Return a column as an array for `infos`."""
+    import pyarrow as pa
+
+    if name in _FAILED:  # NaN except where a move failed
         return column.to_numpy()
     kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
     if pa.types.is_string(kind) or pa.types.is_large_string(kind):
@@ -93,17 +99,17 @@ def _info(column: pa.ChunkedArray, name: str, dataset: str) -> Shaped[np.ndarray
         raise InputError(f"expected numbers or text, found {kind}; leave the column out", source=dataset, field=name)
     if column.null_count:
         row = column.is_null().to_pylist().index(True) + 1
-        message = "a Minari dataset holds no empty cells; fill it, or leave the column out"
+        message = "a Minari dataset has no empty cells; fill it, or leave the column out"
         raise InputError(message, source=dataset, row=row, field=name)
     return values
 
 
-def _pair(table: pa.Table, first: str, second: str) -> Float[np.ndarray, "rows 2"]:
+def _pair(table: "pa.Table", first: str, second: str) -> Float[np.ndarray, "rows 2"]:
     return np.stack([table[first].to_numpy(), table[second].to_numpy()], axis=1)
 
 
 def _check_space(space: Any, dataset: str) -> None:
-    """Refuse observations that hold no positions."""
+    """Raise `InputError` for observations without positions."""
     from gymnasium.spaces import Box, Dict
 
     if isinstance(space, Dict) and "achieved_goal" not in space.spaces:
@@ -114,15 +120,15 @@ def _check_space(space: Any, dataset: str) -> None:
             raise InputError(f"expected a Box of at least two numbers x, y, found {each}", source=dataset, field=name)
 
 
-def _places(seen: Any) -> dict[str, Any]:
-    """The part of observations, or of their space, that holds positions, and then the part that holds goals."""
-    if not isinstance(seen, Mapping):
-        return {"observations": seen}
-    return {name: seen[name] for name in ("achieved_goal", "desired_goal") if name in seen}
+def _places(observations: Any) -> dict[str, Any]:
+    """Return the positions in observations, or in their space, and then the goals, if any."""
+    if not isinstance(observations, Mapping):
+        return {"observations": observations}
+    return {name: observations[name] for name in ("achieved_goal", "desired_goal") if name in observations}
 
 
 def _labels(episodes: Sequence[Episode], dataset: str) -> list[Any]:
-    """The label of each walk, or, unless all episodes have one, Minari's numbers of the episodes."""
+    """Return the label of each walk, or, unless all episodes have one, Minari's numbers of the episodes."""
     labels = [episode.metadata.get("walk") for episode in episodes]
     if any(label is None for label in labels):
         return list(range(len(labels)))
@@ -133,8 +139,10 @@ def _labels(episodes: Sequence[Episode], dataset: str) -> list[Any]:
     return labels
 
 
-def _table(episode: Episode, label: object) -> pa.Table:
-    """One walk, a row a position."""
+def _table(episode: Episode, label: object) -> "pa.Table":
+    """Return the table of one walk, one row per position."""
+    import pyarrow as pa
+
     rows = len(episode.rewards) + 1
     places = {
         name: _plane(values, rows, episode.source, name) for name, values in _places(episode.observations).items()
@@ -146,20 +154,20 @@ def _table(episode: Episode, label: object) -> pa.Table:
     return pa.table(columns | _columns(episode.infos, rows))
 
 
-def _goal(episode: Episode, seen: Float[np.ndarray, "rows 2"] | None) -> Float[np.ndarray, " 2"] | None:
-    """Where an episode wants to go, if it says so."""
-    if seen is not None:
-        changed = (seen != seen[0]).any(axis=1)
+def _goal(episode: Episode, goals: Float[np.ndarray, "rows 2"] | None) -> Float[np.ndarray, " 2"] | None:
+    """Return the goal of an episode, if it has one."""
+    if goals is not None:
+        changed = (goals != goals[0]).any(axis=1)
         if changed.any():
             message = f"expected one goal, found another at step {int(np.argmax(changed))}"
             raise InputError(message, source=episode.source, field="desired_goal")
-        return seen[0]
-    told = episode.metadata.get("goal")
-    return None if told is None else _plane([told], 1, episode.source, "goal")[0]
+        return goals[0]
+    goal = episode.metadata.get("goal")
+    return None if goal is None else _plane([goal], 1, episode.source, "goal")[0]
 
 
 def _plane(values: Any, rows: int, source: str, field: str) -> Float[np.ndarray, "rows 2"]:
-    """x and y, the first two numbers of each row."""
+    """Return x and y, the first two numbers of each row."""
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -176,8 +184,10 @@ def _plane(values: Any, rows: int, source: str, field: str) -> Float[np.ndarray,
     return places
 
 
-def _columns(infos: Mapping[str, Any], rows: int) -> dict[str, pa.Array]:
-    """The infos that say one thing of every position; text comes as bytes."""
+def _columns(infos: Mapping[str, Any], rows: int) -> "dict[str, pa.Array]":
+    """Return the infos with one number or text for every position; text is stored as bytes."""
+    import pyarrow as pa
+
     columns = {}
     for name, values in infos.items():
         if name in _OWN or not isinstance(values, np.ndarray) or values.shape != (rows,):
