@@ -42,33 +42,33 @@ from sidestep.continuous import (
     Critic,
     Dynamics,
     FinitePolicy,
-    Hold,
     LinearGaussian,
     ObstacleMotion,
     Pendulum,
+    PendulumTask,
     Planner,
-    Planning,
+    PlannerState,
     Policy,
     QuadraticTask,
-    RollOut,
+    Rollout,
     Schedule,
+    batch_tasks,
     finite_policy,
-    fit,
-    gather,
+    fit_dynamics,
+    gather_trajectories,
     gaussian_policy,
-    plan,
-    radial_field,
-    roll_outs,
-    stack,
+    plan_policy,
+    sample_rollouts,
+    task_at,
+    task_features,
     value_gradient,
 )
 from sidestep.continuous.estimators import Estimator
-from sidestep.continuous.tasks import task_at
-from sidestep.experiments import pendulum as pendulum_experiment
-from sidestep.experiments import room as room_experiment
+from sidestep.experiments.pendulum import PendulumConfig
+from sidestep.experiments.room import RoomConfig
 from sidestep.tabular.backups import Behavior, LogSumExp
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory
-from sidestep.worlds.continuous_room import room, starts
+from sidestep.worlds.continuous_room import random_starts, room
 
 CASES = ("room, score", "pendulum, score", "pendulum, pathwise")
 WALKERS, WIDTH = 25, 48
@@ -76,7 +76,9 @@ AGENTS, DISCOUNT = Behavior(LogSumExp(), 2.0), 0.95
 ESTIMATORS = ("score", "score and critic", "pathwise")
 PROBLEMS = ("linear, stable", "linear, unstable", "pendulum, hanging", "pendulum, upright")
 PLACES, STARTS, UNMOVED = 16, 128, 1e-30
-PLANNER = Planner(horizon=1, places=16, samples=2, options=4, learning_rate=0.02, critic_rate=0.01, critic_width=32)
+PLANNER = Planner(
+    horizon=1, batch_size=16, samples=2, candidates=4, learning_rate=0.02, critic_rate=0.01, critic_width=32
+)
 
 
 @dataclass
@@ -132,28 +134,25 @@ class Batch(eqx.Module):
 def case_of(name: str) -> Case:
     """Return the fit of that name."""
     world, estimator = name.split(", ")
-    random, kind = np.random.default_rng(0), room_experiment if world == "room" else pendulum_experiment
-    if world == "room":
-        rooms, behavior = room(), room_experiment.people()
-        known, tasks, actions, begins = rooms.dynamics, rooms.tasks, rooms.actions, starts(rooms, WALKERS, random)
-        centers = (room_experiment.CENTRES, room_experiment.CENTRES)
-        field = radial_field(known.low, known.high, centers, room_experiment.PRIOR_MEAN)
-        dynamics = ObstacleMotion(field, known.low, known.high, known.noise)
+    random, config = np.random.default_rng(0), RoomConfig() if world == "room" else PendulumConfig()
+    if isinstance(config, RoomConfig):
+        rooms = room(config.lattice_points)
+        known, tasks, actions = rooms.dynamics, rooms.tasks, rooms.actions
+        begins = random_starts(rooms, WALKERS, random)
+        dynamics = ObstacleMotion(config.radial_field(rooms), known.low, known.high, known.noise)
     else:
-        dynamics = Pendulum(noise=pendulum_experiment.NOISE)
-        behavior, goals = Behavior(LogSumExp(), pendulum_experiment.BETA), pendulum_experiment.GOALS
-        tasks = [Hold(jnp.asarray(goal), jnp.asarray(pendulum_experiment.DISCOUNT)) for goal in goals]
-        actions = jnp.asarray(pendulum_experiment.TORQUES)[:, None]
-        begins = [np.array([goal, 0.0]) + random.uniform(-1, 1, (WALKERS, 2)) for goal in goals]
+        dynamics, tasks, actions = Pendulum(noise=config.noise), config.tasks, config.actions
+        begins = [np.array([goal, 0.0]) + random.uniform(-1, 1, (WALKERS, 2)) for goal in config.goals]
     states, task = jnp.asarray(np.concatenate(begins)), jnp.repeat(jnp.arange(len(tasks)), WALKERS)
-    seen = jax.vmap(lambda task, state: task.features(state))(task_at(stack(tasks), task), states)
-    policy = finite_policy(jax.random.key(0), actions, seen, width=WIDTH)
+    features = task_features(task_at(batch_tasks(tasks), task), states)
+    policy = finite_policy(jax.random.key(0), actions, features, width=WIDTH)
     trajectories = [
         Trajectory(np.stack([state, state + random.normal(0, 0.1, 2)]), random.integers(len(actions), size=1), index)
         for state, index in zip(np.asarray(states), task.tolist(), strict=True)
     ]
     by: Estimator = "pathwise" if estimator == "pathwise" else "score"
-    return Case(dynamics, gather(trajectories, tasks), behavior, policy, kind.PLANNER, kind.SCHEDULE.moves, by)
+    demonstrations, moves = gather_trajectories(trajectories, tasks), config.schedule.batch_size
+    return Case(dynamics, demonstrations, config.behavior, policy, config.planner, moves, by)
 
 
 def speed(name: str, options: Options) -> Record:
@@ -164,7 +163,7 @@ def speed(name: str, options: Options) -> Record:
     tasks, states = task_at(demos.tasks, demos.task[drawn]), demos.states[drawn]
     note(f"{name}: compiling")
     planning, _ = _fitted(case, options.iterations)
-    choices, weights = planner.tried(key, case.policy, tasks, states)
+    choices, weights = planner.candidate_actions(key, case.policy, tasks, states)
     batch = Batch(tasks, states, demos.actions[drawn], choices, weights)
     rolled = _roll(case, batch, key)
 
@@ -194,30 +193,30 @@ def speed(name: str, options: Options) -> Record:
     }
 
 
-def _fitted(case: Case, iterations: int) -> tuple[Planning[FinitePolicy], float]:
+def _fitted(case: Case, iterations: int) -> tuple[PlannerState[FinitePolicy], float]:
     """Return what a fit knows in the end, and the median time between reports (the first comes after compiling)."""
     reported: list[float] = []
-    result = fit(
+    result = fit_dynamics(
         case.dynamics,
         case.demonstrations,
         case.behavior,
         case.policy,
         case.planner,
         estimator=case.estimator,
-        schedule=Schedule(iterations=1 + iterations, rehearsals=0, moves=case.moves),
+        schedule=Schedule(iterations=1 + iterations, policy_warmup=0, batch_size=case.moves),
         report=lambda *_: reported.append(time.perf_counter()),
     )
-    return result.planning, float(np.median(np.diff(reported)))
+    return result.planner_state, float(np.median(np.diff(reported)))
 
 
 @eqx.filter_jit
-def _roll(case: Case, batch: Batch, key: PRNGKeyArray) -> RollOut:
+def _roll(case: Case, batch: Batch, key: PRNGKeyArray) -> Rollout:
     given = (case.dynamics, case.policy, batch.tasks, case.behavior, key, batch.states)
-    return roll_outs(*given, case.planner.horizon, batch.choices, case.planner.samples)
+    return sample_rollouts(*given, case.planner.horizon, batch.choices, case.planner.samples)
 
 
 @eqx.filter_jit
-def _model_gradient(case: Case, planning: Planning[FinitePolicy], batch: Batch, key: PRNGKeyArray) -> PyTree:
+def _model_gradient(case: Case, planning: PlannerState[FinitePolicy], batch: Batch, key: PRNGKeyArray) -> PyTree:
     """Return ∇ of the actions' log-likelihood, with the roll-outs that it takes."""
     behavior, planner = case.behavior, case.planner
 
@@ -230,15 +229,15 @@ def _model_gradient(case: Case, planning: Planning[FinitePolicy], batch: Batch, 
 
 
 @eqx.filter_jit
-def _policy_step(case: Case, planning: Planning, batch: Batch, rolled: RollOut) -> PyTree:
+def _policy_step(case: Case, planning: PlannerState, batch: Batch, rolled: Rollout) -> PyTree:
     """Return the policy after a step; the compiler leaves out the critic's."""
-    return case.planner.improve(planning, batch.tasks, case.behavior, rolled, batch.weights)[0].policy
+    return case.planner.update(planning, case.behavior, rolled, batch.weights)[0].policy
 
 
 @eqx.filter_jit
-def _critic_step(case: Case, planning: Planning, batch: Batch, rolled: RollOut) -> Critic:
+def _critic_step(case: Case, planning: PlannerState, batch: Batch, rolled: Rollout) -> Critic:
     """Return the critic after a step; the compiler leaves out the policy's."""
-    return case.planner.improve(planning, batch.tasks, case.behavior, rolled, batch.weights)[0].critic
+    return case.planner.update(planning, case.behavior, rolled, batch.weights)[0].critic
 
 
 # ---------------------------------------------------------------------------------------------------- noise
@@ -289,7 +288,7 @@ def problem_of(name: str) -> Problem:
         examples = jax.vmap(task.features)(states)
         return Problem(dynamics, task, states, gaussian_policy(jax.random.key(1), 1, examples, spread=0.5, depth=0))
     angle = np.pi if place == "hanging" else 0.0
-    task = Hold(jnp.asarray(angle), discount)
+    task = PendulumTask(jnp.asarray(angle), discount)
     states = jnp.asarray(np.array([angle, 0.0]) + random.uniform(-0.4, 0.4, (STARTS, 2)))
     examples, torques = jax.vmap(task.features)(states), jnp.linspace(-2.0, 2.0, 5)[:, None]
     return Problem(Pendulum(), task, states, finite_policy(jax.random.key(1), torques, examples, width=32))
@@ -298,9 +297,9 @@ def problem_of(name: str) -> Problem:
 def planned(problem: Problem, horizon: int, steps: int, *, moving: bool = True) -> tuple[Policy, Critic]:
     """Return a policy for the problem and a critic for the policy; unless `moving`, the policy stays as it is."""
     planner = replace(PLANNER, horizon=horizon, learning_rate=PLANNER.learning_rate if moving else UNMOVED)
-    tasks, task = stack([problem.task]), jnp.zeros(STARTS, jnp.int32)
-    result = plan(problem.dynamics, tasks, AGENTS, problem.policy, problem.states, task, planner, steps=steps)
-    return result.policy, result.planning.critic
+    tasks, task = batch_tasks([problem.task]), jnp.zeros(STARTS, jnp.int32)
+    result = plan_policy(problem.dynamics, tasks, AGENTS, problem.policy, problem.states, task, planner, steps=steps)
+    return result.policy, result.planner_state.critic
 
 
 def noise(name: str, options: Options) -> Iterator[Record]:
@@ -363,7 +362,7 @@ def _estimates(
     samples: int,
 ) -> Array:
     """Return the gradient that each roll-out gives by itself: places × samples × parameters."""
-    tasks = stack([problem.task])
+    tasks = batch_tasks([problem.task])
 
     def one(state: Array, choice: Array, key: PRNGKeyArray) -> Array:
         given = (problem.dynamics, problem.policy, tasks, AGENTS, key, state[None], choice[None, None], jnp.ones_like)

@@ -1,4 +1,4 @@
-"""Dynamics: what is drawn has the density that is claimed, and each family moves as its equations say."""
+"""Dynamics: samples have the stated density, and each family follows its equations."""
 
 from functools import cache
 from typing import NamedTuple
@@ -31,7 +31,7 @@ from helpers.families import (
 from sidestep.continuous.dynamics import LinearGaussian
 from sidestep.continuous.obstacles import ObstacleMotion, RadialField, Walls, network_field, radial_field
 from sidestep.continuous.physical import Pendulum, PointMass
-from sidestep.continuous.tasks import Hold
+from sidestep.continuous.tasks import PendulumTask
 from sidestep.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("unoptimised")
@@ -45,13 +45,11 @@ gaussian = pytest.mark.parametrize("name", GAUSSIAN)
 every = pytest.mark.parametrize("name", EVERY)
 
 
-class Look(NamedTuple):
-    """What there is to see of a family at one state and action; together, so that it is compiled but once.
+class Evaluation(NamedTuple):
+    """A family at one state and action, compiled once.
 
-    - `samples`: next states. `log_probs`: of `points`.
-    - `slope`, `differences`: the gradient by all parameters of a sample's log-probability, and by differences.
-    - `surprises`: of the points, in a function that is not linear. `linear`: in one that is, of samples.
-    - `moved`: by how much a sample moves with the parameters while its key is held.
+    `log_probs` and `variates` (of a curved function) are at `points`, `linear` (variates of a linear function) at
+    `samples`. `slope` and `differences` are the gradient of a log-probability; `moved` is the change of a sample.
     """
 
     samples: np.ndarray
@@ -59,13 +57,13 @@ class Look(NamedTuple):
     log_probs: np.ndarray
     slope: np.ndarray
     differences: np.ndarray
-    surprises: np.ndarray
+    variates: np.ndarray
     linear: np.ndarray
     moved: np.ndarray
 
 
 @cache
-def look(name) -> Look:
+def evaluate(name) -> Evaluation:
     dynamics, state, action = EVERY[name]
     points = np.arange(4) if name == "table" else np.zeros((1, 1)) if name == "Laplace" else around(*EVERY[name])
     flat, to_parameters = ravel_pytree(dynamics.parameters)
@@ -75,22 +73,22 @@ def look(name) -> Look:
         return dynamics.with_parameters(to_parameters(flat))
 
     @jax.jit
-    def seen(keys, points, steps):
+    def compute(keys, points, steps):
         samples = jax.vmap(dynamics.sample, (0, None, None))(keys, state, action)
         log_probs = jax.vmap(dynamics.log_prob, (None, None, 0))(state, action, points)
         slope = jax.grad(lambda flat: at(flat).log_prob(state, action, samples[0]))(flat)
         beside = jax.vmap(lambda flat: at(flat).log_prob(state, action, samples[0]))(flat + steps)
-        surprises = jax.vmap(dynamics.surprise, (None, None, None, 0))(curved, state, action, points)
-        linear = jax.vmap(dynamics.surprise, (None, None, None, 0))(straight, state, action, samples)
+        variates = jax.vmap(dynamics.transition_control_variate, (None, None, None, 0))(curved, state, action, points)
+        linear = jax.vmap(dynamics.transition_control_variate, (None, None, None, 0))(straight, state, action, samples)
         moved = at(flat + 0.1).sample(keys[0], state, action) - samples[0]
-        return samples, log_probs, slope, beside, surprises, linear, moved
+        return samples, log_probs, slope, beside, variates, linear, moved
 
-    keys = jax.random.split(jax.random.key(0, impl="unsafe_rbg"), SAMPLES)  # random enough, and compiles in no time
-    samples, log_probs, slope, beside, *surprises, moved = seen(
+    keys = jax.random.split(jax.random.key(0, impl="unsafe_rbg"), SAMPLES)  # good enough, and compiles quickly
+    samples, log_probs, slope, beside, *variates, moved = compute(
         keys, jnp.asarray(points), jnp.concatenate([steps, -steps])
     )
     differences = (beside[: len(flat)] - beside[len(flat) :]) / 2e-5
-    return Look(*map(np.asarray, (samples, points, log_probs, slope, differences, *surprises, moved)))
+    return Evaluation(*map(np.asarray, (samples, points, log_probs, slope, differences, *variates, moved)))
 
 
 def curved(state):
@@ -114,67 +112,67 @@ def around(dynamics, state, action):
 
 
 @gaussian
-def test_densities_add_up_to_one_and_samples_have_their_moments(name):
+def test_log_prob_integrates_to_one_and_samples_have_its_moments(name):
     """Sums over a lattice as wide as the noise are exact to 1e-7 for Gaussians."""
-    found = look(name)
-    shares = np.exp(found.log_probs) * np.asarray(GAUSSIAN[name].dynamics.noise).prod()
-    assert shares.sum() == pytest.approx(1, abs=1e-7)
-    mean = shares @ found.points
-    covariance = (found.points - mean).T @ (shares[:, None] * (found.points - mean))
-    spread, away = np.sqrt(np.diag(covariance)), found.samples - mean
+    seen = evaluate(name)
+    masses = np.exp(seen.log_probs) * np.asarray(GAUSSIAN[name].dynamics.noise).prod()
+    assert masses.sum() == pytest.approx(1, abs=1e-7)
+    mean = masses @ seen.points
+    covariance = (seen.points - mean).T @ (masses[:, None] * (seen.points - mean))
+    spread, away = np.sqrt(np.diag(covariance)), seen.samples - mean
     np.testing.assert_allclose(away.mean(axis=0) / spread, 0, atol=0.03)
     np.testing.assert_allclose((away.T @ away / SAMPLES - covariance) / np.outer(spread, spread), 0, atol=0.05)
 
 
 @pytest.mark.parametrize("name", [*GAUSSIAN, "table"])
-def test_surprises_average_to_nothing_and_are_what_was_not_expected(name):
-    found = look(name)
+def test_transition_control_variate_has_mean_0_and_removes_linear_noise(name):
+    seen = evaluate(name)
     volume = 1.0 if name == "table" else np.asarray(GAUSSIAN[name].dynamics.noise).prod()
-    shares = np.exp(found.log_probs) * volume
-    assert shares @ found.surprises == pytest.approx(0, abs=1e-6)
-    assert shares @ found.surprises**2 > 1e-4
-    if EVERY[name].dynamics.reparameterised or name == "table":
-        expected = found.samples.reshape(SAMPLES, -1) @ np.arange(1, 1 + found.samples[0].size)
-        mean = shares @ (found.points.reshape(len(shares), -1) @ np.arange(1, 1 + found.samples[0].size))
-        np.testing.assert_allclose(found.linear, expected - mean, atol=1e-6)
+    masses = np.exp(seen.log_probs) * volume
+    assert masses @ seen.variates == pytest.approx(0, abs=1e-6)
+    assert masses @ seen.variates**2 > 1e-4
+    if EVERY[name].dynamics.reparameterized or name == "table":
+        expected = seen.samples.reshape(SAMPLES, -1) @ np.arange(1, 1 + seen.samples[0].size)
+        mean = masses @ (seen.points.reshape(len(masses), -1) @ np.arange(1, 1 + seen.samples[0].size))
+        np.testing.assert_allclose(seen.linear, expected - mean, atol=1e-6)
 
 
-def test_a_family_that_knows_no_better_is_never_surprised():
-    assert not look("Laplace").surprises.any()
+def test_transition_control_variate_default_is_0():
+    assert not evaluate("Laplace").variates.any()
 
 
-def test_a_table_is_drawn_as_often_as_it_says():
+def test_table_dynamics_sample_frequencies_match_probabilities():
     dynamics, state, action = TABLE
     expected = np.zeros(4)
     expected[np.asarray(dynamics.model.graph.successors[state, action])] = dynamics.model.probabilities()[state, action]
-    np.testing.assert_allclose(np.exp(look("table").log_probs), expected, atol=1e-15)
+    np.testing.assert_allclose(np.exp(evaluate("table").log_probs), expected, atol=1e-15)
     assert expected.sum() == pytest.approx(1, abs=1e-12)
-    np.testing.assert_allclose(np.bincount(look("table").samples, minlength=4) / SAMPLES, expected, atol=0.015)
+    np.testing.assert_allclose(np.bincount(evaluate("table").samples, minlength=4) / SAMPLES, expected, atol=0.015)
 
 
 @every
-def test_gradients_by_parameters_agree_with_differences(name):
-    slope = look(name).slope
-    np.testing.assert_allclose(slope, look(name).differences, rtol=1e-5, atol=1e-7)
+def test_log_prob_gradient_matches_differences(name):
+    slope = evaluate(name).slope
+    np.testing.assert_allclose(slope, evaluate(name).differences, rtol=1e-5, atol=1e-7)
     assert (np.abs(slope).max() > 1e-3) if name != "walls" else len(slope) == 0
 
 
 @every
-def test_only_one_outcome_can_be_reparameterised(name):
-    assert EVERY[name].dynamics.reparameterised == (name not in JUMPING)
+def test_reparameterized_only_with_one_outcome(name):
+    assert EVERY[name].dynamics.reparameterized == (name not in JUMPING)
 
 
 @pytest.mark.parametrize("name", sorted(GAUSSIAN.keys() - JUMPING))
-def test_with_the_key_held_samples_move_as_means_do(name):
+def test_sample_with_fixed_key_moves_as_the_mean(name):
     dynamics, state, action = GAUSSIAN[name]
     moved = dynamics.with_parameters(jax.tree.map(lambda leaf: leaf + 0.1, dynamics.parameters))
     expected = outcomes(moved, state, action).means[0] - outcomes(dynamics, state, action).means[0]
     assert np.abs(expected).max() > 1e-4
-    np.testing.assert_allclose(look(name).moved, expected, atol=1e-12)
+    np.testing.assert_allclose(evaluate(name).moved, expected, atol=1e-12)
 
 
 @every
-def test_other_parameters_same_family(name):
+def test_with_parameters_changes_only_parameters(name):
     dynamics = EVERY[name].dynamics
     before = jax.tree.map(np.asarray, dynamics.parameters)
     moved = dynamics.with_parameters(jax.tree.map(lambda leaf: leaf + 0.25, dynamics.parameters))
@@ -187,7 +185,7 @@ def test_other_parameters_same_family(name):
 # Linear dynamics
 
 
-def test_linear_dynamics_are_a_normal_distribution():
+def test_linear_gaussian_log_prob_is_normal():
     state, action, following = vector(1, -2), vector(0.5), vector(0.3, -1.1)
     mean = np.array([0.9 * 1 + 0.2 * -2, -0.1 * 1 + 0.8 * -2 + 0.5 * 0.5])
     expected = stats.norm.logpdf(following, mean, NOISE).sum()
@@ -204,11 +202,11 @@ def gymnasium_pendulum(gravity, mass, length):
 
 
 @pytest.mark.parametrize("constants", [(10.0, 1.0, 1.0), (9.81, 0.7, 1.3)])
-def test_the_pendulum_is_that_of_gymnasium(constants):
+def test_pendulum_matches_gymnasium(constants):
     random, environment = np.random.default_rng(0), gymnasium_pendulum(*constants)
     states = np.concatenate([random.uniform([-7, -8], [7, 8], (40, 2)), [[1.5, 7.99], [-1.5, -7.99]]])
     torques = random.uniform(-2, 2, (42, 1))
-    pendulum, task = Pendulum(*constants), Hold(goal=jnp.zeros(()), discount=jnp.asarray(0.9))
+    pendulum, task = Pendulum(*constants), PendulumTask(goal=jnp.zeros(()), discount=jnp.asarray(0.9))
     means = jax.jit(jax.vmap(lambda *of: pendulum.outcomes(*of).means[0]))(jnp.asarray(states), jnp.asarray(torques))
     rewards = jax.jit(jax.vmap(task.reward))(jnp.asarray(states), jnp.asarray(torques))
     for state, torque, mean, reward in zip(states, torques, means, rewards, strict=True):
@@ -218,7 +216,7 @@ def test_the_pendulum_is_that_of_gymnasium(constants):
         assert float(reward) == pytest.approx(float(expected), abs=1e-9)
 
 
-def test_torques_beyond_the_motors_are_cut_off_as_in_gymnasium():
+def test_pendulum_clips_torques_as_gymnasium():
     environment, pendulum = gymnasium_pendulum(10.0, 1.0, 1.0), Pendulum()
     for torque in (-5.0, 3.0):
         environment.state = np.array([0.3, -0.2])  # pyright: ignore[reportAttributeAccessIssue]
@@ -227,13 +225,13 @@ def test_torques_beyond_the_motors_are_cut_off_as_in_gymnasium():
         np.testing.assert_allclose(mean, environment.state, atol=1e-9)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_constants_are_told_in_their_own_units_and_learned_as_logarithms():
+def test_pendulum_constants_have_units_and_parameters_are_logarithms():
     pendulum = Pendulum(9.0, 2.0, 0.5, unknown=("mass",))
     assert [float(pendulum.constant(name)) for name in ("gravity", "mass", "length")] == [9, pytest.approx(2), 0.5]
     assert {name: float(value) for name, value in pendulum.parameters.items()} == {"mass": pytest.approx(np.log(2))}
 
 
-def test_a_point_mass_steps_as_its_equations_say():
+def test_point_mass_step_follows_its_equations():
     mass = PointMass(0.5, (0.3, -0.2), time_step=0.1)
     speed = np.array([-0.5, 1.5]) + 0.1 * (np.array([0.4 + 0.3, -1 - 0.2]) - 0.5 * np.array([-0.5, 1.5]))
     expected = np.concatenate([np.array([1, 2]) + 0.1 * speed, speed])
@@ -242,8 +240,7 @@ def test_a_point_mass_steps_as_its_equations_say():
     np.testing.assert_array_equal(log_probabilities, [0])
 
 
-def test_a_point_mass_that_is_left_alone_is_carried_along_by_the_wind():
-    """At the end v = wind/friction."""
+def test_point_mass_without_action_reaches_wind_over_friction():
     mass = PointMass(0.5, (0.3, -0.2))
     last, _ = jax.lax.scan(lambda s, _: (mass.outcomes(s, jnp.zeros(2)).means[0], None), jnp.zeros(4), length=400)
     np.testing.assert_allclose(last[2:], [0.6, -0.4], atol=1e-6)
@@ -252,7 +249,7 @@ def test_a_point_mass_that_is_left_alone_is_carried_along_by_the_wind():
 # Obstacles
 
 
-def test_obstacles_stop_moves_or_slow_them():
+def test_obstacle_motion_stops_or_slows_moves():
     """At the logit ln 3, a place is blocked with probability 3/4."""
     field = RadialField(jnp.full(2, np.log(3.0)), jnp.asarray([[0.0, 0.0], [4.0, 4.0]]), 1.0)
     stopping, slowing = (ObstacleMotion(field, LOW, HIGH, NOISE, stops=stops) for stops in (True, False))
@@ -266,8 +263,8 @@ def test_obstacles_stop_moves_or_slow_them():
 
 
 @pytest.mark.parametrize("stops", [True, False])
-def test_obstacles_count_where_a_move_aims(stops):
-    """Walls block at their border too, nobody is held for standing in one, and moves end at the room's border."""
+def test_obstacle_motion_blocks_at_the_target(stops):
+    """Walls block at their border too, moves that start in one go on, and targets are clipped to the room."""
     motion = ObstacleMotion(WALLS, LOW, HIGH, NOISE, stops=stops)
 
     def mean(place, step):
@@ -280,51 +277,49 @@ def test_obstacles_count_where_a_move_aims(stops):
     np.testing.assert_allclose(mean((3.5, 3.5), (1, -9)), [4, 0], atol=1e-4)
 
 
-def test_walls_are_boxes():
+def test_walls_logit_is_high_in_boxes():
     walls = Walls(low=jnp.asarray([[0.0, 0.0], [2.0, 2.0]]), high=jnp.asarray([[1.0, 1.0], [3.0, 3.0]]))
     places = jnp.asarray([[0.5, 0.5], [1.0, 1.0], [1.5, 1.5], [2.5, 0.5], [2.5, 2.9]])
     assert jax.vmap(walls.inside)(places).tolist() == [True, True, False, False, True]
     assert jax.vmap(walls.logit)(places).tolist() == [12, 12, -12, -12, 12]
 
 
-def test_radial_functions_are_weighted_means_of_the_logits_around():
+def test_radial_field_logit_is_weighted_mean():
     field = radial_field(LOW, HIGH, (3, 2), logit=-1.5)
-    np.testing.assert_allclose(field.centres, [[x, y] for x in (0, 2, 4) for y in (0, 4)])
-    assert float(field.logit(vector(1.3, 9), field.parameters)) == pytest.approx(-1.5)
-    narrow = RadialField(jnp.arange(6.0), field.centres, 0.1)
-    for index, centre in enumerate(narrow.centres):
-        assert float(narrow.logit(centre, narrow.parameters)) == pytest.approx(index)
-    assert float(narrow.logit(vector(0, 2), narrow.parameters)) == pytest.approx(0.5)
-    place, weights = vector(1, 1), np.exp(-np.sum((np.asarray(field.centres) - 1) ** 2, axis=1) / 2 / field.width**2)
+    np.testing.assert_allclose(field.centers, [[x, y] for x in (0, 2, 4) for y in (0, 4)])
+    assert float(field.logit(vector(1.3, 9))) == pytest.approx(-1.5)
+    narrow = RadialField(jnp.arange(6.0), field.centers, 0.1)
+    for index, center in enumerate(narrow.centers):
+        assert float(narrow.logit(center)) == pytest.approx(index)
+    assert float(narrow.logit(vector(0, 2))) == pytest.approx(0.5)
+    place, weights = vector(1, 1), np.exp(-np.sum((np.asarray(field.centers) - 1) ** 2, axis=1) / 2 / field.width**2)
     expected = np.arange(6) @ weights / weights.sum()
-    assert float(field.logit(place, jnp.arange(6.0))) == pytest.approx(expected)
+    assert float(RadialField(jnp.arange(6.0), field.centers, field.width).logit(place)) == pytest.approx(expected)
 
 
-def test_a_network_begins_near_its_logit_and_can_learn_any_place():
+def test_network_field_begins_near_its_logit_with_all_gradients():
     places = jnp.asarray(np.random.default_rng(0).uniform(0, 4, (50, 2)))
-    logits = jax.jit(jax.vmap(lambda place: NETWORK.logit(place, NETWORK.parameters)))(places)
+    logits = jax.jit(jax.vmap(NETWORK.logit))(places)
     np.testing.assert_allclose(logits, 0.5, atol=1)
-    assert (np.abs(look("network, stopping").slope) > 0).all()
+    assert (np.abs(evaluate("network, stopping").slope) > 0).all()
 
 
-def test_rooms_and_centres_are_not_learned():
-    """Gradients by anything but the parameters are nothing, so that no optimiser could move the room."""
+def test_obstacle_motion_gradient_of_room_and_centers_is_0():
     motion = radial(True)
     slopes = jax.jit(jax.grad(lambda motion: motion.log_prob(PLACE, vector(5, 5), PLACE)))(motion)
-    assert all(np.abs(leaf).max() == 0 for leaf in (slopes.low, slopes.high, slopes.field.centres))
+    assert all(np.abs(leaf).max() == 0 for leaf in (slopes.low, slopes.high, slopes.field.centers))
     assert np.abs(slopes.parameters).max() > 0
 
 
-# Families of one's own
+# New families
 
 
-def test_a_new_family_is_one_class_with_outcomes():
-    """All of the above holds for it as well; and there is one with a density, which is fitted elsewhere."""
+def test_gaussian_dynamics_subclass_with_outcomes_has_mixture_density():
     gusts = Gusts(jnp.log(vector(0.5, 0.3, 0.2)))
-    found = [float(log_prob(gusts, vector(1), vector(2), vector(x))) for x in (3.1, 4.0, 1.9)]
-    winds, shares = np.array([0, 1, -1]), np.array([0.5, 0.3, 0.2])
-    expected = stats.norm.pdf(np.array([3.1, 4.0, 1.9])[:, None], 3 + winds, 0.3) @ shares
-    np.testing.assert_allclose(np.exp(found), expected, atol=1e-12)
+    log_probs = [float(log_prob(gusts, vector(1), vector(2), vector(x))) for x in (3.1, 4.0, 1.9)]
+    winds, masses = np.array([0, 1, -1]), np.array([0.5, 0.3, 0.2])
+    expected = stats.norm.pdf(np.array([3.1, 4.0, 1.9])[:, None], 3 + winds, 0.3) @ masses
+    np.testing.assert_allclose(np.exp(log_probs), expected, atol=1e-12)
 
 
 # Refusals
@@ -336,7 +331,7 @@ def refused(make, *, match):
 
 
 @pytest.mark.parametrize("noise", [vector(0.1, 0), vector(-1, 1), vector(np.nan, 1), vector(np.inf, 1)])
-def test_noise_is_above_nothing(noise):
+def test_noise_not_above_0_is_refused(noise):
     match = "field 'noise': expected finite numbers above 0"
     refused(lambda: LinearGaussian(jnp.eye(2), jnp.eye(2), noise), match=match)
     refused(lambda: ObstacleMotion(WALLS, LOW, HIGH, noise), match=match)
@@ -346,26 +341,26 @@ def test_noise_is_above_nothing(noise):
 
 @pytest.mark.parametrize("wrong", [0.0, -1.0, np.nan, np.inf])
 @pytest.mark.parametrize("name", ["gravity", "mass", "length", "time_step"])
-def test_pendulums_refuse(name, wrong):
+def test_pendulum_constants_not_above_0_are_refused(name, wrong):
     refused(lambda: Pendulum(**{name: wrong}), match=f"field '{name}': expected a finite number above 0, found {wrong}")
 
 
-def test_unknown_constants_are_known_by_name():
-    refused(lambda: Pendulum(unknown=("colour",)), match=r"'unknown': expected some of .*'length'.*, found .*colour")
+def test_pendulum_unknown_name_is_refused():
+    refused(lambda: Pendulum(unknown=("color",)), match=r"'unknown': expected some of .*'length'.*, found .*color")
 
 
-def test_point_masses_refuse():
+def test_point_mass_bad_settings_are_refused():
     refused(lambda: PointMass(friction=0.0), match="'friction': expected a finite number above 0, found 0")
     refused(lambda: PointMass(time_step=-0.1), match="'time_step': expected a finite number above 0")
     refused(lambda: PointMass(wind=(np.nan, 0.0)), match="'parameters': expected finite numbers")
 
 
-def test_linear_dynamics_refuse_what_is_not_finite():
+def test_linear_gaussian_not_finite_is_refused():
     refused(lambda: LinearGaussian(jnp.eye(2) * jnp.inf, jnp.eye(2), NOISE), match="'parameters': expected finite")
 
 
 @pytest.mark.parametrize(("low", "high"), [((0, 0), (1, 0)), ((2, 0), (1, 1)), ((0, np.nan), (1, 1))])
-def test_rooms_have_their_corners_in_order(low, high):
+def test_corners_out_of_order_are_refused(low, high):
     low, high = vector(*low), vector(*high)
     match = "field 'low, high': expected corners in order"
     refused(lambda: ObstacleMotion(WALLS, low, high, NOISE), match=match)
@@ -374,10 +369,10 @@ def test_rooms_have_their_corners_in_order(low, high):
 
 
 @pytest.mark.parametrize("counts", [(2,), (1, 3), (2, 2, 2), (0, 2)])
-def test_radial_functions_need_two_centres_a_side(counts):
+def test_radial_field_fewer_than_two_centers_a_side_are_refused(counts):
     refused(lambda: radial_field(LOW, HIGH, counts), match="'counts': expected 2 numbers of at least 2")
 
 
-def test_obstacles_refuse_logits_that_are_not_finite():
+def test_obstacle_motion_logits_not_finite_are_refused():
     field = radial_field(LOW, HIGH, (2, 2), logit=np.nan)
     refused(lambda: ObstacleMotion(field, LOW, HIGH, NOISE), match="'parameters': expected finite numbers")

@@ -1,4 +1,4 @@
-"""Lattices: shares and interpolation, the tabular stand-in of a continuous world, and values that are known exactly."""
+"""Lattices: interpolation, the tabular approximation of a continuous world, and values in closed form."""
 
 import equinox as eqx
 import jax
@@ -11,7 +11,7 @@ from sidestep.continuous.dynamics import LinearGaussian
 from sidestep.continuous.lattice import Lattice, tabular_task
 from sidestep.continuous.obstacles import ObstacleMotion, RadialField, Walls
 from sidestep.continuous.physical import Pendulum
-from sidestep.continuous.tasks import Hold, reach
+from sidestep.continuous.tasks import PendulumTask, reach_region
 from sidestep.errors import InputError
 from sidestep.tabular import solve as solver
 from sidestep.tabular.backups import Behavior, HardMax, LogSumExp
@@ -24,19 +24,19 @@ RING = Lattice(jnp.asarray([-np.pi]), jnp.asarray([np.pi]), (8,), (True,))
 CYLINDER = Lattice(jnp.asarray([-np.pi, -8.0]), jnp.asarray([np.pi, 8.0]), (12, 9), (True, False))
 
 
-tabular = eqx.filter_jit(lattices.tabular)
+tabular_model = eqx.filter_jit(lattices.tabular_model)
 action_values = eqx.filter_jit(lattices.action_values)
 solve = eqx.filter_jit(solver.solve)
 
 
 @eqx.filter_jit
-def shared(lattice, places):
-    return jax.vmap(lattice.shares)(places)
+def weights_at(lattice, places):
+    return jax.vmap(lattice.interpolation_weights)(places)
 
 
 @eqx.filter_jit
-def interpolated(lattice, values, places):
-    return jax.vmap(lattice.interpolated, (None, 0))(values, places)
+def interpolate(lattice, values, places):
+    return jax.vmap(lattice.interpolate, (None, 0))(values, places)
 
 
 def scattered(lattice, count=200, beyond=1.0):
@@ -44,27 +44,27 @@ def scattered(lattice, count=200, beyond=1.0):
     return jnp.asarray(RANDOM.uniform(lattice.low - beyond, lattice.high + beyond, (count, len(lattice.counts))))
 
 
-# Points and shares
+# Points and weights
 
 
-def test_points_run_fastest_along_the_last_side():
+def test_points_last_side_runs_fastest():
     np.testing.assert_allclose(BOX.points(), [[x, y] for x in (-1, 0, 1, 2) for y in (2, 3, 4)])
     assert BOX.size == 12
     np.testing.assert_allclose(RING.points()[:, 0], -np.pi + np.arange(8) * np.pi / 4)
 
 
 @pytest.mark.parametrize("lattice", [BOX, RING, CYLINDER])
-def test_shares_add_up_to_one(lattice):
-    points, weights = shared(lattice, scattered(lattice))
+def test_interpolation_weights_add_up_to_one(lattice):
+    points, weights = weights_at(lattice, scattered(lattice))
     np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-12)
     assert (np.asarray(weights) >= 0).all()
     assert ((np.asarray(points) >= 0) & (np.asarray(points) < lattice.size)).all()
     values = jnp.asarray(RANDOM.normal(size=lattice.size))
-    np.testing.assert_allclose(interpolated(lattice, values, lattice.points()), values, atol=1e-12)
+    np.testing.assert_allclose(interpolate(lattice, values, lattice.points()), values, atol=1e-12)
 
 
-def test_inside_linear_functions_are_met_exactly():
-    """And so is the product of coordinates, as bilinear interpolation has it; beyond it is as at the border."""
+def test_interpolate_bilinear_function_is_exact_inside():
+    """Outside the corners, values are those at the border."""
     places = scattered(BOX)
     inside = np.clip(places, BOX.low, BOX.high)
     assert (inside != places).any(axis=1).mean() > 0.3
@@ -73,15 +73,15 @@ def test_inside_linear_functions_are_met_exactly():
         return 3 - 2 * x + 0.5 * y + x * y
 
     values = function(*BOX.points().T)
-    np.testing.assert_allclose(interpolated(BOX, values, places), function(*inside.T), atol=1e-12)
+    np.testing.assert_allclose(interpolate(BOX, values, places), function(*inside.T), atol=1e-12)
 
 
-def test_rings_close():
+def test_interpolate_periodic_side_closes():
     values = RANDOM.normal(size=8)
     angles = np.append(RANDOM.uniform(-20, 20, 200), [np.pi, -np.pi, np.nextafter(np.pi, 4), np.nextafter(-np.pi, -4)])
     expected = np.interp(angles, RING.points()[:, 0], values, period=2 * np.pi)
     np.testing.assert_allclose(
-        interpolated(RING, jnp.asarray(values), jnp.asarray(angles[:, None])), expected, atol=1e-9
+        interpolate(RING, jnp.asarray(values), jnp.asarray(angles[:, None])), expected, atol=1e-9
     )
 
 
@@ -101,8 +101,8 @@ MOVES = jnp.asarray([[1.0, 0.0], [0.0, -1.0], [-1.0, 1.0]])
     (Pendulum(), CYLINDER, jnp.asarray([[-2.0], [0.0], [2.0]])),
     (ObstacleMotion(WALL, BOX.low, BOX.high, jnp.full(2, 0.1)), BOX, MOVES / 3),
 ])  # fmt: skip
-def test_probabilities_add_up_to_one_and_keep_the_mean(dynamics, lattice, actions):
-    model = tabular(dynamics, lattice, actions)
+def test_tabular_model_probabilities_add_up_and_keep_the_mean(dynamics, lattice, actions):
+    model = tabular_model(dynamics, lattice, actions)
     transitions = np.asarray(dense(model))
     np.testing.assert_allclose(transitions.sum(axis=-1), 1, atol=1e-12)
     here = lattice.size // 2 + 1
@@ -110,19 +110,19 @@ def test_probabilities_add_up_to_one_and_keep_the_mean(dynamics, lattice, action
     np.testing.assert_allclose(transitions[here, 0] @ lattice.points(), np.exp(log_probabilities) @ means, atol=1e-12)
 
 
-def test_where_outcomes_fall_on_points_the_chain_is_exact():
+def test_tabular_model_outcomes_on_points_are_exact():
     """Moves of one step that are stopped by a field: the target or the place itself, and never outside."""
     field = RadialField(jnp.asarray([1.0, -2.0]), jnp.asarray([[-1.0, 2.0], [2.0, 4.0]]), 1.0)
     motion = ObstacleMotion(field, BOX.low, BOX.high, jnp.full(2, 0.1))
-    transitions = np.asarray(dense(tabular(motion, BOX, MOVES)))
+    transitions = np.asarray(dense(tabular_model(motion, BOX, MOVES)))
     points = np.asarray(BOX.points())
     expected = np.zeros_like(transitions)
     for state, place in enumerate(points):
         for action, move in enumerate(np.asarray(MOVES)):
             target = np.clip(place + move, BOX.low, BOX.high)
-            nearer, farther = (np.sum((target - centre) ** 2) for centre in np.asarray(field.centres))
-            share = 1 / (1 + np.exp((nearer - farther) / 2))
-            blocked = 1 / (1 + np.exp(-(1.0 * share - 2.0 * (1 - share))))
+            nearer, farther = (np.sum((target - center) ** 2) for center in np.asarray(field.centers))
+            weight = 1 / (1 + np.exp((nearer - farther) / 2))
+            blocked = 1 / (1 + np.exp(-(1.0 * weight - 2.0 * (1 - weight))))
             expected[state, action, np.flatnonzero((points == target).all(axis=1))[0]] += 1 - blocked
             expected[state, action, state] += blocked
     np.testing.assert_allclose(transitions, expected, atol=1e-12)
@@ -136,13 +136,13 @@ LINE = Lattice(jnp.zeros(1), jnp.full(1, 9.0), (10,))
 BOTH_WAYS = jnp.asarray([[-1.0], [1.0]])
 
 
-def test_a_corridor_at_a_step_cost():
+def test_solve_corridor_with_step_cost_matches_closed_form():
     """With β = 2, Z = exp βV solves Z(k) = e⁻² (Z(k − 1) + Z(k + 1)), Z(0) = 1 and, at the far end, Z(10) = Z(9).
 
     So Z(k) ∝ xᵏ + x¹⁹⁻ᵏ with x = e⁻² (1 + x²).
     """
-    task = tabular_task(reach((0.0,), 0.5, discount=1.0, step_cost=1.0), LINE, BOTH_WAYS)
-    solution = solve(tabular(WALK, LINE, BOTH_WAYS), task, Behavior(LogSumExp(), 2.0))
+    task = tabular_task(reach_region((0.0,), 0.5, discount=1.0, step_cost=1.0), LINE, BOTH_WAYS)
+    solution = solve(tabular_model(WALK, LINE, BOTH_WAYS), task, Behavior(LogSumExp(), 2.0))
     x = (1 - np.sqrt(1 - 4 * np.exp(-4))) / (2 * np.exp(-2))
     steps = np.arange(10)
     expected = np.log((x**steps + x ** (19 - steps)) / (1 + x**19)) / 2
@@ -151,20 +151,19 @@ def test_a_corridor_at_a_step_cost():
 
 
 @pytest.mark.parametrize("stride", [1.0, 0.5])
-def test_a_corridor_to_a_goal_that_pays(stride):
+def test_solve_corridor_with_goal_reward_matches_closed_form(stride):
     """Strides of a whole step are worth γᵏ; of half a step, x̄ = γ (x̄ + 1)/2 a point, for values are interpolated."""
-    goal, people = reach((0.0,), 0.25, discount=0.9), Behavior(HardMax())
+    goal, optimal = reach_region((0.0,), 0.25, discount=0.9), Behavior(HardMax())
     actions = stride * BOTH_WAYS
-    solution = solve(tabular(WALK, LINE, actions), tabular_task(goal, LINE, actions), people)
+    solution = solve(tabular_model(WALK, LINE, actions), tabular_task(goal, LINE, actions), optimal)
     rate = 0.9 if stride == 1 else 0.45 / 0.55
     np.testing.assert_allclose(solution.values, rate ** np.arange(10), atol=1e-8)
     q = jax.vmap(lambda place: action_values(WALK, LINE, goal, solution.values, place, actions))(LINE.points())
     np.testing.assert_allclose(q[1:], solution.action_values[1:], atol=1e-8)
 
 
-def test_action_values_between_points():
-    """One move ahead: the reward here, and the interpolated value there."""
-    task = Hold(goal=jnp.zeros(()), discount=jnp.asarray(0.9))
+def test_action_values_between_points_look_one_move_ahead():
+    task = PendulumTask(goal=jnp.zeros(()), discount=jnp.asarray(0.9))
     state, torques = jnp.asarray([0.3, 0.5]), jnp.asarray([[-1.0], [1.0]])
     values = 1 + 2 * CYLINDER.points()[:, 1]
     q = action_values(Pendulum(), CYLINDER, task, values, state, torques)
@@ -172,8 +171,8 @@ def test_action_values_between_points():
     np.testing.assert_allclose(q, -(0.3**2) - 0.1 * 0.5**2 - 0.001 + 0.9 * (1 + 2 * speeds), atol=1e-12)
 
 
-def test_tasks_on_points():
-    table = tabular_task(reach((0.0,), 0.5, discount=0.9), LINE, BOTH_WAYS)
+def test_tabular_task_reads_rewards_and_ends_at_points():
+    table = tabular_task(reach_region((0.0,), 0.5, discount=0.9), LINE, BOTH_WAYS)
     np.testing.assert_array_equal(table.terminal, np.arange(10) == 0)
     np.testing.assert_array_equal(table.terminal_reward, np.ones(10))
     np.testing.assert_array_equal(table.reward, np.zeros((10, 2)))
@@ -185,12 +184,12 @@ def test_tasks_on_points():
 @pytest.mark.parametrize(
     ("low", "high"), [([0, 0], [1, 0]), ([0, 2], [1, 1]), ([0, 0], [1, np.inf]), ([np.nan, 0], [1, 1])]
 )
-def test_lattices_have_their_corners_in_order(low, high):
+def test_lattice_corners_out_of_order_are_refused(low, high):
     with pytest.raises(InputError, match="field 'low, high': expected corners in order"):
         Lattice(jnp.asarray(low, float), jnp.asarray(high, float), (2, 2))
 
 
 @pytest.mark.parametrize(("counts", "periodic"), [((1, 2), None), ((2,), None), ((2, 2, 2), None), ((2, 2), (True,))])
-def test_lattices_have_two_points_a_side(counts, periodic):
+def test_lattice_fewer_than_two_points_a_side_are_refused(counts, periodic):
     with pytest.raises(InputError, match="field 'counts': expected 2 numbers of at least 2"):
         Lattice(jnp.zeros(2), jnp.ones(2), counts, periodic)

@@ -1,4 +1,4 @@
-"""Policies and critics: probabilities, advantages and entropies are what they say, and scalings are never learned."""
+"""Policies and critics: probabilities, advantages and entropies; scalings are never learned."""
 
 import equinox as eqx
 import jax
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sidestep.continuous.critic import critic
+from sidestep.continuous.critic import make_critic
 from sidestep.continuous.policies import FinitePolicy, finite_policy, gaussian_policy, table_policy
 from sidestep.errors import InputError
 
@@ -21,12 +21,12 @@ FRESH = finite_policy(KEY, ACTIONS, EXAMPLES, width=4, depth=1)
 WIDE = gaussian_policy(KEY, 2, EXAMPLES, spread=1.5, width=4, depth=1)
 
 
-def sharpened(policy):
+def with_large_weights(policy):
     """A policy whose network is no longer near 0."""
     return eqx.tree_at(lambda each: each.network.network.layers[-1].weight, policy, replace_fn=lambda old: 200 * old)
 
 
-FINITE, GAUSSIAN = sharpened(FRESH), sharpened(WIDE)
+FINITE, GAUSSIAN = with_large_weights(FRESH), with_large_weights(WIDE)
 GAUSSIAN = eqx.tree_at(lambda policy: policy.log_spread, GAUSSIAN, jnp.log(jnp.asarray([0.5, 1.2])))
 log_probs = eqx.filter_jit(lambda policy, x, choices: jax.vmap(policy.log_prob, (None, 0))(x, choices))
 drawn = eqx.filter_jit(lambda policy, keys, x: jax.vmap(policy.sample, (0, None))(keys, x))
@@ -35,12 +35,12 @@ drawn = eqx.filter_jit(lambda policy, keys, x: jax.vmap(policy.sample, (0, None)
 # Over a finite set
 
 
-def test_finite_policies_begin_uniform():
+def test_finite_policy_begins_uniform():
     np.testing.assert_allclose(jax.vmap(FRESH.log_probs)(EXAMPLES), -np.log(4), atol=0.05)
     assert np.abs(FINITE.log_probs(X) + np.log(4)).max() > 0.2
 
 
-def test_finite_policies_are_proportional_to_exp_of_their_advantages():
+def test_finite_policy_is_proportional_to_exp_of_advantages():
     log_pi = np.asarray(log_probs(FINITE, X, jnp.arange(4)))
     pi, entropy = np.exp(log_pi), float(FINITE.entropy(X))
     assert pi.sum() == pytest.approx(1, abs=1e-12)
@@ -51,13 +51,13 @@ def test_finite_policies_are_proportional_to_exp_of_their_advantages():
     np.testing.assert_allclose(log_pi, FINITE.log_probs(X), atol=1e-12)
 
 
-def test_finite_policies_draw_as_often_as_they_say():
+def test_finite_policy_sample_frequencies_match_probabilities():
     choices = drawn(FINITE, jax.random.split(KEY, 20_000), X)
     np.testing.assert_allclose(np.bincount(choices, minlength=4) / 20_000, np.exp(FINITE.log_probs(X)), atol=0.015)
     np.testing.assert_array_equal(FINITE.action(jnp.asarray(2)), ACTIONS[2])
 
 
-def test_a_table_has_a_number_for_every_feature_and_action():
+def test_table_policy_has_a_logit_for_every_feature_and_action():
     policy = table_policy(3, 2)
     weights = jnp.asarray([[1.0, 0.0], [0.0, 2.0], [0.0, 0.0]])
     policy = eqx.tree_at(lambda each: each.network.network.weight, policy, weights)
@@ -69,44 +69,44 @@ def test_a_table_has_a_number_for_every_feature_and_action():
 # Over vectors
 
 
-def test_gaussian_policies_begin_around_nothing_with_their_spread():
+def test_gaussian_policy_begins_near_0_with_its_spread():
     np.testing.assert_allclose(jax.vmap(WIDE.network)(EXAMPLES), 0, atol=0.05)
     np.testing.assert_allclose(WIDE.log_spread, np.log(1.5))
     assert np.abs(GAUSSIAN.network(X)).max() > 0.2
 
 
-def test_gaussian_policies_are_a_density_with_its_entropy():
+def test_gaussian_policy_density_integrates_to_one_and_has_its_entropy():
     """Summed over a lattice as wide as half the spread, which is exact to 1e-8 for Gaussians."""
     mean, spread = np.asarray(GAUSSIAN.network(X)), np.exp(np.asarray(GAUSSIAN.log_spread))
     steps = np.stack(np.meshgrid(*[np.arange(-7, 7, 0.5)] * 2), axis=-1).reshape(-1, 2)
     actions = mean + steps * spread
     log_pi = np.asarray(log_probs(GAUSSIAN, X, jnp.asarray(actions)))
     np.testing.assert_allclose(log_pi, stats.norm.logpdf(actions, mean, spread).sum(axis=1), atol=1e-10)
-    shares = np.exp(log_pi) * spread.prod() * 0.25
-    assert shares.sum() == pytest.approx(1, abs=1e-8)
-    assert -shares @ log_pi == pytest.approx(float(GAUSSIAN.entropy(X)), abs=1e-8)
-    assert shares @ (log_pi + float(GAUSSIAN.entropy(X))) == pytest.approx(0, abs=1e-8)
+    masses = np.exp(log_pi) * spread.prod() * 0.25
+    assert masses.sum() == pytest.approx(1, abs=1e-8)
+    assert -masses @ log_pi == pytest.approx(float(GAUSSIAN.entropy(X)), abs=1e-8)
+    assert masses @ (log_pi + float(GAUSSIAN.entropy(X))) == pytest.approx(0, abs=1e-8)
 
 
-def test_gaussian_policies_draw_around_their_mean():
+def test_gaussian_policy_samples_have_its_moments():
     choices = np.asarray(drawn(GAUSSIAN, jax.random.split(KEY, 20_000), X))
     np.testing.assert_allclose(choices.mean(axis=0), GAUSSIAN.network(X), atol=0.03)
     np.testing.assert_allclose(choices.std(axis=0), [0.5, 1.2], rtol=0.02)
     np.testing.assert_array_equal(GAUSSIAN.action(jnp.asarray(choices[0])), choices[0])
 
 
-def test_with_the_key_held_gaussian_choices_move_with_their_mean():
+def test_gaussian_policy_sample_with_fixed_key_moves_with_the_mean():
     moved = eqx.tree_at(lambda each: each.network.network.layers[-1].bias, GAUSSIAN, replace_fn=lambda old: old + 0.7)
     np.testing.assert_allclose(moved.sample(KEY, X) - GAUSSIAN.sample(KEY, X), 0.7, atol=1e-12)
-    assert GAUSSIAN.reparameterised
-    assert not FINITE.reparameterised
+    assert GAUSSIAN.reparameterized
+    assert not FINITE.reparameterized
 
 
 # What is learned
 
 
 @pytest.mark.parametrize("policy", [FINITE, GAUSSIAN])
-def test_neither_scalings_nor_actions_are_ever_learned(policy):
+def test_policy_gradient_of_scaling_and_actions_is_0(policy):
     choice = jnp.asarray(1) if isinstance(policy, FinitePolicy) else jnp.ones(2)
 
     @eqx.filter_jit
@@ -114,53 +114,53 @@ def test_neither_scalings_nor_actions_are_ever_learned(policy):
     def slopes(policy):
         return policy.log_prob(X, choice) + policy.entropy(X) + jnp.sum(policy.action(choice))
 
-    found = slopes(policy)
-    held = [found.network.centre, found.network.scale] + ([found.actions] if isinstance(policy, FinitePolicy) else [])
-    assert all(np.abs(leaf).max() == 0 for leaf in held)
-    learned = jax.tree.leaves(found.network.network)
+    slope = slopes(policy)
+    fixed = [slope.network.center, slope.network.scale] + ([slope.actions] if isinstance(policy, FinitePolicy) else [])
+    assert all(np.abs(leaf).max() == 0 for leaf in fixed)
+    learned = jax.tree.leaves(slope.network.network)
     assert all(np.abs(leaf).max() > 0 for leaf in learned)
 
 
-def test_inputs_are_scaled_by_examples():
-    """A feature that never changes is left as it is."""
-    np.testing.assert_allclose(FRESH.network.centre, EXAMPLES.mean(axis=0))
+def test_scaled_network_standardizes_by_examples():
+    """A constant feature is not scaled."""
+    np.testing.assert_allclose(FRESH.network.center, EXAMPLES.mean(axis=0))
     np.testing.assert_allclose(FRESH.network.scale, [*EXAMPLES.std(axis=0)[:2], 1])
 
 
-def test_critics_begin_at_the_mean_and_learn_their_network_only():
+def test_make_critic_begins_at_the_mean_and_learns_its_network_only():
     random, left = np.random.default_rng(1), jnp.linspace(0, 1, 30)
-    worths = jnp.asarray(random.normal(-40, 7, 30))
-    guess = critic(KEY, EXAMPLES, left, worths, width=4, depth=1)
-    np.testing.assert_allclose(jax.vmap(guess)(EXAMPLES, left), worths.mean(), atol=1)
-    np.testing.assert_allclose(guess.network.centre, [*EXAMPLES.mean(axis=0), 0.5])
-    assert float(guess.spread) == pytest.approx(float(worths.std()))
-    slopes = eqx.filter_jit(eqx.filter_grad(lambda guess: guess(X, left[3])))(guess)
-    assert [float(slope) for slope in (slopes.centre, slopes.spread)] == [0, 0]
-    assert np.abs(slopes.network.centre).max() == np.abs(slopes.network.scale).max() == 0
+    returns = jnp.asarray(random.normal(-40, 7, 30))
+    critic = make_critic(KEY, EXAMPLES, left, returns, width=4, depth=1)
+    np.testing.assert_allclose(jax.vmap(critic)(EXAMPLES, left), returns.mean(), atol=1)
+    np.testing.assert_allclose(critic.network.center, [*EXAMPLES.mean(axis=0), 0.5])
+    assert float(critic.spread) == pytest.approx(float(returns.std()))
+    slopes = eqx.filter_jit(eqx.filter_grad(lambda critic: critic(X, left[3])))(critic)
+    assert [float(slope) for slope in (slopes.center, slopes.spread)] == [0, 0]
+    assert np.abs(slopes.network.center).max() == np.abs(slopes.network.scale).max() == 0
     assert (np.abs(slopes.network.network.layers[-1].weight) > 0).all()
 
 
-def test_critics_of_what_is_always_worth_the_same():
-    assert float(critic(KEY, EXAMPLES, jnp.ones(30), jnp.full(30, 2.0), width=4, depth=1).spread) == 1
+def test_make_critic_constant_returns_have_spread_1():
+    assert float(make_critic(KEY, EXAMPLES, jnp.ones(30), jnp.full(30, 2.0), width=4, depth=1).spread) == 1
 
 
 # Refusals
 
 
 @pytest.mark.parametrize("actions", [jnp.ones((1, 2)), jnp.zeros((0, 2)), jnp.asarray([[1.0], [np.nan]])])
-def test_finite_policies_need_two_finite_actions(actions):
+def test_finite_policy_fewer_than_two_finite_actions_are_refused(actions):
     with pytest.raises(InputError, match="field 'actions': expected two or more actions of finite numbers"):
         finite_policy(KEY, actions, EXAMPLES)
 
 
 @pytest.mark.parametrize("spread", [0.0, -1.0, np.nan, np.inf])
-def test_spreads_are_above_nothing(spread):
+def test_gaussian_policy_spread_not_above_0_is_refused(spread):
     with pytest.raises(InputError, match=f"field 'spread': expected a finite number above 0, found {spread}"):
         gaussian_policy(KEY, 1, EXAMPLES, spread=spread)
 
 
 @pytest.mark.parametrize("examples", [jnp.zeros((0, 3)), EXAMPLES.at[1, 1].set(jnp.inf)])
-def test_policies_need_finite_examples(examples):
+def test_policy_without_finite_examples_is_refused(examples):
     match = "field 'examples': expected one or more rows of finite numbers"
     with pytest.raises(InputError, match=match):
         finite_policy(KEY, ACTIONS, examples)

@@ -1,4 +1,4 @@
-"""Eq. 12 by roll-outs: the policies of soft and optimal people, in a table and in a linear-quadratic world."""
+"""Eq. 12 by rollouts: the policies of soft and optimal agents, in a table and in a linear-quadratic world."""
 
 from functools import partial
 
@@ -17,16 +17,16 @@ from helpers.small_worlds import (
     TASKS,
     WHICH,
     entropies,
+    exact_policy,
     exact_values,
     linear,
-    peoples_policy,
     policy_table,
     table,
     with_logits,
 )
-from sidestep.continuous.planner import Planner, Planning, PlanProgress, check_planner, dealt
-from sidestep.continuous.planning import Plan, plan
+from sidestep.continuous.planner import Planner, PlannerState, PlanProgress, PolicyPlan, check_planner, plan_policy
 from sidestep.continuous.policies import gaussian_policy, table_policy
+from sidestep.continuous.policy_gradient import minibatches
 from sidestep.continuous.tasks import task_at
 from sidestep.errors import InputError, NotConverged
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax, LogSumExp, Mellowmax
@@ -35,48 +35,48 @@ pytestmark = pytest.mark.usefixtures("unoptimised")
 
 WORLD, BETA = table(), 1.5
 SOFT, OPTIMAL = Behavior(LogSumExp(), BETA), Behavior(HardMax(), BETA)
-PEOPLE = {
+BEHAVIORS = {
     "log-sum-exp": SOFT,
     "Boltzmann": Behavior(BoltzmannAverage(), BETA),
     "mellowmax": Behavior(Mellowmax(), BETA),
 }
-HERE = len(PLACES)  # as many places as there are, so that every step tries each of them once
-PLANNER = Planner(horizon=15, places=HERE, samples=8, learning_rate=0.02, critic_rate=0.02, critic_width=8)
+HERE = len(PLACES)  # as many as there are, so that every step tries each start once
+PLANNER = Planner(horizon=15, batch_size=HERE, samples=8, learning_rate=0.02, critic_rate=0.02, critic_width=8)
 UNIFORM = table_policy(ACTIONS, TASKS * STATES)
 
 
-def planned(behavior, policy=UNIFORM, planner=PLANNER, *, steps, **given) -> Plan:
-    return plan(WORLD.dynamics, WORLD.tasks, behavior, policy, PLACES, WHICH, planner, steps=steps, **given)
+def planned(behavior, policy=UNIFORM, planner=PLANNER, *, steps, **settings) -> PolicyPlan:
+    return plan_policy(WORLD.dynamics, WORLD.tasks, behavior, policy, PLACES, WHICH, planner, steps=steps, **settings)
 
 
 def divergence(pi, other):
-    """KL(π‖other) of every place, in nats."""
+    """KL(π‖other) of every start, in nats."""
     return (pi * (np.log(pi) - np.log(other))).sum(axis=-1)[WHICH, PLACES]
 
 
 @pytest.fixture(scope="module")
-def begun() -> Planning:
-    """Planning at its start, from the uniform policy."""
-    return PLANNER.begin(jax.random.key(0), WORLD.dynamics, UNIFORM, task_at(WORLD.tasks, WHICH), SOFT, PLACES)
+def initial() -> PlannerState:
+    """PlannerState at its start, from the uniform policy."""
+    return PLANNER.initialize(jax.random.key(0), WORLD.dynamics, UNIFORM, task_at(WORLD.tasks, WHICH), SOFT, PLACES)
 
 
 @pytest.fixture(scope="module")
 def exact():
-    """The policies of all soft people."""
-    return {name: np.asarray(peoples_policy(WORLD, behavior)) for name, behavior in PEOPLE.items()}
+    """The policies of all soft agents."""
+    return {name: np.asarray(exact_policy(WORLD, behavior)) for name, behavior in BEHAVIORS.items()}
 
 
 @pytest.fixture(scope="module")
-def found(begun):
-    """What is found for them: for the first from a uniform policy, for the others from what the first do."""
-    first = planned(SOFT, warm=begun, steps=300)
-    others = {name: planned(PEOPLE[name], warm=first.planning, steps=100) for name in list(PEOPLE)[1:]}
+def plans(initial):
+    """The plan of the first agent from a uniform policy, those of the others from the first's."""
+    first = planned(SOFT, warm_start=initial, steps=300)
+    others = {name: planned(BEHAVIORS[name], warm_start=first.planner_state, steps=100) for name in list(BEHAVIORS)[1:]}
     return {"log-sum-exp": first} | others
 
 
-@pytest.mark.parametrize("name", PEOPLE)
-def test_people_s_own_policy_is_found_and_no_other_people_s(name, found, exact):
-    pi = np.asarray(policy_table(found[name].policy))
+@pytest.mark.parametrize("name", BEHAVIORS)
+def test_plan_policy_soft_agent_converges_to_its_own_exact_policy(name, plans, exact):
+    pi = np.asarray(policy_table(plans[name].policy))
     for other, policy in exact.items():
         if other == name:
             assert divergence(pi, policy).max() < 0.01
@@ -84,21 +84,21 @@ def test_people_s_own_policy_is_found_and_no_other_people_s(name, found, exact):
             assert divergence(pi, policy).max() > 0.03
 
 
-def test_optimal_people_choose_the_best_actions(begun):
-    best = np.asarray(peoples_policy(WORLD, OPTIMAL)).argmax(axis=-1)[WHICH, PLACES]
-    pi = np.asarray(policy_table(planned(OPTIMAL, warm=begun, steps=150).policy))[WHICH, PLACES]
+def test_plan_policy_optimal_agent_chooses_the_best_actions(initial):
+    best = np.asarray(exact_policy(WORLD, OPTIMAL)).argmax(axis=-1)[WHICH, PLACES]
+    pi = np.asarray(policy_table(planned(OPTIMAL, warm_start=initial, steps=150).policy))[WHICH, PLACES]
     assert (pi.argmax(axis=-1) == best).all()
     assert pi.max(axis=-1).min() > 0.9
 
 
-def test_the_critic_comes_to_know_what_states_are_worth(found, exact, begun):
+def test_plan_policy_critic_approaches_exact_values(plans, exact, initial):
     bonus = entropies(exact["log-sum-exp"]) / BETA
     values, _ = exact_values(WORLD, WORLD.dynamics.parameters, exact["log-sum-exp"], PLANNER.horizon, bonus)
     values = np.asarray(values[WHICH, PLACES])
     places = jnp.eye(TASKS * STATES)[WHICH * STATES + PLACES]
     before, after = (
-        jax.vmap(planning.critic, (0, None))(places, jnp.ones(()))
-        for planning in (begun, found["log-sum-exp"].planning)
+        jax.vmap(state.critic, (0, None))(places, jnp.ones(()))
+        for state in (initial, plans["log-sum-exp"].planner_state)
     )
     assert np.abs(after - values).mean() < 0.25 * np.abs(before - values).mean()
 
@@ -113,34 +113,35 @@ def optimal_control(task, dynamics):
     return gain, np.sqrt(np.diag(np.linalg.inv(curvature)) / (2 * BETA))
 
 
-def test_a_gaussian_policy_becomes_that_of_maximum_entropy_control():
+@pytest.mark.slow
+def test_plan_policy_gaussian_policy_matches_maximum_entropy_control():
     dynamics, tasks, _ = linear(goals=((0.0, 0.0),))
     starts = jax.random.normal(jax.random.key(1), (256, 2))
     planner = Planner(
-        horizon=12, places=16, samples=2, options=16, critic_width=8, learning_rate=0.015, critic_rate=0.02
+        horizon=12, batch_size=16, samples=2, candidates=16, critic_width=8, learning_rate=0.015, critic_rate=0.02
     )
-    blank = gaussian_policy(jax.random.key(2), 1, starts, depth=0)
-    made = plan(dynamics, tasks, SOFT, blank, starts, jnp.zeros(256, int), planner, steps=250)
+    policy = gaussian_policy(jax.random.key(2), 1, starts, depth=0)
+    result = plan_policy(dynamics, tasks, SOFT, policy, starts, jnp.zeros(256, int), planner, steps=250)
     gain, spread = optimal_control(task_at(tasks, 0), dynamics)
-    mean, middle = made.policy.network, jnp.zeros(2)
+    mean, middle = result.policy.network, jnp.zeros(2)
     close = 0.05 * np.linalg.norm(gain)
     assert np.linalg.norm(jax.jacobian(mean)(middle) - gain) < close
     assert np.linalg.norm(mean(middle)) < close
-    np.testing.assert_allclose(jnp.exp(made.policy.log_spread), spread, rtol=0.1)
+    np.testing.assert_allclose(jnp.exp(result.policy.log_spread), spread, rtol=0.1)
 
 
-LOOK = Planner(horizon=6, places=HERE, samples=1000, critic_width=8)
+PRECISE = Planner(horizon=6, batch_size=HERE, samples=1000, critic_width=8)
 
 
-def looked(behavior, pi, begun) -> PlanProgress:
-    """The figures of a policy, by many roll-outs."""
-    planning = eqx.tree_at(lambda planning: planning.policy, begun, with_logits(jnp.log(pi)))
-    return planned(behavior, planner=LOOK, steps=1, warm=planning).history[0]
+def figures_of(behavior, pi, initial) -> PlanProgress:
+    """The figures of a policy, by many rollouts."""
+    state = eqx.tree_at(lambda state: state.policy, initial, with_logits(jnp.log(pi)))
+    return planned(behavior, planner=PRECISE, steps=1, warm_start=state).history[0]
 
 
 @partial(jax.jit, static_argnames="optimal")
-def by_programme(pi, optimal):
-    """Return, gradient, entropy and lag by dynamic programming.
+def exact_figures(pi, optimal):
+    """Return, gradient, entropy and policy gap by dynamic programming.
 
     As in eq. 12, the sum over first choices is exact; what happens after each of them counts alike.
     """
@@ -148,100 +149,103 @@ def by_programme(pi, optimal):
     def values(logits):
         moving = jax.nn.softmax(logits)
         bonus = 0.0 if optimal else entropies(moving) / BETA
-        _, q = exact_values(WORLD, WORLD.dynamics.parameters, moving, LOOK.horizon, bonus)
+        _, q = exact_values(WORLD, WORLD.dynamics.parameters, moving, PRECISE.horizon, bonus)
         at_once = (moving * jax.lax.stop_gradient(q)).sum(axis=-1) + bonus
         return (at_once + q.mean(axis=-1))[WHICH, PLACES].mean(), q[WHICH, PLACES]
 
     slope, q = jax.grad(values, has_aux=True)(jnp.log(pi))
-    earned, _ = exact_values(WORLD, WORLD.dynamics.parameters, pi, LOOK.horizon)
+    earned, _ = exact_values(WORLD, WORLD.dynamics.parameters, pi, PRECISE.horizon)
     own, aim = pi[WHICH, PLACES], jax.nn.log_softmax(BETA * q)
     gains, far = q.max(axis=-1) - (own * q).sum(axis=-1), (own * (jnp.log(own) - aim)).sum(axis=-1)
-    lag = (gains if optimal else far).mean()
+    gap = (gains if optimal else far).mean()
     entropy = entropies(pi)[WHICH, PLACES].mean()
-    return earned[WHICH, PLACES].mean(), jnp.linalg.norm(slope), entropy, lag
+    return earned[WHICH, PLACES].mean(), jnp.linalg.norm(slope), entropy, gap
 
 
 @pytest.mark.parametrize("behavior", [SOFT, OPTIMAL], ids=["log-sum-exp", "hard max"])
 @pytest.mark.parametrize("policy", [UNIFORM, WORLD.policy], ids=["uniform", "another"])
-def test_figures_are_those_of_dynamic_programming(policy, behavior, begun):
-    figures = looked(behavior, policy_table(policy), begun)
-    earned, gradient, entropy, lag = (float(part) for part in by_programme(policy_table(policy), behavior is OPTIMAL))
+def test_progress_figures_match_dynamic_programming(policy, behavior, initial):
+    pi = policy_table(policy)
+    figures = figures_of(behavior, pi, initial)
+    expected_return, gradient, entropy, gap = (
+        float(part) for part in exact_figures(policy_table(policy), behavior is OPTIMAL)
+    )
     assert figures.iteration == 0
-    assert figures.expected_return == pytest.approx(earned, abs=0.05)
+    assert figures.expected_return == pytest.approx(expected_return, abs=0.05)
     assert figures.gradient == pytest.approx(gradient, rel=0.05)
     assert figures.entropy == pytest.approx(entropy, rel=1e-9)
-    assert figures.lag == pytest.approx(lag, rel=0.1)
+    assert figures.policy_gap == pytest.approx(gap, rel=0.1)
 
 
-def test_a_policy_that_has_been_found_lags_no_more(begun, exact):
-    at_first, at_last = (looked(SOFT, pi, begun) for pi in (policy_table(UNIFORM), exact["log-sum-exp"]))
-    assert at_first.lag > 0.1
-    assert abs(at_last.lag) < 0.01
+def test_policy_gap_exact_policy_is_near_0(initial, exact):
+    at_first, at_last = (figures_of(SOFT, pi, initial) for pi in (policy_table(UNIFORM), exact["log-sum-exp"]))
+    assert at_first.policy_gap > 0.1
+    assert abs(at_last.policy_gap) < 0.01
     assert at_last.gradient < 0.15 * at_first.gradient
 
 
-def test_a_warm_start_begins_where_the_former_plan_ended(found):
-    former = found["log-sum-exp"]
-    again = planned(SOFT, warm=former.planning, steps=2)
+def test_plan_policy_warm_start_continues_the_former_plan(plans):
+    former = plans["log-sum-exp"]
+    again = planned(SOFT, warm_start=former.planner_state, steps=2)
     entropy = entropies(policy_table(former.policy))[WHICH, PLACES].mean()
     assert again.history[0].entropy == pytest.approx(float(entropy), rel=1e-9)
     for moments, each in (("policy_moments", 1), ("critic_moments", PLANNER.critic_steps)):
-        counts = [getattr(plan.planning, moments)[0].count for plan in (former, again)]
+        counts = [getattr(plan.planner_state, moments)[0].count for plan in (former, again)]
         assert counts == [300 * each, 302 * each]
     before, after = (ravel_pytree(eqx.filter(plan.policy, eqx.is_inexact_array))[0] for plan in (former, again))
     assert 0 < np.abs(after - before).max() < 3 * PLANNER.learning_rate
 
 
-def test_every_step_is_reported_and_the_same_seed_gives_the_same_steps(begun):
+def test_plan_policy_reports_every_step_and_repeats_by_seed(initial):
     seen = []
-    first = planned(SOFT, warm=begun, steps=3, report=seen.append)
+    first = planned(SOFT, warm_start=initial, steps=3, report=seen.append)
     assert tuple(seen) == first.history
     assert [figures.iteration for figures in seen] == [0, 1, 2]
-    np.testing.assert_allclose(first.lately(2)[1:], np.mean(seen[1:], axis=0)[1:], rtol=1e-12)
-    assert first.lately(2).iteration == 2
-    assert eqx.tree_equal(first.planning, planned(SOFT, warm=begun, steps=3).planning)
-    assert planned(SOFT, warm=begun, steps=3, seed=1).history[0] != first.history[0]
+    np.testing.assert_allclose(first.recent_progress(2)[1:], np.mean(seen[1:], axis=0)[1:], rtol=1e-12)
+    assert first.recent_progress(2).iteration == 2
+    assert eqx.tree_equal(first.planner_state, planned(SOFT, warm_start=initial, steps=3).planner_state)
+    assert planned(SOFT, warm_start=initial, steps=3, seed=1).history[0] != first.history[0]
 
 
-def test_critics_begin_at_the_mean_of_what_is_to_come(begun):
+def test_initialize_critic_begins_at_the_mean_return(initial):
     pi = policy_table(UNIFORM)
     values = exact_values(WORLD, WORLD.dynamics.parameters, pi, PLANNER.horizon, entropies(pi) / BETA)[0]
-    guesses = jax.vmap(begun.critic, (0, None))(jnp.eye(TASKS * STATES), jnp.ones(()))
-    assert values.min() < begun.critic.centre < values.max()
-    assert np.abs(guesses - begun.critic.centre).max() < 0.1 * begun.critic.spread
+    predictions = jax.vmap(initial.critic, (0, None))(jnp.eye(TASKS * STATES), jnp.ones(()))
+    assert values.min() < initial.critic.center < values.max()
+    assert np.abs(predictions - initial.critic.center).max() < 0.1 * initial.critic.spread
 
 
 @pytest.mark.parametrize(
     ("name", "value", "least"),
     [
         ("horizon", 0, 1),
-        ("places", 0, 1),
+        ("batch_size", 0, 1),
         ("samples", 1, 2),
-        ("options", 0, 1),
+        ("candidates", 0, 1),
         ("critic_width", 0, 1),
         ("critic_steps", 0, 1),
     ],
 )
-def test_settings_that_are_too_small_are_refused(name, value, least, begun):
+def test_check_planner_refuses_counts_that_are_too_small(name, value, least, initial):
     planner = Planner(**{"horizon": 2, name: value})
     with pytest.raises(InputError, match=f"{name}.*at least {least}, found {value}"):
         check_planner(planner)
     with pytest.raises(InputError, match=name):
-        planned(SOFT, planner=planner, steps=1, warm=begun)
+        planned(SOFT, planner=planner, steps=1, warm_start=initial)
 
 
 @pytest.mark.parametrize("name", ["learning_rate", "critic_rate"])
 @pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf")])
-def test_rates_that_are_not_above_0_are_refused(name, rate):
+def test_check_planner_refuses_rates_not_above_0(name, rate):
     with pytest.raises(InputError, match=f"{name}.*finite number above 0"):
         check_planner(Planner(horizon=2, **{name: rate}))
 
 
-def test_what_cannot_be_planned_for_is_refused():
+def test_plan_policy_refuses_bad_starts():
     world, tasks = WORLD.dynamics, WORLD.tasks
 
     def planned_from(states, which, steps=1):
-        return plan(world, tasks, SOFT, UNIFORM, states, which, PLANNER, steps=steps)
+        return plan_policy(world, tasks, SOFT, UNIFORM, states, which, PLANNER, steps=steps)
 
     with pytest.raises(InputError, match=r"steps.*at least 1"):
         planned_from(PLACES, WHICH, steps=0)
@@ -254,36 +258,37 @@ def test_what_cannot_be_planned_for_is_refused():
     with pytest.raises(InputError, match=r"states.*row 2.*has not ended"):
         planned_from(jnp.asarray([0, 4]), jnp.zeros(2, int))
     with pytest.raises(InputError, match="has not ended"):
-        PLANNER.begin(jax.random.key(0), world, UNIFORM, task_at(tasks, jnp.zeros(2, int)), SOFT, jnp.asarray([4, 4]))
+        PLANNER.initialize(
+            jax.random.key(0), world, UNIFORM, task_at(tasks, jnp.zeros(2, int)), SOFT, jnp.asarray([4, 4])
+        )
 
 
-def test_parts_of_a_deal_differ_by_places_and_hold_every_move():
-    places, options, samples, moves = 6, 2, 3, 4
-    shape = places, options, samples, moves
-    cards = np.moveaxis(np.indices(shape), 0, -1)
-    hands = np.asarray(dealt(jnp.asarray(cards), parts=4))
-    assert hands.shape == (4, 36, 4)
-    assert len(np.unique(hands.reshape(-1, 4), axis=0)) == np.prod(shape)
-    for hand in hands:
-        assert set(hand[:, 3]) == set(range(moves))
-    assert dealt(jnp.ones((1, 1, 2, 1)), parts=8).shape == (2, 1)
+def test_minibatches_hold_every_move_and_are_disjoint():
+    shape = 6, 2, 3, 4
+    entries = np.moveaxis(np.indices(shape), 0, -1)
+    batches = np.asarray(minibatches(jnp.asarray(entries), count=4))
+    assert batches.shape == (4, 36, 4)
+    assert len(np.unique(batches.reshape(-1, 4), axis=0)) == np.prod(shape)
+    for batch in batches:
+        assert set(batch[:, 3]) == set(range(4))
+    assert minibatches(jnp.ones((1, 1, 2, 1)), count=8).shape == (2, 1)
 
 
-def test_with_nothing_to_come_a_critic_stays_as_it_is():
-    planner = Planner(horizon=1, places=HERE, samples=2, critic_width=8)
-    made = planned(SOFT, planner=planner, steps=3)
-    assert made.planning.critic_moments[0].count == 0
-    assert made.planning.policy_moments[0].count == 3
+def test_fit_critic_with_horizon_1_keeps_the_critic():
+    planner = Planner(horizon=1, batch_size=HERE, samples=2, critic_width=8)
+    result = planned(SOFT, planner=planner, steps=3)
+    assert result.planner_state.critic_moments[0].count == 0
+    assert result.planner_state.policy_moments[0].count == 3
 
 
-def test_figures_that_are_not_finite_are_an_error(begun):
+def test_plan_policy_figures_not_finite_raise(initial):
     nowhere = with_logits(jnp.nan * jnp.zeros((TASKS, STATES, ACTIONS)))
-    broken = eqx.tree_at(lambda planning: planning.policy, begun, nowhere)
+    broken = eqx.tree_at(lambda state: state.policy, initial, nowhere)
     with pytest.raises(NotConverged, match="step 0"):
-        planned(SOFT, warm=broken, steps=1)
+        planned(SOFT, warm_start=broken, steps=1)
 
 
-def test_mellowmax_people_need_actions_that_can_be_counted():
+def test_plan_policy_mellowmax_over_vectors_is_refused():
     dynamics, tasks, policy = linear()
     with pytest.raises(InputError, match="mellowmax"):
-        plan(dynamics, tasks, PEOPLE["mellowmax"], policy, jnp.zeros((2, 2)), jnp.arange(2), PLANNER, steps=1)
+        plan_policy(dynamics, tasks, BEHAVIORS["mellowmax"], policy, jnp.zeros((2, 2)), jnp.arange(2), PLANNER, steps=1)

@@ -1,4 +1,4 @@
-"""The continuous experiments from the command line, with few people and few steps: what they write."""
+"""The continuous experiments with few agents and few steps: their files, and moves that are removed."""
 
 import json
 
@@ -6,52 +6,60 @@ import numpy as np
 import pytest
 
 from sidestep.cli.app import main
-from sidestep.continuous.fit import Schedule
+from sidestep.continuous.likelihood import Schedule
 from sidestep.continuous.planner import Planner
-from sidestep.experiments import pendulum, room
+from sidestep.experiments import pendulum, representations, room
+from sidestep.inference.optimizers import LBFGS
 from sidestep.tabular.demonstrations import Trajectory
-from sidestep.worlds.continuous_room import without
+from sidestep.worlds import continuous_room
+from sidestep.worlds.continuous_room import without_moves
 
 pytestmark = pytest.mark.usefixtures("unoptimised")
-PLANNER = Planner(horizon=3, places=4, samples=2, critic_width=4)
-SCHEDULE = Schedule(iterations=2, rehearsals=1, moves=4)
-KEYS = {
-    "room": {"auc", "mean_inside", "mean_outside", "transitions_only", "seconds", "converged", "message"},
-    "pendulum": {"gravity_true", "gravity_estimate", "seconds", "converged", "message"},
-    "representations": {"auc", "mean_inside", "mean_outside", "representations", "seconds"},
+QUICK = {
+    "planner": Planner(horizon=3, batch_size=4, samples=2, critic_width=4),
+    "schedule": Schedule(iterations=2, policy_warmup=1, batch_size=4),
+    "agents_per_goal": 1,
+    "width": 4,
 }
+ROOM = room.RoomConfig(**QUICK, lattice_points=21)
+PENDULUM = pendulum.PendulumConfig(**QUICK, moves=5, lattice_points=(24, 21))
+REPRESENTATIONS = representations.RepresentationsConfig(**QUICK, lattice_points=21, grid_optimizer=LBFGS(iterations=1))
 
 
-@pytest.fixture(autouse=True)
-def _quick(monkeypatch):
-    for module in (room, pendulum):
-        monkeypatch.setattr(module, "PLANNER", PLANNER)
-        monkeypatch.setattr(module, "SCHEDULE", SCHEDULE)
-        monkeypatch.setattr(module, "WALKERS", 1)
-        monkeypatch.setattr(module, "_WIDTH", 4)
-    monkeypatch.setattr(pendulum, "MOVES", 5)
-
-
-@pytest.mark.parametrize("name", ["room", "pendulum", "representations"])
-def test_an_experiment_writes_its_picture_and_its_figures(name, tmp_path, capsys):
-    assert main(["experiment", name, "--out", str(tmp_path), "--seed", "1"]) == 0
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert KEYS[name] <= set(summary)
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "run", "config", "keys"),
+    [
+        ("room", room.run, ROOM, {"auc", "mean_inside", "mean_outside", "transitions_only", "converged", "message"}),
+        ("pendulum", pendulum.run, PENDULUM, {"gravity_true", "gravity_estimate", "converged", "message"}),
+        (
+            "representations",
+            representations.run,
+            REPRESENTATIONS,
+            {"auc", "mean_inside", "mean_outside", "representations"},
+        ),
+    ],
+)
+def test_run_writes_picture_and_summary(name, run, config, keys, tmp_path):
+    reports = []
+    summary = run(tmp_path, 1, reports.append, config)
+    assert json.loads((tmp_path / "summary.json").read_text()) == summary
     assert summary["command"] == f"experiment {name}"
+    assert keys | {"seconds"} <= set(summary)
     assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-    assert "seconds" in capsys.readouterr().out
+    assert reports
 
 
-def test_an_experiment_that_does_not_exist_is_wrong_usage(capsys):
+def test_experiment_command_unknown_name_is_wrong_usage(capsys):
     assert main(["experiment", "kitchen"]) == 2
     assert "kitchen" in capsys.readouterr().err
 
 
-def test_moves_into_the_wall_are_taken_out():
-    world = room.room()  # pyright: ignore
-    demonstrations, _ = room.demonstrated(world, seed=3)
-    aims = demonstrations.states + world.actions[demonstrations.actions]
-    assert not world.inside(aims.__array__()).any()
+def test_demonstrations_never_aim_at_the_wall():
+    world = continuous_room.room()
+    demonstrations, _ = ROOM.demonstrations(world, seed=3)
+    targets = demonstrations.states + world.actions[demonstrations.actions]
+    assert not world.inside(np.asarray(targets)).any()
 
 
 @pytest.mark.parametrize(
@@ -64,9 +72,9 @@ def test_moves_into_the_wall_are_taken_out():
         ("xxxxxx", []),
     ],
 )
-def test_what_is_left_of_a_walk_are_the_pieces_between(hits, pieces):
+def test_without_moves_returns_the_pieces_between(hits, pieces):
     walk = Trajectory(np.arange(7)[:, None], np.arange(10, 16), 3)
-    left = without(np.array([hit == "x" for hit in hits]), walk)
+    left = without_moves(walk, np.array([hit == "x" for hit in hits]))
     assert [each.states.ravel().tolist() for each in left] == [list(piece) for piece in pieces]
     assert [each.actions.tolist() for each in left] == [[10 + state for state in piece[:-1]] for piece in pieces]
     assert all(each.task == 3 for each in left)

@@ -1,4 +1,4 @@
-"""Dynamics of every kind for the tests, and two that are written here, as anybody might."""
+"""Dynamics of every kind for the tests; some are defined here, as a user would."""
 
 from typing import Any, NamedTuple
 
@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sidestep.continuous.dynamics import Dynamics, GaussianDynamics, LinearGaussian, Outcomes, TableDynamics, certain
+from sidestep.continuous.dynamics import Dynamics, GaussianDynamics, LinearGaussian, Outcomes, TableDynamics
 from sidestep.continuous.obstacles import ObstacleMotion, Walls, network_field, radial_field
 from sidestep.continuous.physical import Pendulum, PointMass
 from sidestep.tabular.graph import graph
@@ -21,7 +21,7 @@ class Drift(GaussianDynamics):
     noise: jax.Array
 
     def outcomes(self, state, action):
-        return certain(state + action + self.parameters)
+        return Outcomes.single(state + action + self.parameters)
 
 
 class LaplaceDrift(Dynamics):
@@ -30,7 +30,7 @@ class LaplaceDrift(Dynamics):
     parameters: jax.Array
 
     @property
-    def reparameterised(self):
+    def reparameterized(self):
         return True
 
     def sample(self, key, state, action):
@@ -41,7 +41,7 @@ class LaplaceDrift(Dynamics):
 
 
 class Gusts(GaussianDynamics):
-    """A move on a line that succeeds, is blown one further or one back; the parameters are the logits of the three."""
+    """A move on a line that succeeds, goes one further or one back; the parameters are the logits of the three."""
 
     parameters: jax.Array
     noise: jax.Array = eqx.field(default_factory=lambda: jnp.full(1, 0.3))
@@ -52,7 +52,7 @@ class Gusts(GaussianDynamics):
 
 
 class Example(NamedTuple):
-    """Dynamics, and a state and an action at which to look at them."""
+    """Dynamics, and a state and an action to evaluate them at."""
 
     dynamics: Any
     state: jax.Array

@@ -1,4 +1,4 @@
-"""Small worlds for the tests of the continuous half, with their exact answers by plain dense sums."""
+"""Small worlds for the tests of continuous worlds, with exact answers by plain dense sums."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sidestep.continuous.dynamics import LinearGaussian, TableDynamics
-from sidestep.continuous.policies import FinitePolicy, GaussianPolicy, Policy, Scaled, table_policy
+from sidestep.continuous.policies import FinitePolicy, GaussianPolicy, Policy, ScaledNetwork, table_policy
 from sidestep.continuous.tasks import QuadraticTask, TableTask, table_tasks
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.graph import graph
@@ -18,11 +18,11 @@ from sidestep.tabular.tasks import Task
 
 TASKS, STATES, ACTIONS = 2, 5, 3
 ENDS = jnp.eye(TASKS, STATES, dtype=bool)[:, ::-1].at[1].set(jnp.arange(STATES) == 0)
-WHICH, PLACES = jnp.nonzero(~ENDS)  # every task and state in which one acts
+WHICH, PLACES = jnp.nonzero(~ENDS)  # every task and state that is not terminal
 
 
 class Table(NamedTuple):
-    """A small discrete world with two tasks, seen as a continuous one; its policy is neither uniform nor good."""
+    """A small discrete world with two tasks as a continuous one; its policy is neither uniform nor optimal."""
 
     dynamics: TableDynamics
     tasks: TableTask
@@ -30,7 +30,7 @@ class Table(NamedTuple):
 
 
 def table(seed=3) -> Table:
-    """Five states in which three actions lead to the next, the one after, or nowhere; each task ends in one of them."""
+    """Five states in which three actions lead to the next, the one after, or the same; each task ends in one."""
     random = np.random.default_rng(seed)
     successors = (np.arange(STATES)[:, None, None] + np.arange(3) + np.zeros((1, ACTIONS, 1), int)) % STATES
     model = TabularModel(graph(successors), jnp.asarray(1.5 * random.normal(size=successors.shape)))
@@ -53,8 +53,8 @@ def policy_table(policy: FinitePolicy):
     return jnp.exp(log_probs).reshape(TASKS, STATES, ACTIONS)
 
 
-def peoples_policy(world: Table, behavior: Behavior):
-    """π[task, state, action] of people who know the world, by the tabular half."""
+def exact_policy(world: Table, behavior: Behavior):
+    """π[task, state, action] of agents that know the world, by value iteration."""
     tasks = [jax.tree.map(lambda leaf, index=index: leaf[index], world.tasks.task) for index in range(TASKS)]
     return jnp.stack([plan(world.dynamics.model, task, behavior).policy for task in tasks])
 
@@ -66,7 +66,7 @@ def entropies(pi):
 
 @eqx.filter_jit
 def exact_values(world: Table, parameters, pi, horizon, bonus: jax.Array | float = 0.0):
-    """V[task, state] and Q[task, state, action] of a fixed policy that looks so far; acting adds `bonus` to V."""
+    """V[task, state] and Q[task, state, action] of a fixed policy up to a horizon; acting adds `bonus` to V."""
     model, tasks = world.dynamics.model.with_parameters(parameters), world.tasks.task
     states, actions = np.arange(STATES)[:, None, None], np.arange(ACTIONS)[:, None]
     transitions = jnp.zeros((STATES, ACTIONS, STATES))
@@ -83,7 +83,7 @@ GAIN, OFFSET, SPREAD = jnp.asarray([[-0.4, -0.6]]), jnp.asarray([0.1]), 0.3
 
 
 class Linear(NamedTuple):
-    """A linear-Gaussian world of two components and one input, with two tasks; its policy is linear, not the best."""
+    """A linear-Gaussian world of two components and one input, with two tasks; its policy is linear, not optimal."""
 
     dynamics: LinearGaussian
     tasks: QuadraticTask
@@ -97,5 +97,5 @@ def linear(goals=((0.5, -0.2), (-0.3, 0.4))) -> Linear:
     tasks = QuadraticTask(*(jnp.asarray(part) for part in (goals, *costs, [0.8, 0.9][: len(goals)])))
     blank = eqx.nn.Linear(2, 1, key=jax.random.key(0))
     mean = eqx.tree_at(lambda layer: (layer.weight, layer.bias), blank, (GAIN, OFFSET))
-    policy = GaussianPolicy(Scaled(mean, jnp.zeros(2), jnp.ones(2)), jnp.log(jnp.asarray([SPREAD])))
+    policy = GaussianPolicy(ScaledNetwork(mean, jnp.zeros(2), jnp.ones(2)), jnp.log(jnp.asarray([SPREAD])))
     return Linear(dynamics, tasks, policy)

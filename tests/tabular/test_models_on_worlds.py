@@ -18,7 +18,7 @@ from sidestep.tabular.simulation import simulate
 from sidestep.tabular.solve import solve
 from sidestep.tabular.tasks import Task, reach
 from sidestep.worlds.farm import Farm
-from sidestep.worlds.gravity import DIRECTIONS, Gravity, rule_of
+from sidestep.worlds.gravity import DIRECTIONS, Gravity, most_probable_rule
 from sidestep.worlds.rooms import three_rooms, two_rooms
 
 UP, DOWN, LEFT, RIGHT = range(4)
@@ -56,7 +56,7 @@ FALLING = Gravity(COLOURS)
 
 
 def test_nobody_moves_against_gravity_and_colours_turn_it():
-    model = FALLING.ruled(RULE)
+    model = FALLING.known_model(RULE)
     middle = 4 * 12
     for gravity, against in zip(range(4), (DOWN, UP, RIGHT, LEFT), strict=True):
         for action, target in zip(range(4), (7, 17, 11, 13), strict=True):
@@ -72,13 +72,13 @@ def test_nobody_moves_against_gravity_and_colours_turn_it():
 def test_before_anything_is_known_every_direction_is_as_probable():
     chances = FALLING.model().probabilities()[4 * 5 + DOWN, RIGHT]
     np.testing.assert_allclose(chances, 0.25)
-    with pytest.raises(InputError, match="colours"):
+    with pytest.raises(InputError, match="colors"):
         Gravity(np.zeros((2, 2), int)).model()
 
 
-def test_the_rule_of_gravity_is_found_from_ten_demonstrations_a_goal():
+def test_the_most_probable_rule_gravity_is_found_from_ten_demonstrations_a_goal():
     """Of optimal people, who choose their colours by where these let them go."""
-    world, random = FALLING.ruled(RULE), np.random.default_rng(1)
+    world, random = FALLING.known_model(RULE), np.random.default_rng(1)
     goals = [0, 4, 20, 24]
     tasks = [anywhere(world.graph, 4 * goal + np.arange(4)) for goal in goals]
     # in some corners one falls for ever
@@ -89,7 +89,7 @@ def test_the_rule_of_gravity_is_found_from_ten_demonstrations_a_goal():
     demos = gather(simulate(jax.random.key(0), world, tasks, starts), tasks)
     found = fit(FALLING.model(), demos, Behavior(BoltzmannAverage(), 10.0), prior=Normal(0.0, 2.0))
     assert found.converged
-    assert rule_of(found.model).tolist() == RULE.tolist()
+    assert most_probable_rule(found.model).tolist() == RULE.tolist()
 
 
 # The farm
@@ -102,7 +102,7 @@ FARM = Farm(TERRAIN, MACHINE)
 
 
 def test_terrain_stops_the_wrong_machine_and_machines_are_swapped():
-    model = FARM.ruled(ENTERS)
+    model = FARM.known_model(ENTERS)
     beside_first, beside_second = 3 * 1, 3 * 16
     assert surely(model, beside_first + 0, RIGHT) == 3 * 2 + 0
     assert surely(model, beside_first + 1, RIGHT) == beside_first + 1
@@ -118,7 +118,7 @@ def test_terrain_stops_the_wrong_machine_and_machines_are_swapped():
 @pytest.mark.parametrize("terms", [("actions",), ("actions", "transitions")])
 def test_what_machines_can_enter_is_found_from_ten_demonstrations_a_goal(terms):
     """Optimal people never try in vain; that they fetch another machine says what theirs cannot do."""
-    world, random = FARM.ruled(ENTERS), np.random.default_rng(2)
+    world, random = FARM.known_model(ENTERS), np.random.default_rng(2)
     goals = [4, 14, 24, 5]
     tasks = [anywhere(world.graph, 3 * goal + np.arange(3)) for goal in goals]
     ground = np.setdiff1d(np.flatnonzero((TERRAIN == 0) & (MACHINE < 0)), goals)
@@ -128,7 +128,7 @@ def test_what_machines_can_enter_is_found_from_ten_demonstrations_a_goal(terms):
     assert not bumped.any()
     found = fit(FARM.model(), demos, Behavior(BoltzmannAverage(), 10.0), prior=Normal(0.0, 2.0), terms=terms)
     assert found.converged
-    assert ((np.asarray(FARM.stopped(found.model)) < 0.5) == ENTERS).all()
+    assert ((np.asarray(FARM.stop_probabilities(found.model)) < 0.5) == ENTERS).all()
 
 
 # Walls between cells, and roads

@@ -1,15 +1,15 @@
-"""Continuous worlds: behavior-aware modeling where states are vectors, and values are found by roll-outs.
+"""Continuous worlds: behavior-aware modeling with vectors for states, and values by rollouts.
 
-The paper's section "Continuous State Spaces" (eqs. 11 and 12). The names here are the public ones.
+This is the paper's section "Continuous State Spaces". `value_gradient` has eq. 11, `plan_policy` follows eq. 12, and
+`fit_dynamics` uses both. The names here are the public ones.
 """
 
-from sidestep.continuous.critic import Critic, critic
-from sidestep.continuous.demonstrations import gather
+from sidestep.continuous.critic import Critic, make_critic
 from sidestep.continuous.dynamics import Dynamics, GaussianDynamics, LinearGaussian, Outcomes, TableDynamics
 from sidestep.continuous.estimators import score_surrogate, value_gradient
-from sidestep.continuous.fit import ContinuousFit, Schedule, fit
+from sidestep.continuous.fit import ContinuousFit, fit_dynamics
 from sidestep.continuous.lattice import Lattice
-from sidestep.continuous.likelihood import FitProgress
+from sidestep.continuous.likelihood import FitProgress, Schedule
 from sidestep.continuous.obstacles import (
     Field,
     NetworkField,
@@ -20,60 +20,39 @@ from sidestep.continuous.obstacles import (
     radial_field,
 )
 from sidestep.continuous.physical import Pendulum, PointMass
-from sidestep.continuous.planner import Planner, Planning, PlanProgress
-from sidestep.continuous.planning import Plan, plan
+from sidestep.continuous.planner import Planner, PlannerState, PlanProgress, PolicyPlan, plan_policy
 from sidestep.continuous.policies import FinitePolicy, GaussianPolicy, Policy, finite_policy, gaussian_policy
-from sidestep.continuous.rollouts import RollOut, returns, roll_out, roll_outs, said, to_come
-from sidestep.continuous.simulation import simulate
-from sidestep.continuous.tasks import ContinuousTask, Hold, QuadraticTask, Reach, TableTask, reach, stack
+from sidestep.continuous.rollouts import (
+    Rollout,
+    discounted_returns,
+    q_estimates,
+    returns_to_go,
+    sample_rollout,
+    sample_rollouts,
+)
+from sidestep.continuous.simulation import simulate_trajectories
+from sidestep.continuous.tasks import (
+    ContinuousTask,
+    PendulumTask,
+    QuadraticTask,
+    ReachTask,
+    TableTask,
+    batch_tasks,
+    reach_region,
+    task_at,
+    task_features,
+)
+from sidestep.continuous.trajectories import gather_trajectories
 
-__all__ = [
-    "ContinuousFit",
-    "ContinuousTask",
-    "Critic",
-    "Dynamics",
-    "Field",
-    "FinitePolicy",
-    "FitProgress",
-    "GaussianDynamics",
-    "GaussianPolicy",
-    "Hold",
-    "Lattice",
-    "LinearGaussian",
-    "NetworkField",
-    "ObstacleMotion",
-    "Outcomes",
-    "Pendulum",
-    "Plan",
-    "PlanProgress",
-    "Planner",
-    "Planning",
-    "PointMass",
-    "Policy",
-    "QuadraticTask",
-    "RadialField",
-    "Reach",
-    "RollOut",
-    "Schedule",
-    "TableDynamics",
-    "TableTask",
-    "Walls",
-    "critic",
-    "finite_policy",
-    "fit",
-    "gather",
-    "gaussian_policy",
-    "network_field",
-    "plan",
-    "radial_field",
-    "reach",
-    "returns",
-    "roll_out",
-    "roll_outs",
-    "said",
-    "score_surrogate",
-    "simulate",
-    "stack",
-    "to_come",
-    "value_gradient",
-]
+__all__ = ["Dynamics", "GaussianDynamics", "LinearGaussian", "Outcomes", "TableDynamics"]
+__all__ += ["Field", "NetworkField", "ObstacleMotion", "RadialField", "Walls", "network_field", "radial_field"]
+__all__ += ["Pendulum", "PointMass"]
+__all__ += ["ContinuousTask", "PendulumTask", "QuadraticTask", "ReachTask", "TableTask"]
+__all__ += ["batch_tasks", "reach_region", "task_at", "task_features"]
+__all__ += ["FinitePolicy", "GaussianPolicy", "Policy", "finite_policy", "gaussian_policy"]
+__all__ += ["Critic", "make_critic"]
+__all__ += ["Rollout", "discounted_returns", "q_estimates", "returns_to_go", "sample_rollout", "sample_rollouts"]
+__all__ += ["score_surrogate", "value_gradient"]
+__all__ += ["PlanProgress", "Planner", "PlannerState", "PolicyPlan", "plan_policy"]
+__all__ += ["ContinuousFit", "FitProgress", "Schedule", "fit_dynamics"]
+__all__ += ["Lattice", "gather_trajectories", "simulate_trajectories"]

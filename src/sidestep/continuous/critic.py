@@ -1,8 +1,8 @@
-"""Critics: a guess of what a state is worth, which makes estimates less noisy and never biased.
+"""Critics: estimates of the value of a state, which reduce the variance of rollouts and add no bias.
 
-V_w(x, l) is a network that follows the worth W_i of what was to come from the states of earlier roll-outs; l = 1 − i/τ
-is the share of the roll-out that is left, for what is to come is little where little is left. It only ever serves as a
-control variate: it is subtracted where what is subtracted averages to nothing.
+V_w(x, l) is a network fitted to the returns-to-go W_i of earlier rollouts; l = 1 − i/τ is the fraction of the horizon
+that is left, because little can follow when little is left. It only serves as a baseline or control variate
+(Greensmith, Bartlett and Baxter 2004): every term made from it has mean 0.
 """
 
 import equinox as eqx
@@ -10,35 +10,49 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, Scalar
 
-from sidestep.continuous.policies import Features, Scaled, scaled_network
+from sidestep.continuous.policies import Features, ScaledNetwork, scaled_network
 
 
 class Critic(eqx.Module):
-    """V_w(x, l) = centre + spread · network(x, l)."""
+    """A value estimate V_w(x, l) = center + spread · network(x, l)."""
 
-    network: Scaled
-    centre: Float[Array, ""]
+    network: ScaledNetwork
+    center: Float[Array, ""]
     spread: Float[Array, ""]
 
     def __call__(self, x: Features, left: Float[Scalar, ""]) -> Float[Scalar, ""]:
-        """The guess."""
-        centre, spread = jax.lax.stop_gradient((self.centre, self.spread))
-        return centre + spread * self.network(jnp.append(x, left))[0]
+        """Return the estimate."""
+        center, spread = jax.lax.stop_gradient((self.center, self.spread))
+        return center + spread * self.network(jnp.append(x, left))[0]
 
 
-def critic(
+def make_critic(
     key: PRNGKeyArray,
     examples: Float[Array, "examples features"],
     left: Float[Array, " examples"],
-    worths: Float[Array, " examples"],
+    returns: Float[Array, " examples"],
     *,
     width: int = 64,
     depth: int = 2,
 ) -> Critic:
-    """A critic that begins at the mean of `worths`, what states with these features and so much left were worth."""
-    spread = worths.std()
+    """Return a critic that begins at the mean of observed returns-to-go.
+
+    Args:
+        key: draws the initial weights.
+        examples: the features of states.
+        left: the fraction of the horizon that was left there, in [0, 1].
+        returns: the returns-to-go from there, in units of reward.
+        width: units in each hidden layer.
+        depth: hidden layers.
+
+    Example:
+        >>> critic = make_critic(jax.random.key(0), jnp.eye(2), jnp.ones(2), jnp.array([1.0, 3.0]))
+        >>> float(critic.center), float(critic.spread)
+        (2.0, 1.0)
+    """
+    spread = returns.std()
     return Critic(
         scaled_network(key, jnp.column_stack([examples, left]), 1, width, depth),
-        worths.mean(),
+        returns.mean(),
         jnp.where(spread > 0, spread, 1.0),
     )

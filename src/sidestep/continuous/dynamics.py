@@ -1,16 +1,16 @@
-"""Dynamics of continuous worlds: T_θ(s, a, s′) as a density that can be sampled.
+"""Dynamics of continuous worlds: the transition model T_θ(s, a, s′) as a density that can be sampled.
 
-A family says two things: how to draw a next state, and how probable a next state is,
+A family of dynamics draws a next state and evaluates its density,
 
     s′ ~ T_θ(s, a, ·),        ln T_θ(s, a, s′).
 
-States and actions are arrays of any shape; most are vectors. Most families need only say where an action may lead, with
-which probabilities, for noise is Gaussian around each outcome k:
+States and actions are arrays of any shape; most are vectors. Most families are Gaussian mixtures: an action leads to
+outcome k with probability p_k, and noise is added to the mean of the outcome,
 
     T_θ(s, a, s′) = Σ_k p_k N(s′; m_k, diag(noise²)),      p = p_θ(s, a),  m = m_θ(s, a).
 
-With one outcome, s′ = m_θ(s, a) + noise · ε, so that the noise can be held fixed while θ moves: such dynamics are
-*reparameterised*, and gradients may pass along the path.
+With one outcome, s′ = m_θ(s, a) + noise · ε, and ε can be held fixed while θ moves. Such dynamics are *reparameterized*
+(Kingma and Welling 2014): gradients may pass along the path.
 """
 
 import abc
@@ -30,112 +30,141 @@ from sidestep.tabular.models import TransitionModel
 
 State = Shaped[Array, "*state"]
 Action = Shaped[Array, "*action"]
-Value = Callable[[State], Float[Scalar, ""]]
+ValueFunction = Callable[[State], Float[Scalar, ""]]
 
 _Family = TypeVar("_Family", bound="Dynamics")
-_Table = TypeVar("_Table", bound="TableDynamics")
 
 
 class Dynamics(eqx.Module):
     """A density T_θ(s, a, ·) over next states.
 
-    - `parameters`: θ, a pytree of floating-point arrays, all of which are learned.
-    - `reparameterised`: whether `sample` moves smoothly with θ and the state while the key is held fixed.
+    A new family is a subclass with `sample` and `log_prob`, or of `GaussianDynamics` with `outcomes`. Its methods take
+    one state and one action; `jax.vmap` makes many of them.
 
-    A new family is a subclass with `sample` and `log_prob`, or of `GaussianDynamics` with `outcomes`. Both take one
-    state and one action; `jax.vmap` makes many of them.
+    Attributes:
+        parameters: θ, a pytree of floating-point arrays, all of which are learned.
     """
 
     parameters: eqx.AbstractVar[PyTree[Float[Array, "..."]]]
 
     @property
     @abc.abstractmethod
-    def reparameterised(self) -> bool:
-        """Whether gradients may pass along a sampled path."""
+    def reparameterized(self) -> bool:
+        """Whether `sample` is smooth in θ and the state while the key is held fixed."""
 
     @abc.abstractmethod
     def sample(self, key: PRNGKeyArray, state: State, action: Action) -> State:
-        """A next state s′ ~ T_θ(s, a, ·)."""
+        """Draw a next state s′ ~ T_θ(s, a, ·)."""
 
     @abc.abstractmethod
     def log_prob(self, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
-        """ln T_θ(s, a, s′), in nats."""
+        """Return ln T_θ(s, a, s′), in nats."""
 
-    def surprise(self, value: Value, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
-        """What a function of the next state is beyond what was to be expected: of this function, or of one like it.
+    def transition_control_variate(
+        self, value: ValueFunction, state: State, action: Action, next_state: State
+    ) -> Float[Scalar, ""]:
+        """Return v(s′) − E[v(s′)] for a function v close to `value`; its mean over next states is 0.
 
-        It averages to nothing over next states, and is taken off what roll-outs say, to make it less noisy. 0, unless a
-        family knows better.
+        Rollouts subtract it to reduce their variance. It is 0 unless a family defines it.
         """
         del value, state, action, next_state
         return jnp.zeros((), jnp.result_type(float))
 
     def with_parameters(self: _Family, parameters: PyTree[Float[Array, "..."]]) -> _Family:
-        """The same family at another θ."""
+        """Return the same family at another θ."""
         return eqx.tree_at(lambda dynamics: dynamics.parameters, self, parameters)
 
 
 class Outcomes(NamedTuple):
-    """Where an action may lead: ln p_k, and the mean next state m_k, of every outcome k."""
+    """The outcomes of an action.
+
+    Attributes:
+        log_probabilities: ln p_k of every outcome k.
+        means: the mean next state m_k of every outcome k.
+    """
 
     log_probabilities: Float[Array, " outcomes"]
     means: Float[Array, "outcomes dimensions"]
+
+    @classmethod
+    def single(cls, mean: Float[Array, " dimensions"]) -> "Outcomes":
+        """Return the outcomes of an action with a single one."""
+        return cls(jnp.zeros(1, mean.dtype), mean[None])
 
 
 class GaussianDynamics(Dynamics):
     """Gaussian noise around one or several outcomes.
 
-    - `noise`: the standard deviation of every component of the state, above 0; it is not learned.
+    A new family is a subclass with `outcomes`, and with `example_action` where actions do not have the state's shape.
+    A subclass that replaces `sample` or `log_prob` must replace `transition_control_variate` too, to keep its mean 0.
 
-    A new family is a subclass with `outcomes`, and with `example_action` where actions are not of the state's shape.
-    Who changes `sample` or `log_prob` as well must change `surprise`, which would not average to nothing any more.
+    Attributes:
+        noise: the standard deviation of every component of the state, above 0; it is not learned.
     """
 
     noise: eqx.AbstractVar[Float[Array, " dimensions"]]
 
     @abc.abstractmethod
     def outcomes(self, state: Float[Array, " dimensions"], action: Float[Array, " inputs"]) -> Outcomes:
-        """Where the action may lead."""
+        """Return the outcomes of an action."""
 
     @property
-    def reparameterised(self) -> bool:
-        """With a single outcome, the path moves with θ; which of several happens, jumps."""
+    def reparameterized(self) -> bool:
+        """Whether there is a single outcome: the draw of one among several is not smooth in θ."""
         example = jnp.zeros_like(self.noise)
         return jax.eval_shape(self.outcomes, example, self.example_action()).means.shape[0] == 1
 
     def example_action(self) -> Float[Array, " inputs"]:
-        """An action of the right shape; as many components as the state has, unless a family says otherwise."""
+        """Return an action of the right shape; that of the state, unless a family differs."""
         return jnp.zeros_like(self.noise)
 
     def sample(self, key: PRNGKeyArray, state: State, action: Action) -> State:
-        """An outcome drawn by its probability, and the noise around it."""
-        choosing, shaking = jax.random.split(key)
+        """Draw an outcome by its probability, and the noise around it."""
+        outcome_key, noise_key = jax.random.split(key)
         log_probabilities, means = self.outcomes(state, action)
-        chosen = 0 if len(means) == 1 else jax.random.categorical(choosing, log_probabilities)
-        return means[chosen] + self.noise * jax.random.normal(shaking, means.shape[1:], means.dtype)
+        outcome = 0 if len(means) == 1 else jax.random.categorical(outcome_key, log_probabilities)
+        return means[outcome] + self.noise * jax.random.normal(noise_key, means.shape[1:], means.dtype)
 
     def log_prob(self, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
-        """The logarithm of the mixture's density."""
-        log_probabilities, means = self.outcomes(state, action)
-        each = norm.logpdf(next_state, means, self.noise).sum(axis=-1)
-        return jax.nn.logsumexp(log_probabilities + each)
+        """Return the logarithm of the mixture's density."""
+        return jax.nn.logsumexp(self._joint_log_probs(self.outcomes(state, action), next_state))
 
-    def surprise(self, value: Value, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
-        """Of the function made linear around each outcome, v_k(s′) = v(m_k) + ∇v(m_k)·(s′ − m_k).
+    def transition_control_variate(
+        self, value: ValueFunction, state: State, action: Action, next_state: State
+    ) -> Float[Scalar, ""]:
+        """Return Σ_k P(k | s′) v_k(s′) − Σ_k p_k v(m_k), with v_k(s′) = v(m_k) + ∇v(m_k)·(s′ − m_k).
 
-        That is Σ_k P(k | s′) v_k(s′) − Σ_k p_k v(m_k).
+        v_k is the value function made linear around outcome k; its mean is known.
         """
-        log_probabilities, means = self.outcomes(state, action)
-        each = norm.logpdf(next_state, means, self.noise).sum(axis=-1)
-        values, slopes = jax.vmap(jax.value_and_grad(value))(means)
-        there = values + jnp.sum(slopes * (next_state - means), axis=-1)
-        return jax.nn.softmax(log_probabilities + each) @ there - jnp.exp(log_probabilities) @ values
+        outcomes = self.outcomes(state, action)
+        values, slopes = jax.vmap(jax.value_and_grad(value))(outcomes.means)
+        linear = values + jnp.sum(slopes * (next_state - outcomes.means), axis=-1)
+        posterior = jax.nn.softmax(self._joint_log_probs(outcomes, next_state))
+        return posterior @ linear - jnp.exp(outcomes.log_probabilities) @ values
+
+    def _joint_log_probs(self, outcomes: Outcomes, next_state: State) -> Float[Array, " outcomes"]:
+        """Return ln p_k + ln N(s′; m_k, diag(noise²))."""
+        return outcomes.log_probabilities + norm.logpdf(next_state, outcomes.means, self.noise).sum(axis=-1)
 
 
 class LinearGaussian(GaussianDynamics):
-    """s′ = A s + B a + noise · ε.
+    """Linear dynamics s′ = A s + B a + noise · ε.
 
-    - `parameters`: {"state": A, "action": B}, both learned.
+    Args:
+        state: A, of shape (dimensions, dimensions).
+        action: B, of shape (dimensions, inputs).
+        noise: the standard deviation of every component, above 0.
+
+    Attributes:
+        parameters: {"state": A, "action": B}, both learned.
+
+    Raises:
+        InputError: numbers that are not finite, noise not above 0, or shapes that do not fit.
+
+    Example:
+        >>> dynamics = LinearGaussian(jnp.eye(2), jnp.ones((2, 1)), jnp.full(2, 0.1))
+        >>> dynamics.outcomes(jnp.zeros(2), jnp.array([3.0])).means.tolist()
+        [[3.0, 3.0]]
     """
 
     parameters: dict[str, Float[Array, "dimensions _"]]
@@ -147,7 +176,6 @@ class LinearGaussian(GaussianDynamics):
         action: Float[Array, "dimensions inputs"],
         noise: Float[Array, " dimensions"],
     ):
-        """Raises `InputError` for numbers that are not finite, noise not above 0, and shapes that do not fit."""
         self.noise = checked_noise(noise, len(state))
         self.parameters = {"state": jnp.asarray(state), "action": jnp.asarray(action)}
         if np.shape(state) != (len(state),) * 2 or np.ndim(action) != 2 or len(action) != len(state):
@@ -158,73 +186,64 @@ class LinearGaussian(GaussianDynamics):
         check_finite(self.parameters)
 
     def example_action(self) -> Float[Array, " inputs"]:
-        """As many components as B has columns."""
+        """Return an action with as many components as B has columns."""
         return jnp.zeros_like(self.parameters["action"][0])
 
     def outcomes(self, state: Float[Array, " dimensions"], action: Float[Array, " inputs"]) -> Outcomes:
-        """A s + B a, surely."""
-        return certain(self.parameters["state"] @ state + self.parameters["action"] @ action)
+        """Return A s + B a as the only outcome."""
+        return Outcomes.single(self.parameters["state"] @ state + self.parameters["action"] @ action)
 
 
 class TableDynamics(Dynamics):
-    """A discrete world seen as dynamics: states and actions are whole numbers, T_θ that of a transition model.
+    """A discrete world as dynamics: states and actions are whole numbers, T_θ is that of a transition model.
 
-    What is built for densities can so be checked where exact answers are known.
+    Estimators for densities can so be checked against exact answers.
 
-    - `model`: any `TransitionModel`.
+    Attributes:
+        model: any `TransitionModel`; its parameters are those of the dynamics.
     """
 
     model: TransitionModel
-    parameters: PyTree[Float[Array, "..."]]
 
     def __init__(self, model: TransitionModel):
-        self.model, self.parameters = model, model.parameters
+        self.model = model
 
     @property
-    def reparameterised(self) -> bool:
-        """Never: states jump."""
-        return False
+    def parameters(self) -> PyTree:
+        """The parameters θ of the model."""
+        return self.model.parameters
 
-    def with_parameters(self: _Table, parameters: PyTree[Float[Array, "..."]]) -> _Table:
-        """The same family at another θ, which is also that of its model."""
-        places = (lambda dynamics: dynamics.parameters, lambda dynamics: dynamics.model.parameters)
-        moved = self
-        for place in places:
-            moved = eqx.tree_at(place, moved, parameters)
-        return moved
+    @property
+    def reparameterized(self) -> bool:
+        """Never, because states are whole numbers."""
+        return False
 
     def _probabilities(self, state: State, action: Action) -> Float[Array, " outcomes"]:
         return self.model.probabilities()[state, action]
 
     def sample(self, key: PRNGKeyArray, state: State, action: Action) -> State:
-        """An outcome drawn by its probability."""
+        """Draw an outcome by its probability."""
         outcome = jax.random.categorical(key, jnp.log(self._probabilities(state, action)))
         return self.model.graph.successors[state, action, outcome].astype(state.dtype)
 
     def log_prob(self, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
-        """The logarithm of the probabilities of all outcomes that are the next state."""
+        """Return the logarithm of the total probability of all outcomes that are the next state."""
         same = self.model.graph.successors[state, action] == next_state
         probability = jnp.sum(jnp.where(same, self._probabilities(state, action), 0.0))
-        # the logarithm of 0 has no gradient, even where it is not looked at
+        # the logarithm of 0 has no gradient, even where `where` discards it
         possible = probability > 0
         return jnp.where(possible, jnp.log(jnp.where(possible, probability, 1.0)), -jnp.inf)
 
-    def surprise(self, value: Value, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
-        """Of the function itself."""
+    def transition_control_variate(
+        self, value: ValueFunction, state: State, action: Action, next_state: State
+    ) -> Float[Scalar, ""]:
+        """Return v(s′) − E[v(s′)] of the value function itself."""
         successors = self.model.graph.successors[state, action].astype(next_state.dtype)
         return value(next_state) - self._probabilities(state, action) @ jax.vmap(value)(successors)
 
 
-def certain(mean: Float[Array, " dimensions"]) -> Outcomes:
-    """The only outcome."""
-    return Outcomes(jnp.zeros(1, mean.dtype), mean[None])
-
-
 def checked_noise(noise: Float[Array, " _"] | np.ndarray, dimensions: int) -> Float[Array, " dimensions"]:
-    """The standard deviations as floating-point numbers.
-
-    Raises `InputError` unless there is one for each dimension, finite and above 0.
-    """
+    """Return standard deviations as floating-point numbers; refuse any that are not finite and above 0."""
     noise = jnp.asarray(noise, jnp.result_type(float))
     if noise.shape != (dimensions,):
         raise InputError(f"expected {dimensions} numbers, one a component of the state, found {noise}", field="noise")
@@ -233,8 +252,14 @@ def checked_noise(noise: Float[Array, " _"] | np.ndarray, dimensions: int) -> Fl
     return noise
 
 
-def check_finite(parameters: PyTree[Float[Array, "..."]]) -> None:
-    """Raises `InputError` unless all parameters are finite; inside `jit` nothing is checked."""
-    for leaf in jax.tree.leaves(parameters):
+def check_finite(arrays: PyTree[Shaped[Array, "..."]], field: str = "parameters") -> None:
+    """Refuse arrays that are not finite; inside `jit` nothing is checked."""
+    for leaf in jax.tree.leaves(arrays):
         if not isinstance(leaf, Tracer) and not np.isfinite(leaf).all():
-            raise InputError("expected finite numbers", field="parameters")
+            raise InputError("expected finite numbers", field=field)
+
+
+def check_corners(low: Float[Array, " dimensions"], high: Float[Array, " dimensions"]) -> None:
+    """Refuse corners that are not finite, or a `high` that does not lie above `low`."""
+    if not (np.isfinite(low).all() and np.isfinite(high).all() and (np.asarray(low) < np.asarray(high)).all()):
+        raise InputError(f"expected corners in order, found {low} and {high}", field="low, high")

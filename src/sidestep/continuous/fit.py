@@ -1,8 +1,9 @@
-"""Fits in continuous worlds: the dynamics that make demonstrations most probable, when values need roll-outs.
+"""Fits of continuous dynamics to demonstrations, where values need rollouts.
 
-The gradient of the objective (`likelihood`) takes the people's policy, and that policy is itself found by gradients
-(`planner`). Both take one step at a time: one batch of roll-outs, from some of the demonstrated states, gives a step of
-the policy, of its critic and of the model. The policy is so always a little behind the model; by how much, `lag` says.
+The gradient of the objective (`likelihood`) needs the agent's policy, and that policy is itself found by gradients
+(`policy_gradient`). Both take one step at a time, as in actor–critic methods: one batch of rollouts, from the states of
+some demonstrated moves, gives a step of the policy, of its critic and of the model. The policy is therefore always a
+little behind the model; `policy_gap` measures by how much.
 """
 
 import re
@@ -18,15 +19,21 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from sidestep.continuous.demonstrations import check_choices
 from sidestep.continuous.dynamics import Dynamics
 from sidestep.continuous.estimators import Estimator
-from sidestep.continuous.likelihood import FitProgress, Problem, check_problem, descend, rehearse
-from sidestep.continuous.planner import Planner, Planning, SomePolicy
-from sidestep.continuous.planning import plan
+from sidestep.continuous.likelihood import (
+    FitProblem,
+    FitProgress,
+    Schedule,
+    check_problem,
+    improve_policy,
+    objective_gradient,
+)
+from sidestep.continuous.planner import Planner, PlannerState, SomePolicy, plan_policy
 from sidestep.continuous.policies import Policy
 from sidestep.continuous.tasks import task_at
-from sidestep.errors import NotConverged, check_count, check_positive
+from sidestep.continuous.trajectories import check_choices
+from sidestep.errors import NotConverged
 from sidestep.inference.checkpoints import Saver, fingerprint
 from sidestep.inference.priors import Normal, Prior
 from sidestep.tabular.backups import Behavior
@@ -37,66 +44,41 @@ Family = TypeVar("Family", bound=Dynamics)
 
 
 class ContinuousFit(eqx.Module, Generic[Family, SomePolicy]):
-    """Learned dynamics and how they were found.
+    """The result of a fit.
 
-    - `dynamics`: the family at the mean of θ over the last quarter of the iterations.
-    - `planning`: the people's policy, and what planning goes on from.
-    - `history`: a `FitProgress` an iteration.
-    - `drift`: how far the mean of θ over the last eighth is from that over the eighth before, at most, a parameter:
-      as a share of how far that would be, had every step gone the whole learning rate one way.
-    - `lag`: the policy's, on average over the last quarter.
-    - `converged`: whether drift and lag are below the tolerances that were asked for; `message` says what they are.
+    Attributes:
+        dynamics: the family at the mean of θ over the last quarter of the iterations.
+        planner_state: the agent's policy, its critic and their optimizers.
+        history: a `FitProgress` an iteration.
+        drift: the largest distance, over parameters, between the means of θ over the last eighth and over the eighth
+            before; as a fraction of the distance that steps of the full learning rate in one direction would give.
+        policy_gap: the policy's, on average over the last quarter.
+        converged: whether drift and policy gap are within the tolerances of the schedule.
+        message: the values of both.
     """
 
     dynamics: Family
-    planning: Planning[SomePolicy]
+    planner_state: PlannerState[SomePolicy]
     history: tuple[FitProgress, ...] = eqx.field(static=True)
     drift: float = eqx.field(static=True)
-    lag: float = eqx.field(static=True)
+    policy_gap: float = eqx.field(static=True)
     converged: bool = eqx.field(static=True)
     message: str = eqx.field(static=True)
 
 
-class Schedule(eqx.Module):
-    """How long a fit climbs, and in which steps.
-
-    - `iterations`: steps of the model. `rehearsals`: steps of the policy alone, before the model's first.
-    - `moves`: how many demonstrated moves a step looks at.
-    - `learning_rate`: of Adam, in units of θ; it falls to a twentieth along a cosine.
-    - `policy_steps`: steps of the policy for each of the model's, one of them with the model's own roll-outs.
-    - `drift`, `lag`: below which (either side of 0) a fit counts as converged, as in `ContinuousFit`.
-    """
-
-    iterations: int = eqx.field(default=400, static=True)
-    rehearsals: int = eqx.field(default=200, static=True)
-    moves: int = eqx.field(default=32, static=True)
-    learning_rate: float = eqx.field(default=0.05, static=True)
-    policy_steps: int = eqx.field(default=1, static=True)
-    drift: float = eqx.field(default=0.5, static=True)
-    lag: float = eqx.field(default=0.1, static=True)
-
-    def rate(self) -> optax.Schedule:
-        """The learning rate at each iteration."""
-        return optax.cosine_decay_schedule(self.learning_rate, self.iterations, alpha=0.05)
-
-    def adam(self) -> optax.GradientTransformation:
-        """The model's optimiser; it forgets rare large gradients, which roll-outs give, within a hundred steps."""
-        return optax.adam(self.rate(), b2=0.99)
-
-
-class _Fitting(eqx.Module):
-    """What a fit carries from iteration to iteration; arrays only, so that a checkpoint can hold it.
+class _State(eqx.Module):
+    """The state that a fit carries from iteration to iteration.
 
     `sums` are of θ: over the last quarter of the iterations but its second half, and over that half.
     """
 
     parameters: PyTree[Float[Array, "..."]]
     moments: PyTree
-    planning: PyTree
+    planner_state: PyTree
     sums: Float[Array, "2 parameters"]
 
 
-def fit(
+def fit_dynamics(
     dynamics: Family,
     demonstrations: Demonstrations,
     behavior: Behavior,
@@ -112,144 +94,144 @@ def fit(
     checkpoint: str | Path | None = None,
     resume: bool = False,
 ) -> ContinuousFit[Family, SomePolicy]:
-    """The dynamics of the family of `dynamics` that maximise the posterior of `demonstrations`, starting there.
+    """Find the parameters of a family of dynamics that maximize the posterior of demonstrations.
 
-    - `demonstrations`: from `gather`. `policy`: where the people's policy begins.
-    - `planner`: how roll-outs are made and the policy is improved; its `samples` count here too.
-    - `prior`: over all parameters, `Normal()` by default. `terms`: "actions", "transitions" or both.
-    - `estimator`: "score" (eq. 11), or "pathwise" for reparameterised dynamics and smooth rewards.
-    - `report`: called with a `FitProgress` and the dynamics as they are then, after every iteration.
-    - `checkpoint`: a file that is kept up to date; with `resume` the fit goes on from there and ends exactly as if it
-      had not been interrupted.
+    Args:
+        dynamics: the family at the initial parameters.
+        demonstrations: from `gather_trajectories`.
+        behavior: the agent's backup and β.
+        policy: the initial policy of the agent.
+        planner: settings of rollouts and of the policy's optimizers.
+        prior: over all parameters, `Normal()` by default.
+        terms: "actions", "transitions" or both.
+        estimator: "score" (eq. 11), or "pathwise" for reparameterized dynamics and smooth rewards.
+        schedule: length and steps of the fit.
+        seed: draws everything random.
+        report: called with the figures and the present dynamics after every iteration.
+        checkpoint: a file that is kept up to date.
+        resume: whether to go on from the checkpoint; the result is that of an uninterrupted fit, bit for bit.
 
-    Raises `InputError` for data or settings that cannot be used, `NotConverged` if numbers cease to be finite.
+    Raises:
+        InputError: data or settings that cannot be used.
+        NotConverged: figures that cease to be finite.
+
+    References:
+        Eqs. 6, 11 and 12 of the paper.
     """
-    schedule = schedule or Schedule()
+    prior, schedule = prior or Normal(), schedule or Schedule()
     check_choices(demonstrations, policy)
-    taken = jax.vmap(policy.action)(demonstrations.actions)
-    problem = Problem(
-        dynamics, demonstrations, behavior, prior or Normal(), planner, taken, schedule.moves, terms, estimator
-    )
-    check_schedule(schedule)
+    actions = jax.vmap(policy.action)(demonstrations.actions)
+    problem = FitProblem(dynamics, demonstrations, behavior, prior, planner, actions, schedule, terms, estimator)
     check_problem(problem, policy)
-    rehearsing, key = jax.random.split(jax.random.key(seed))
-    saver = Saver(
-        checkpoint, fingerprint(_identity((problem, schedule, policy, seed))) if checkpoint is not None else ""
-    )
-    beginning, rehearsing = jax.random.split(rehearsing)
-    carried, fixed = eqx.partition(_begun(problem, schedule, policy, beginning), eqx.is_array)
+    key = problem_fingerprint((problem, policy, seed)) if checkpoint is not None else ""
+    saver = Saver(checkpoint, key)
+    warmup_key, key = jax.random.split(jax.random.key(seed))
+    initial_key, warmup_key = jax.random.split(warmup_key)
+    carried, fixed = eqx.partition(_initialize(problem, policy, initial_key), eqx.is_array)
     history: list[FitProgress] = []
     if resume:
         carried, records, _ = saver.load(carried)
         history = [FitProgress(int(record[0]), *record[1:]) for record in records]
     if not history:
-        carried = eqx.filter(_rehearsed(problem, schedule, eqx.combine(carried, fixed), rehearsing), eqx.is_array)
+        carried = eqx.filter(_warm_up(problem, eqx.combine(carried, fixed), warmup_key), eqx.is_array)
     for iteration in range(len(history), schedule.iterations):
-        carried, numbers = _step(
-            problem, schedule, carried, fixed, jax.random.fold_in(key, iteration), jnp.asarray(iteration)
-        )
-        history.append(FitProgress(iteration, *(float(number) for number in numbers[1:])))
-        _check_numbers(history[-1])
+        step_key = jax.random.fold_in(key, iteration)
+        carried, numbers = _step(problem, carried, fixed, step_key, jnp.asarray(iteration))
+        progress = FitProgress(iteration, *(float(number) for number in numbers[1:]))
+        history.append(progress)
+        if not np.isfinite(progress).all():
+            raise NotConverged(
+                f"the figures ceased to be finite at iteration {iteration}: dynamics or rewards that return NaN, "
+                "or too high a learning rate"
+            )
         saver.save(carried, history)
         if report:
-            report(history[-1], dynamics.with_parameters(eqx.combine(carried, fixed).parameters))
-    return _ended(problem, schedule, eqx.combine(carried, fixed), history)
+            report(progress, dynamics.with_parameters(eqx.combine(carried, fixed).parameters))
+    return _result(problem, eqx.combine(carried, fixed), history)
 
 
-def _identity(problem: PyTree) -> tuple[list, str]:
-    """All of a problem, as numbers and text: functions by their names, for their addresses change between processes."""
+def problem_fingerprint(problem: PyTree) -> str:
+    """Return a digest of a problem; functions count by name, because their addresses differ between processes."""
     numbers, rest = eqx.partition(problem, eqx.is_array_like)
     text = f"{jax.tree.structure(problem)} {jax.tree.leaves(rest)}"
-    return jax.tree.leaves(numbers), re.sub(r" at 0x[0-9a-f]+", "", text)
+    return fingerprint((jax.tree.leaves(numbers), re.sub(r" at 0x[0-9a-f]+", "", text)))
 
 
-def _begun(problem: Problem, schedule: Schedule, policy: Policy, key: PRNGKeyArray) -> _Fitting:
-    """A fit before anything has been found."""
+def _initialize(problem: FitProblem, policy: Policy, key: PRNGKeyArray) -> _State:
     demos, parameters = problem.demonstrations, problem.dynamics.parameters
     own = task_at(demos.tasks, demos.task)
-    planning = problem.planner.begin(key, problem.dynamics, policy, own, problem.behavior, demos.states)
+    planner_state = problem.planner.initialize(key, problem.dynamics, policy, own, problem.behavior, demos.states)
     flat = ravel_pytree(parameters)[0]
-    return _Fitting(parameters, schedule.adam().init(parameters), planning, jnp.zeros((2, len(flat)), flat.dtype))
+    return _State(
+        parameters, problem.schedule.adam().init(parameters), planner_state, jnp.zeros((2, len(flat)), flat.dtype)
+    )
 
 
-def _rehearsed(problem: Problem, schedule: Schedule, begun: _Fitting, key: PRNGKeyArray) -> _Fitting:
-    """A fit once the policy has been found for the first model, as well as so many steps can."""
-    if not schedule.rehearsals or "actions" not in problem.terms:
-        return begun
+def _warm_up(problem: FitProblem, state: _State, key: PRNGKeyArray) -> _State:
+    """Plan for the first model, if the objective needs a policy."""
+    if not problem.schedule.policy_warmup or "actions" not in problem.terms:
+        return state
     demos = problem.demonstrations
-    found = plan(
+    plan = plan_policy(
         problem.dynamics,
         demos.tasks,
         problem.behavior,
-        begun.planning.policy,
+        state.planner_state.policy,
         demos.states,
         demos.task,
         problem.planner,
-        steps=schedule.rehearsals,
+        steps=problem.schedule.policy_warmup,
         seed=int(jax.random.randint(key, (), 0, 2**31 - 1)),
-        warm=begun.planning,
+        warm_start=state.planner_state,
     )
-    return eqx.tree_at(lambda fitting: fitting.planning, begun, found.planning)
+    return eqx.tree_at(lambda state: state.planner_state, state, plan.planner_state)
 
 
 @eqx.filter_jit
 def _step(
-    problem: Problem, schedule: Schedule, carried: PyTree, fixed: PyTree, key: PRNGKeyArray, iteration: Int[Array, ""]
+    problem: FitProblem, carried: PyTree, fixed: PyTree, key: PRNGKeyArray, iteration: Int[Array, ""]
 ) -> tuple[PyTree, FitProgress]:
-    """One step of the policy, its critic and the model."""
-    fitting: _Fitting = eqx.combine(carried, fixed)
-    looking, *rehearsing = jax.random.split(key, schedule.policy_steps)
-    planning = fitting.planning
+    """Make one step of the policy, its critic and the model."""
+    state: _State = eqx.combine(carried, fixed)
+    schedule = problem.schedule
+    model_key, *policy_keys = jax.random.split(key, schedule.policy_steps)
+    planner_state = state.planner_state
     if "actions" in problem.terms:
-        for again in rehearsing:
-            planning = rehearse(problem, fitting.parameters, planning, again)
-    planning, slope, numbers = descend(problem, fitting.parameters, planning, looking)
-    step, moments = schedule.adam().update(slope, fitting.moments)
-    parameters = optax.apply_updates(fitting.parameters, step)
-    late = jnp.stack([iteration >= first for first in _windows(schedule)[:2]])
-    late = late & jnp.stack([iteration < end for end in _windows(schedule)[1:]])
-    sums = fitting.sums + late[:, None] * ravel_pytree(parameters)[0]
-    after = _Fitting(parameters, moments, planning, sums)
-    return eqx.filter(after, eqx.is_array), numbers
+        for policy_key in policy_keys:
+            planner_state = improve_policy(problem, state.parameters, planner_state, policy_key)
+    planner_state, slope, numbers = objective_gradient(problem, state.parameters, planner_state, model_key)
+    step, moments = schedule.adam().update(slope, state.moments)
+    parameters = optax.apply_updates(state.parameters, step)
+    begin, middle, end = _last_quarter(schedule)
+    after = jnp.stack([iteration >= begin, iteration >= middle])
+    within = after & jnp.stack([iteration < middle, iteration < end])
+    sums = state.sums + within[:, None] * ravel_pytree(parameters)[0]
+    return eqx.filter(_State(parameters, moments, planner_state, sums), eqx.is_array), numbers
 
 
-def _windows(schedule: Schedule) -> tuple[int, int, int]:
-    """Where the last two eighths of the iterations begin, and where they end."""
+def _last_quarter(schedule: Schedule) -> tuple[int, int, int]:
+    """Return the first iterations of the last two eighths, and their end."""
     eighth = max(1, schedule.iterations // 8)
     return max(0, schedule.iterations - 2 * eighth), schedule.iterations - eighth, schedule.iterations
 
 
-def _ended(problem: Problem, schedule: Schedule, fitting: _Fitting, history: list[FitProgress]) -> ContinuousFit:
-    begin, middle, end = _windows(schedule)
+def _result(problem: FitProblem, state: _State, history: list[FitProgress]) -> ContinuousFit:
+    schedule = problem.schedule
+    begin, middle, end = _last_quarter(schedule)
     flat, to_parameters = ravel_pytree(problem.dynamics.parameters)
-    former, latter = fitting.sums / jnp.asarray([[middle - begin], [end - middle]], flat.dtype)
-    gone = jnp.cumsum(schedule.rate()(jnp.arange(end)))
-    drift = float(jnp.abs(latter - former).max() / (gone[middle:end].mean() - gone[begin:middle].mean()))
-    lag = float(np.mean([progress.lag for progress in history[begin:]]))
+    former, latter = state.sums / jnp.asarray([[middle - begin], [end - middle]], flat.dtype)
+    distance = jnp.cumsum(schedule.rate()(jnp.arange(end)))
+    possible = distance[middle:end].mean() - distance[begin:middle].mean()
+    drift = float(jnp.abs(latter - former).max() / possible)
+    gap = float(np.mean([progress.policy_gap for progress in history[begin:]]))
     return ContinuousFit(
         dynamics=problem.dynamics.with_parameters(to_parameters((former + latter) / 2)),
-        planning=fitting.planning,
+        planner_state=state.planner_state,
         history=tuple(history),
         drift=drift,
-        lag=lag,
-        converged=drift <= schedule.drift and abs(lag) <= schedule.lag,
-        message=f"over the last quarter parameters drifted by up to {drift:.2g} of what their steps allow (asked: "
-        f"{schedule.drift:g}), and the policy lagged {lag:.2g} behind the model (asked: {schedule.lag:g})",
+        policy_gap=gap,
+        converged=drift <= schedule.drift_tolerance and abs(gap) <= schedule.policy_gap_tolerance,
+        message=f"over the last quarter parameters drifted by up to {drift:.2g} of what their steps allow (tolerance "
+        f"{schedule.drift_tolerance:g}), and the policy gap was {gap:.2g} (tolerance "
+        f"{schedule.policy_gap_tolerance:g})",
     )
-
-
-def check_schedule(schedule: Schedule) -> None:
-    """Raises `InputError` for settings that are too small, or a rate that is not above 0."""
-    # the drift is from one half of the last quarter to the other
-    for name, least in {"iterations": 2, "rehearsals": 0, "moves": 1, "policy_steps": 1}.items():
-        check_count(getattr(schedule, name), least, name)
-    for name in ("learning_rate", "drift", "lag"):
-        check_positive(getattr(schedule, name), name)
-
-
-def _check_numbers(progress: FitProgress) -> None:
-    if not np.isfinite(progress).all():
-        raise NotConverged(
-            f"the figures ceased to be finite at iteration {progress.iteration}: dynamics or rewards that return NaN, "
-            "or too high a learning rate"
-        )

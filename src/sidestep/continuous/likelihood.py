@@ -1,12 +1,12 @@
-"""What a batch of demonstrated moves says of dynamics: estimates of the objective and its gradient.
+"""Estimates of the objective and its gradient from a batch of demonstrated moves.
 
-The objective is that of the tabular half (eq. 6), and so is its gradient, but for expectations:
+The objective is the discrete one (eq. 6 of the paper), and so is its gradient, but for expectations:
 
     ∇ log L = Σ_moves [ β ( ∇Q(s, a) − Σ_a′ π(a′|s) ∇Q(s, a′) ) + ∇ ln T_θ(s, a, s′) ],
 
-with ∇Q by roll-outs of the people's policy under the current model (eq. 11). The same roll-outs give a step of that
-policy and of its critic (eq. 12). Over vectors of actions the sum over a′ is a mean over choices that the policy draws,
-weighed by exp(βQ)/π_λ: so it is that of the people under the current model, even where the policy is a little behind.
+with ∇Q by rollouts of the agent's policy under the current model (eq. 11). The same rollouts give a step of that policy
+and of its critic (eq. 12). Over vectors of actions the sum over a′ is a mean over choices that the policy draws, with
+importance weights exp(βQ)/π_λ: it is then that of the agent under the current model, even if the policy lags behind.
 """
 
 from typing import NamedTuple
@@ -20,12 +20,11 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, Shaped
 
 from sidestep.continuous.dynamics import Dynamics, check_finite
 from sidestep.continuous.estimators import Estimator, check_estimator, value_gradient
-from sidestep.continuous.planner import Planner, Planning, PlanProgress, check_planner
-from sidestep.continuous.planning import check_places
+from sidestep.continuous.planner import Planner, PlannerState, PlanProgress, check_planner, check_starts
 from sidestep.continuous.policies import FinitePolicy, Policy
-from sidestep.continuous.rollouts import said, spread_over
-from sidestep.continuous.tasks import ContinuousTask, check_tasks, task_at
-from sidestep.errors import InputError
+from sidestep.continuous.rollouts import q_estimates
+from sidestep.continuous.tasks import ContinuousTask, check_tasks, task_at, task_features
+from sidestep.errors import InputError, check_count, check_positive
 from sidestep.inference.priors import Prior
 from sidestep.tabular.backups import Behavior, LogSumExp
 from sidestep.tabular.demonstrations import Demonstrations
@@ -33,12 +32,18 @@ from sidestep.tabular.likelihood import ALL_TERMS, Term
 
 
 class FitProgress(NamedTuple):
-    """Where a fit stands: estimates from a batch of moves, but for the prior.
+    """Figures of a fit, estimated from one batch of moves; the prior is exact.
 
-    - `objective`: the sum of its parts `actions`, `transitions` (both scaled up to all moves) and `prior`, in nats.
-    - `gradient`: the norm of the objective's gradient.
-    - `expected_return`, `entropy`, `lag`: of the policy, see `PlanProgress`; 0 without the actions' term, which alone
-      needs one.
+    Attributes:
+        iteration: the step of the model.
+        objective: `actions` + `transitions` + `prior`, in nats.
+        actions: the log-likelihood of all actions, in nats.
+        transitions: the log-likelihood of all transitions, in nats.
+        prior: the log-density of the parameters.
+        gradient: the norm of the objective's gradient.
+        expected_return: of the policy, as `PlanProgress` has it; 0 without the actions' term, as the next two.
+        entropy: of the policy.
+        policy_gap: of the policy.
     """
 
     iteration: int
@@ -49,14 +54,48 @@ class FitProgress(NamedTuple):
     gradient: float
     expected_return: float
     entropy: float
-    lag: float
+    policy_gap: float
 
 
-class Problem(eqx.Module):
-    """All that stays as it is during a fit.
+class Schedule(eqx.Module):
+    """The length and the steps of a fit.
 
-    - `taken`: the action of every move. `moves`: how many of the moves make a batch.
-    - The rest is what `fit` was given.
+    Attributes:
+        iterations: steps of the model, 2 or more.
+        policy_warmup: steps of the policy alone, before the model's first.
+        batch_size: demonstrated moves of a step.
+        learning_rate: of Adam, in units of θ; it falls to a twentieth along a cosine.
+        policy_steps: steps of the policy for each of the model's, one of them with the model's own rollouts.
+        drift_tolerance: the largest drift of a converged fit.
+        policy_gap_tolerance: the largest policy gap of a converged fit, on either side of 0.
+
+    Example:
+        >>> Schedule(iterations=100).learning_rate
+        0.05
+    """
+
+    iterations: int = eqx.field(default=400, static=True)
+    policy_warmup: int = eqx.field(default=200, static=True)
+    batch_size: int = eqx.field(default=32, static=True)
+    learning_rate: float = eqx.field(default=0.05, static=True)
+    policy_steps: int = eqx.field(default=1, static=True)
+    drift_tolerance: float = eqx.field(default=0.5, static=True)
+    policy_gap_tolerance: float = eqx.field(default=0.1, static=True)
+
+    def rate(self) -> optax.Schedule:
+        """Return the learning rate as a function of the iteration."""
+        return optax.cosine_decay_schedule(self.learning_rate, self.iterations, alpha=0.05)
+
+    def adam(self) -> optax.GradientTransformation:
+        """Return the model's optimizer; with β₂ = 0.99 it forgets the rare large gradients of rollouts quickly."""
+        return optax.adam(self.rate(), b2=0.99)
+
+
+class FitProblem(eqx.Module):
+    """Data and settings of a fit.
+
+    Attributes:
+        actions: the action of every move, where `demonstrations.actions` holds choices.
     """
 
     dynamics: Dynamics
@@ -64,192 +103,203 @@ class Problem(eqx.Module):
     behavior: Behavior
     prior: Prior
     planner: Planner
-    taken: Shaped[Array, "moves *action"]
-    moves: int = eqx.field(static=True)
+    actions: Shaped[Array, "moves *action"]
+    schedule: Schedule
     terms: tuple[Term, ...] = eqx.field(static=True)
     estimator: Estimator = eqx.field(static=True)
 
 
 class _Batch(NamedTuple):
-    """Some of the moves, and by how much sums over them have to be scaled up."""
+    """Indices of moves, and the factor from a sum over them to a sum over all moves."""
 
-    moves: Int[Array, " some"]
+    moves: Int[Array, " batch"]
     scale: float
 
 
-def rehearse(problem: Problem, parameters: PyTree, planning: Planning, key: PRNGKeyArray) -> Planning:
-    """Planning after a step by roll-outs from a batch of moves; nothing is learned of the dynamics."""
-    choosing, rolling = jax.random.split(key)
-    return _actions(problem, parameters, planning, _drawn(problem, choosing), rolling)[0]
+def improve_policy(
+    problem: FitProblem, parameters: PyTree, planner_state: PlannerState, key: PRNGKeyArray
+) -> PlannerState:
+    """Make a step of the policy and its critic by rollouts from a batch of moves; the model stays the same."""
+    batch_key, rollout_key = jax.random.split(key)
+    return _action_terms(problem, parameters, planner_state, _draw_batch(problem, batch_key), rollout_key)[0]
 
 
-def descend(
-    problem: Problem, parameters: PyTree, planning: Planning, key: PRNGKeyArray
-) -> tuple[Planning, PyTree, FitProgress]:
-    """By one batch of moves: improved planning, the slope of minus the objective, and where the fit stands."""
-    choosing, rolling = jax.random.split(key)
-    batch = _drawn(problem, choosing)
-    slope, numbers = _rest(problem, parameters, batch)
+def objective_gradient(
+    problem: FitProblem, parameters: PyTree, planner_state: PlannerState, key: PRNGKeyArray
+) -> tuple[PlannerState, PyTree, FitProgress]:
+    """Estimate the gradient of minus the objective from one batch of moves.
+
+    Returns:
+        The next state of the planner, the gradient, and the figures of the fit.
+
+    References:
+        Eq. 6 of the paper, with ∇Q by eq. 11.
+    """
+    batch_key, rollout_key = jax.random.split(key)
+    batch = _draw_batch(problem, batch_key)
+    slope, transitions, prior = _rollout_free_terms(problem, parameters, batch)
+    actions = zero = jnp.zeros_like(prior)
+    figures = zero, zero, zero
     if "actions" in problem.terms:
-        planning, of_actions, progress = _actions(problem, parameters, planning, batch, rolling)
-        slope = jax.tree.map(jnp.add, slope, of_actions)
-        numbers = _together(numbers, progress)
-    return planning, slope, numbers._replace(gradient=optax.tree.norm(slope))
+        terms = _action_terms(problem, parameters, planner_state, batch, rollout_key)
+        planner_state, action_slope, actions, plan = terms
+        slope = jax.tree.map(jnp.add, slope, action_slope)
+        figures = plan.expected_return, plan.entropy, plan.policy_gap
+    values = transitions + prior + actions, actions, transitions, prior
+    return planner_state, slope, FitProgress(0, *values, optax.tree.norm(slope), *figures)  # pyright: ignore[reportArgumentType]
 
 
-def _drawn(problem: Problem, key: PRNGKeyArray) -> _Batch:
-    count, all_moves = min(problem.moves, len(problem.demonstrations)), len(problem.demonstrations)
-    return _Batch(jax.random.choice(key, all_moves, (count,), replace=False), all_moves / count)
+def _draw_batch(problem: FitProblem, key: PRNGKeyArray) -> _Batch:
+    moves = len(problem.demonstrations)
+    count = min(problem.schedule.batch_size, moves)
+    return _Batch(jax.random.choice(key, moves, (count,), replace=False), moves / count)
 
 
-def _rest(problem: Problem, parameters: PyTree, batch: _Batch) -> tuple[PyTree, FitProgress]:
-    """The slope of minus what needs no roll-outs, the transitions' term (if it counts) and the prior, and the two."""
+def _rollout_free_terms(problem: FitProblem, parameters: PyTree, batch: _Batch) -> tuple[PyTree, Array, Array]:
+    """Return the gradient of minus the transitions' term (if it counts) and the prior, and the two values."""
     demos = problem.demonstrations
     moves, scale = batch
 
-    def parts(parameters: PyTree) -> tuple[Array, tuple[Array, Array]]:
+    def loss(parameters: PyTree) -> tuple[Array, tuple[Array, Array]]:
         dynamics, prior = problem.dynamics.with_parameters(parameters), problem.prior.log_density(parameters)
-        passed = jnp.zeros_like(prior)
+        transitions = jnp.zeros_like(prior)
         if "transitions" in problem.terms:
-            densities = jax.vmap(dynamics.log_prob)(demos.states[moves], problem.taken[moves], demos.next_states[moves])
-            passed = scale * densities.sum()
-        return -(passed + prior), (passed, prior)
+            arguments = demos.states[moves], problem.actions[moves], demos.next_states[moves]
+            transitions = scale * jax.vmap(dynamics.log_prob)(*arguments).sum()
+        return -(transitions + prior), (transitions, prior)
 
-    slope, (passed, prior) = jax.grad(parts, has_aux=True)(parameters)
-    none = jnp.zeros_like(prior)
-    return slope, FitProgress(0, passed + prior, none, passed, prior, none, none, none, none)  # pyright: ignore[reportArgumentType]
-
-
-def _together(rest: FitProgress, progress: tuple[Array, PlanProgress]) -> FitProgress:
-    """The figures of all terms, those of the actions added."""
-    actions, plan = progress
-    return rest._replace(
-        objective=rest.objective + actions,  # pyright: ignore[reportArgumentType]
-        actions=actions,  # pyright: ignore[reportArgumentType]
-        expected_return=plan.expected_return,
-        entropy=plan.entropy,
-        lag=plan.lag,
-    )
+    slope, (transitions, prior) = jax.grad(loss, has_aux=True)(parameters)
+    return slope, transitions, prior
 
 
-def _actions(
-    problem: Problem, parameters: PyTree, planning: Planning, batch: _Batch, key: PRNGKeyArray
-) -> tuple[Planning, PyTree, tuple[Array, PlanProgress]]:
-    """What roll-outs from some demonstrated moves say.
+def _action_terms(
+    problem: FitProblem, parameters: PyTree, planner_state: PlannerState, batch: _Batch, key: PRNGKeyArray
+) -> tuple[PlannerState, PyTree, Array, PlanProgress]:
+    """Estimate the actions' term by rollouts from the states of a batch of moves.
 
-    That is the improved planning, the slope of minus the actions' log-likelihood, the log-likelihood itself, and how
-    good the policy is.
+    Returns:
+        The next state of the planner, the gradient of minus the actions' log-likelihood, this log-likelihood, and the
+        figures of the policy.
     """
-    demos, planner, behavior = problem.demonstrations, problem.planner, problem.behavior
-    drawing, rolling = jax.random.split(key)
+    demos, planner, behavior, policy = problem.demonstrations, problem.planner, problem.behavior, planner_state.policy
+    choice_key, rollout_key = jax.random.split(key)
     moves, scale = batch
-    tasks, states, chosen = task_at(demos.tasks, demos.task[moves]), demos.states[moves], demos.actions[moves]
-    drawn, shares = planner.tried(drawing, planning.policy, tasks, states)
-    people = _People(behavior, planning.policy, tasks, states, chosen, drawn)
-    tried, shares = people.options(shares)
-    gradient, rolled = value_gradient(
+    tasks, states, observed = task_at(demos.tasks, demos.task[moves]), demos.states[moves], demos.actions[moves]
+    drawn, probabilities = planner.candidate_actions(choice_key, policy, tasks, states)
+    likelihood = _ActionLikelihood(behavior, policy, tasks, states, observed, drawn)
+    candidates, probabilities = likelihood.candidates(probabilities)
+    gradient, rollouts = value_gradient(
         problem.dynamics.with_parameters(parameters),
-        planning.policy,
+        policy,
         tasks,
         behavior,
-        rolling,
+        rollout_key,
         states,
-        tried,
-        people.weights,
+        candidates,
+        likelihood.weights,
         horizon=planner.horizon,
         samples=planner.samples,
-        critic=planning.critic,
+        critic=planner_state.critic,
         estimator=problem.estimator,
     )
-    improved, progress = planner.improve(planning, tasks, behavior, rolled, shares)
-    q = said(rolled, spread_over(tasks, rolled).discount)[..., 0].mean(axis=-1)
+    improved, progress = planner.update(planner_state, behavior, rollouts, probabilities)
+    q = q_estimates(rollouts)[..., 0].mean(axis=-1)
     slope = jax.tree.map(lambda leaf: -scale * leaf, gradient)
-    return improved, slope, (scale * people.log_probs(q).sum(), progress)
+    return improved, slope, scale * likelihood.log_probs(q).sum(), progress
 
 
-class _People(NamedTuple):
-    """Some demonstrated moves, and how probable their choices are by what roll-outs say.
+class _ActionLikelihood(NamedTuple):
+    """The likelihood of the choices of some demonstrated moves, by Q estimates.
 
-    - `chosen`: what was done. `drawn`: what the policy would do; over a finite set, all actions.
+    `observed` are the choices of the demonstrations, `drawn` those of the policy (over a finite set, all actions).
     """
 
     behavior: Behavior
     policy: Policy
     tasks: ContinuousTask
     states: Array
-    chosen: Array
+    observed: Array
     drawn: Array
 
-    def options(self, shares: Array) -> tuple[Array, Array]:
-        """What is to be tried: all actions of a finite set, or what people did and what the policy draws."""
+    def candidates(self, probabilities: Array) -> tuple[Array, Array]:
+        """Return all actions of a finite set, or the observed choices followed by those that the policy draws."""
         if isinstance(self.policy, FinitePolicy):
-            return self.drawn, shares
+            return self.drawn, probabilities
         return (
-            jnp.concatenate([self.chosen[:, None], self.drawn], axis=1),
-            jnp.concatenate([jnp.zeros_like(shares[:, :1]), shares], axis=1),
+            jnp.concatenate([self.observed[:, None], self.drawn], axis=1),
+            jnp.concatenate([jnp.zeros_like(probabilities[:, :1]), probabilities], axis=1),
         )
 
-    def weights(self, q: Float[Array, "places options"]) -> Float[Array, "places options"]:
-        """β (1 for what was done − π): what ∇Q of each option counts for ∇ log π of what was done."""
+    def weights(self, q: Float[Array, "starts candidates"]) -> Float[Array, "starts candidates"]:
+        """Return β (1 for the observed choice − π), the weights of ∇Q in ∇ log π of the observed choices."""
         beta = self.behavior.beta
         if isinstance(self.policy, FinitePolicy):
-            done = jax.nn.one_hot(self.chosen, q.shape[1], dtype=q.dtype)
-            return beta * (done - jnp.exp(self.behavior.log_policy(q)))
-        shares = jax.nn.softmax(self._soft(q), axis=1)
-        return beta * jnp.concatenate([jnp.ones_like(shares[:, :1]), -shares], axis=1)
+            observed = jax.nn.one_hot(self.observed, q.shape[1], dtype=q.dtype)
+            return beta * (observed - jnp.exp(self.behavior.log_policy(q)))
+        probabilities = jax.nn.softmax(self._log_importance(q), axis=1)
+        return beta * jnp.concatenate([jnp.ones_like(probabilities[:, :1]), -probabilities], axis=1)
 
-    def log_probs(self, q: Float[Array, "places options"]) -> Float[Array, " places"]:
-        """log π of what was done."""
+    def log_probs(self, q: Float[Array, "starts candidates"]) -> Float[Array, " starts"]:
+        """Return ln π of the observed choices."""
         if isinstance(self.policy, FinitePolicy):
-            return jnp.take_along_axis(self.behavior.log_policy(q), self.chosen[:, None], axis=1)[:, 0]
-        drawn = self._soft(q)
-        return self.behavior.beta * q[:, 0] - jax.nn.logsumexp(drawn, axis=1) + jnp.log(drawn.shape[1])
+            return jnp.take_along_axis(self.behavior.log_policy(q), self.observed[:, None], axis=1)[:, 0]
+        weights = self._log_importance(q)
+        return self.behavior.beta * q[:, 0] - jax.nn.logsumexp(weights, axis=1) + jnp.log(weights.shape[1])
 
-    def _soft(self, q: Float[Array, "places options"]) -> Float[Array, "places drawn"]:
-        """βQ − ln π_λ of what the policy draws; means by π ∝ exp βQ are means of draws with the exponential of this."""
-        seen = jax.vmap(lambda task, state: task.features(state))(self.tasks, self.states)
-        log_probs = jax.vmap(jax.vmap(self.policy.log_prob, (None, 0)))(seen, self.drawn)
+    def _log_importance(self, q: Float[Array, "starts candidates"]) -> Float[Array, "starts drawn"]:
+        """Return the logarithms βQ − ln π_λ of the importance weights of the drawn choices."""
+        features = task_features(self.tasks, self.states)
+        log_probs = jax.vmap(jax.vmap(self.policy.log_prob, (None, 0)))(features, self.drawn)
         return self.behavior.beta * q[:, 1:] - log_probs
 
 
-def check_problem(problem: Problem, policy: Policy) -> None:
-    """Raises `InputError` for data or settings that do not go together."""
+def check_problem(problem: FitProblem, policy: Policy) -> None:
+    """Refuse data or settings that do not go together."""
     demos = problem.demonstrations
     if not problem.terms or not set(problem.terms) <= set(ALL_TERMS):
         raise InputError(f"expected one or both of {ALL_TERMS}, found {problem.terms}", field="terms")
+    check_schedule(problem.schedule)
     check_planner(problem.planner)
     if not jax.tree.leaves(problem.dynamics.parameters):
         raise InputError("expected parameters to learn, found none", field="dynamics")
     check_finite(problem.dynamics.parameters)
     check_tasks(demos.tasks)
-    check_places(demos.states, demos.task, demos.tasks)
+    check_starts(demos.states, demos.task, demos.tasks)
     check_estimator(problem.estimator, problem.dynamics, demos.tasks)
     if not isinstance(policy, FinitePolicy) and not isinstance(problem.behavior.backup, LogSumExp):
         raise InputError(
-            "over vectors of actions people's policy is known for the log-sum-exp only: expected that, or a finite set",
+            "over vectors of actions the policy is known for the log-sum-exp only: expected that, or a finite set",
             field="behavior",
         )
-    if not np.isfinite(demos.next_states).all():
-        raise InputError("expected finite numbers", field="next_states")
+    check_finite(demos.next_states, field="next_states")
     _check_shapes(problem)
-    densities = np.asarray(jax.vmap(problem.dynamics.log_prob)(demos.states, problem.taken, demos.next_states))
+    densities = np.asarray(jax.vmap(problem.dynamics.log_prob)(demos.states, problem.actions, demos.next_states))
     wrong = np.isnan(densities) | ((densities == -np.inf) & ("transitions" in problem.terms))
     if wrong.any():
         move = int(wrong.argmax())
         raise InputError(
-            f"expected a density above 0 for what happened, found the logarithm {densities[move]}",
+            f"expected a density above 0 for every transition, found the logarithm {densities[move]}",
             source=f"trajectory {int(demos.trajectory[move]) + 1}",
             field="log_prob",
         )
 
 
-def _check_shapes(problem: Problem) -> None:
-    """Raises `InputError` for states or actions that the dynamics cannot take."""
-    states, taken = problem.demonstrations.states, problem.taken
-    expected = f"expected states and actions that the dynamics can take, found shapes {states.shape[1:]} and "
+def _check_shapes(problem: FitProblem) -> None:
+    """Refuse states or actions of shapes that the dynamics cannot take."""
+    state, action = problem.demonstrations.states[0], problem.actions[0]
+    expected = f"expected states and actions that the dynamics can take, found shapes {state.shape} and {action.shape}"
     try:
-        led = jax.eval_shape(problem.dynamics.sample, jax.random.key(0), states[0], taken[0]).shape
+        following = jax.eval_shape(problem.dynamics.sample, jax.random.key(0), state, action).shape
     except (TypeError, ValueError, IndexError) as error:
-        raise InputError(f"{expected}{taken.shape[1:]}", field="demonstrations") from error
-    if led != states.shape[1:]:
-        raise InputError(f"{expected}{taken.shape[1:]}, which lead to {led}", field="demonstrations")
+        raise InputError(expected, field="demonstrations") from error
+    if following != state.shape:
+        raise InputError(f"{expected}, which lead to {following}", field="demonstrations")
+
+
+def check_schedule(schedule: Schedule) -> None:
+    """Refuse settings that are too small, and rates or tolerances not above 0."""
+    # the drift is a difference between two iterations or more
+    for name, least in {"iterations": 2, "policy_warmup": 0, "batch_size": 1, "policy_steps": 1}.items():
+        check_count(getattr(schedule, name), least, name)
+    for name in ("learning_rate", "drift_tolerance", "policy_gap_tolerance"):
+        check_positive(getattr(schedule, name), name)

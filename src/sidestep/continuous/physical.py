@@ -2,35 +2,50 @@
 
 The **pendulum** is that of Gymnasium's `Pendulum-v1`: the angle φ from upright and its speed ω under a torque u,
 
-    ω′ = ω + (3g/(2ℓ) sin φ + 3u/(mℓ²)) Δt,  kept in [−8, 8],        φ′ = φ + ω′ Δt,        u in [−2, 2].
+    ω′ = ω + (3g/(2ℓ) sin φ + 3u/(mℓ²)) Δt,  clipped to [−8, 8],        φ′ = φ + ω′ Δt,        u in [−2, 2].
 
-The **point mass** moves in a plane, pushed by an acceleration a, by wind, and slowed by friction:
+The **point mass** moves in a plane under an acceleration a, wind and friction:
 
     v′ = v + (a + wind − friction · v) Δt,        x′ = x + v′ Δt.
 
-Unknown constants that are above 0 are learned as logarithms, so that steps are relative and none turns negative.
+Unknown constants above 0 are learned as logarithms: steps are relative, and no constant becomes negative.
 """
 
 from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Scalar
 
-from sidestep.continuous.dynamics import GaussianDynamics, Outcomes, certain, check_finite, checked_noise
-from sidestep.errors import InputError
+from sidestep.continuous.dynamics import GaussianDynamics, Outcomes, check_finite, checked_noise
+from sidestep.errors import InputError, check_positive
 
 PENDULUM_CONSTANTS = ("gravity", "mass", "length")
-"""What may be unknown about a pendulum."""
+"""The constants of a pendulum that may be unknown."""
 
 
 class Pendulum(GaussianDynamics):
-    """Gymnasium's `Pendulum-v1`; the state is (φ, ω), the action (u,).
+    """Gymnasium's `Pendulum-v1`; the state is (φ, ω) in radians and radians per second, the action (u,).
 
-    - `parameters`: the logarithms of the unknown constants, by name.
-    - `known`: the other constants.
-    - `noise`: of φ′ and ω′.
+    Args:
+        gravity: g in m/s², above 0.
+        mass: m in kg, above 0.
+        length: ℓ in m, above 0.
+        unknown: the names of the constants to learn, from `PENDULUM_CONSTANTS`.
+        noise: the standard deviations of φ′ and ω′, above 0.
+        time_step: Δt in seconds, above 0.
+
+    Attributes:
+        parameters: the logarithms of the unknown constants, by name.
+        known: the other constants.
+
+    Raises:
+        InputError: constants, noise or a time step not above 0, or an unknown name.
+
+    Example:
+        >>> pendulum = Pendulum(gravity=10.0)
+        >>> pendulum.outcomes(jnp.zeros(2), jnp.array([1.0])).means.round(4).tolist()
+        [[0.0075, 0.15]]
     """
 
     parameters: dict[str, Float[Array, ""]]
@@ -48,11 +63,9 @@ class Pendulum(GaussianDynamics):
         noise: tuple[float, float] = (0.01, 0.05),
         time_step: float = 0.05,
     ):
-        """Raises `InputError` for constants, noise or a time step not above 0, or an unknown that is none of them."""
-        values: dict[str, float] = {"gravity": gravity, "mass": mass, "length": length}
+        values: dict[str, float] = dict(zip(PENDULUM_CONSTANTS, (gravity, mass, length), strict=True))
         for name, value in (*values.items(), ("time_step", time_step)):
-            if not (np.isfinite(value) and value > 0):
-                raise InputError(f"expected a finite number above 0, found {value}", field=name)
+            check_positive(value, name)
         if not set(unknown) <= set(values):
             raise InputError(f"expected some of {PENDULUM_CONSTANTS}, found {tuple(unknown)}", field="unknown")
         self.parameters = {name: jnp.log(jnp.asarray(values[name], jnp.result_type(float))) for name in unknown}
@@ -60,28 +73,41 @@ class Pendulum(GaussianDynamics):
         self.noise, self.time_step = checked_noise(jnp.asarray(noise), 2), time_step
 
     def constant(self, name: str) -> Float[Scalar, ""] | float:
-        """A constant in its own units, known or not."""
+        """Return a constant in its own unit, whether known or learned."""
         return jnp.exp(self.parameters[name]) if name in self.parameters else self.known[name]
 
     def example_action(self) -> Float[Array, " 1"]:
-        """A torque."""
+        """Return a torque."""
         return jnp.zeros(1, self.noise.dtype)
 
     def outcomes(self, state: Float[Array, " 2"], action: Float[Array, " 1"]) -> Outcomes:
-        """One step of the integrator."""
+        """Return one step of the integrator."""
         gravity, mass, length = (self.constant(name) for name in PENDULUM_CONSTANTS)
         angle, speed = state
         torque = jnp.clip(action[0], -2, 2)
-        push = 3 * gravity / (2 * length) * jnp.sin(angle) + 3 / (mass * length**2) * torque
-        speed = jnp.clip(speed + push * self.time_step, -8, 8)
-        return certain(jnp.stack([angle + speed * self.time_step, speed]))
+        acceleration = 3 * gravity / (2 * length) * jnp.sin(angle) + 3 / (mass * length**2) * torque
+        speed = jnp.clip(speed + acceleration * self.time_step, -8, 8)
+        return Outcomes.single(jnp.stack([angle + speed * self.time_step, speed]))
 
 
 class PointMass(GaussianDynamics):
-    """A point mass in a plane with friction and wind; the state is (x, y, v_x, v_y), the action an acceleration.
+    """A point mass in a plane; the state is (x, y, v_x, v_y), the action an acceleration.
 
-    - `parameters`: {"friction": its logarithm, "wind": the acceleration by wind}.
-    - `noise`: of each component of the next state.
+    Args:
+        friction: the deceleration per unit of speed, above 0.
+        wind: the acceleration by wind.
+        noise: the standard deviation of each component of the next state, above 0.
+        time_step: Δt, above 0.
+
+    Attributes:
+        parameters: {"friction": its logarithm, "wind": the acceleration by wind}.
+
+    Raises:
+        InputError: friction, noise or a time step not above 0, or wind that is not finite.
+
+    Example:
+        >>> PointMass().outcomes(jnp.zeros(4), jnp.array([1.0, 0.0])).means.round(3).tolist()
+        [[0.01, 0.0, 0.1, 0.0]]
     """
 
     parameters: dict[str, Float[Array, "..."]]
@@ -96,22 +122,20 @@ class PointMass(GaussianDynamics):
         noise: tuple[float, float, float, float] = (0.01, 0.01, 0.02, 0.02),
         time_step: float = 0.1,
     ):
-        """Raises `InputError` for friction, noise or a time step not above 0, and wind that is not finite."""
-        for name, value in (("friction", friction), ("time_step", time_step)):
-            if not (np.isfinite(value) and value > 0):
-                raise InputError(f"expected a finite number above 0, found {value}", field=name)
+        check_positive(friction, "friction")
+        check_positive(time_step, "time_step")
         real = jnp.result_type(float)
         self.parameters = {"friction": jnp.log(jnp.asarray(friction, real)), "wind": jnp.asarray(wind, real)}
         check_finite(self.parameters)
         self.noise, self.time_step = checked_noise(jnp.asarray(noise), 4), time_step
 
     def example_action(self) -> Float[Array, " 2"]:
-        """An acceleration."""
+        """Return an acceleration."""
         return jnp.zeros(2, self.noise.dtype)
 
     def outcomes(self, state: Float[Array, " 4"], action: Float[Array, " 2"]) -> Outcomes:
-        """One step of the integrator."""
+        """Return one step of the integrator."""
         place, speed = state[:2], state[2:]
         friction = jnp.exp(self.parameters["friction"])
         speed = speed + (action + self.parameters["wind"] - friction * speed) * self.time_step
-        return certain(jnp.concatenate([place + speed * self.time_step, speed]))
+        return Outcomes.single(jnp.concatenate([place + speed * self.time_step, speed]))

@@ -1,17 +1,21 @@
-"""Roll-outs: what happens when a policy acts in a world, τ moves far, and what it was worth.
+"""Rollouts: τ moves of a policy in a world, and the returns that follow.
 
-Move i = 0…τ−1 takes action a_i in state s_i, pays R(s_i, a_i) and leads to s_{i+1}; a terminal state pays its final
-reward once and nothing happens after. The worth of what is *to come* from state s_i is
+Move i = 0…τ−1 takes action a_i in state s_i, pays R(s_i, a_i) and leads to s_{i+1}; a terminal state pays its terminal
+reward once, and nothing happens after it. The *return-to-go* from state s_i is
 
-    W_i = R_i + b_i − z_i + γ W_{i+1},        W_τ = R_τ (a final reward, if s_τ is the first terminal state),
+    W_i = R_i + b_i − z_i + γ W_{i+1},        W_τ = R_τ (a terminal reward, if s_τ is the first terminal state).
 
-where b_i is what the people's backup adds to the mean of its actions' values (`Backup.bonus`: the entropy over β for
-the log-sum-exp, nothing for the Boltzmann average and the hard maximum), less q_λ(s_i, a_i)/β, what the policy's own
-advantages expect of this choice beyond the mean. The latter averages to nothing, whatever the policy, and takes off
-most of the noise of drawing choices where the policy is near π ∝ exp βQ^π. (For the log-sum-exp, b_i is so
-−ln π(a_i | s_i)/β.) The *surprise* z_i = γ (V_w(s_{i+1}) − E V_w(s_{i+1})), by a critic V_w and the dynamics, does the
-same for the noise of what an action leads to; it averages to nothing too, however wrong the critic. What a roll-out
-says of Q^π(s_i, a_i), of people who look τ moves ahead, is then
+It differs from the textbook's sum of discounted rewards in two terms.
+
+1. The *bonus* b_i = B_i − q_λ(s_i, a_i)/β. B_i is the difference between the agent's backup and the mean of its
+   actions' values (`Backup.bonus`: the entropy over β for the log-sum-exp, 0 for the Boltzmann average and the hard
+   maximum). q_λ/β is the advantage that the policy itself expects of the choice. Its mean is 0 for every policy, and
+   near π ∝ exp βQ^π it removes most of the variance of drawing choices. (For the log-sum-exp, b_i is therefore
+   −ln π(a_i | s_i)/β.)
+2. The *transition control variate* z_i = γ (V_w(s_{i+1}) − E V_w(s_{i+1})), by a critic V_w and the dynamics, removes
+   variance of the draw of next states. Its mean is 0 for every critic.
+
+The *Q estimate* of Q^π(s_i, a_i), for an agent that looks τ moves ahead, is then
 
     Q̂_i = R_i − z_i + γ W_{i+1},        and E[W_0] = V^π(s_0).
 """
@@ -28,41 +32,50 @@ from sidestep.errors import check_count
 from sidestep.tabular.backups import Behavior, HardMax
 
 
-class RollOut(eqx.Module):
-    """One roll-out, or (with leading axes) many.
+class Rollout(eqx.Module):
+    """One rollout or, with leading axes, many.
 
-    - `states`: s_0…s_τ; after the end they go on as if it had not come, and count for nothing.
-    - `choices`: those of the policy; `choices[0]` may have been given.
-    - `rewards`: R_0…R_τ, 0 after the end.
-    - `bonuses`: b_0…b_{τ−1}, 0 after the end.
-    - `surprises`: z_0…z_{τ−1}, 0 until a critic says what was to be expected (`estimators.surprised`).
-    - `acting`: whether an action was taken in s_i.
+    Attributes:
+        task: the task of every rollout.
+        states: s_0…s_τ; those after the end are sampled too, and count for nothing.
+        choices: c_0…c_{τ−1} of the policy; the caller may fix the first.
+        rewards: R_0…R_τ, 0 after the end.
+        bonuses: b_0…b_{τ−1}, 0 after the end.
+        transition_control_variates: z_0…z_{τ−1}, 0 until `estimators.with_control_variates` sets them.
+        acting: whether an action was taken in s_i.
     """
 
+    task: ContinuousTask
     states: Shaped[Array, "..."]
     choices: Shaped[Array, "..."]
     rewards: Float[Array, "*batch payments"]
     bonuses: Float[Array, "*batch moves"]
-    surprises: Float[Array, "*batch moves"]
+    transition_control_variates: Float[Array, "*batch moves"]
     acting: Bool[Array, "*batch moves"]
 
     @property
     def leaving(self) -> Shaped[Array, "..."]:
-        """s_0…s_{τ−1}, the states that moves leave."""
+        """The states s_0…s_{τ−1} that moves leave."""
         return jax.lax.slice_in_dim(self.states, 0, self.acting.shape[-1], axis=self.acting.ndim - 1)
 
     @property
     def following(self) -> Shaped[Array, "..."]:
-        """s_1…s_τ, the states that moves lead to."""
+        """The states s_1…s_τ that moves lead to."""
         return jax.lax.slice_in_dim(self.states, 1, None, axis=self.acting.ndim - 1)
+
+    @property
+    def fraction_left(self) -> Float[Array, "*batch moves"]:
+        """The fraction 1 − i/τ of the horizon that is left at every move."""
+        moves = self.acting.shape[-1]
+        return jnp.broadcast_to(1 - jnp.arange(moves) / moves, self.acting.shape).astype(self.rewards.dtype)
 
 
 def temperature(behavior: Behavior) -> Float[Array, ""]:
-    """1/β, or 0 for people who act optimally (`HardMax`)."""
+    """Return 1/β, or 0 for an optimal agent (`HardMax`)."""
     return jnp.zeros_like(behavior.beta) if isinstance(behavior.backup, HardMax) else 1 / behavior.beta
 
 
-def roll_out(
+def sample_rollout(
     dynamics: Dynamics,
     policy: Policy,
     task: ContinuousTask,
@@ -71,108 +84,130 @@ def roll_out(
     state: State,
     horizon: int,
     choice: Choice | None = None,
-) -> RollOut:
-    """What happens from `state` within `horizon` moves; the first choice is the policy's, unless it is given.
+) -> Rollout:
+    """Sample one rollout from a state.
 
-    Differentiable along the path by θ, by λ, or both, where dynamics and policy are reparameterised. Raises
-    `InputError` for a horizon below 1.
+    It is differentiable along the path by θ, by λ, or both, where dynamics and policy are reparameterized.
+
+    Args:
+        dynamics: T_θ.
+        policy: π_λ.
+        task: rewards and ends.
+        behavior: the agent's backup and β, which set the bonuses.
+        key: draws everything random.
+        state: s_0.
+        horizon: τ, the number of moves, 1 or more.
+        choice: the first choice; drawn from the policy by default.
+
+    Raises:
+        InputError: a horizon below 1.
+
+    Example:
+        >>> import sidestep.continuous as sc
+        >>> task = sc.QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.eye(1), jnp.asarray(0.9))
+        >>> dynamics = sc.LinearGaussian(jnp.eye(1), jnp.eye(1), jnp.full(1, 0.1))
+        >>> policy = sc.gaussian_policy(jax.random.key(0), 1, jnp.ones((1, 1)))
+        >>> behavior = Behavior(HardMax())
+        >>> sample_rollout(dynamics, policy, task, behavior, jax.random.key(1), jnp.zeros(1), horizon=5).states.shape
+        (6, 1)
     """
     check_count(horizon, 1, "horizon")
+    actions = len(policy.actions) if isinstance(policy, FinitePolicy) else None
 
     def move(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, tuple]:
         state, choice, over = carry
-        moving, choosing = jax.random.split(key)
+        transition_key, choice_key = jax.random.split(key)
         terminal = task.terminal(state)
         acting = ~(over | terminal)
         action = policy.action(choice)
-        pays = jnp.where(acting, task.reward(state, action), jnp.where(over, 0.0, task.terminal_reward(state)))
-        seen = task.features(state)
-        entropy = policy.entropy(seen)
-        beyond_mean = temperature(behavior) * (policy.log_prob(seen, choice) + entropy)
-        bonus = jnp.where(acting, behavior.backup.bonus(entropy, actions, behavior.beta) - beyond_mean, 0.0)
-        following = dynamics.sample(moving, state, action)
-        next_choice = policy.sample(choosing, task.features(following))
-        return (following, next_choice, over | terminal), (state, choice, pays, bonus, acting)
+        reward = jnp.where(acting, task.reward(state, action), jnp.where(over, 0.0, task.terminal_reward(state)))
+        features = task.features(state)
+        entropy = policy.entropy(features)
+        expected = temperature(behavior) * (policy.log_prob(features, choice) + entropy)
+        bonus = jnp.where(acting, behavior.backup.bonus(entropy, actions, behavior.beta) - expected, 0.0)
+        following = dynamics.sample(transition_key, state, action)
+        next_choice = policy.sample(choice_key, task.features(following))
+        return (following, next_choice, over | terminal), (state, choice, reward, bonus, acting)
 
-    actions = len(policy.actions) if isinstance(policy, FinitePolicy) else None
-    first, key = jax.random.split(key)
-    choice = policy.sample(first, task.features(state)) if choice is None else choice
-    last, passed = jax.lax.scan(move, (state, choice, jnp.zeros((), bool)), jax.random.split(key, horizon))
-    states, choices, rewards, bonuses, acting = passed
+    first_key, key = jax.random.split(key)
+    choice = policy.sample(first_key, task.features(state)) if choice is None else choice
+    last, moves = jax.lax.scan(move, (state, choice, jnp.zeros((), bool)), jax.random.split(key, horizon))
+    states, choices, rewards, bonuses, acting = moves
     end, _, over = last
-    pays = jnp.where(task.terminal(end) & ~over, task.terminal_reward(end), 0.0).astype(rewards.dtype)
+    final = jnp.where(task.terminal(end) & ~over, task.terminal_reward(end), 0.0).astype(rewards.dtype)
+    states, rewards = jnp.concatenate([states, end[None]]), jnp.append(rewards, final)
     bonuses = bonuses.astype(rewards.dtype)
-    return RollOut(
-        jnp.concatenate([states, end[None]]),
-        choices,
-        jnp.append(rewards, pays),
-        bonuses,
-        jnp.zeros_like(bonuses),
-        acting,
-    )
+    return Rollout(task, states, choices, rewards, bonuses, jnp.zeros_like(bonuses), acting)
 
 
-def roll_outs(
+def sample_rollouts(
     dynamics: Dynamics,
     policy: Policy,
     tasks: ContinuousTask,
     behavior: Behavior,
     key: PRNGKeyArray,
-    states: Shaped[Array, "places *state"],
+    states: Shaped[Array, "starts *state"],
     horizon: int,
-    choices: Shaped[Array, "places options *choice"],
+    choices: Shaped[Array, "starts candidates *choice"],
     samples: int,
-) -> RollOut:
-    """Many roll-outs: `samples` from every place with every one of its first choices.
+) -> Rollout:
+    """Sample several rollouts from every start with each of its first choices.
 
-    - `tasks`: the task of each place (a leading axis of places).
-    - The result has leading axes (places, options, samples). The options of a place share their random numbers, so that
-      differences between them are less noisy than they are.
+    The candidates of one start share their random numbers (common random numbers), which reduces the variance of
+    differences between them.
 
-    Raises `InputError` for a horizon or samples below 1.
+    Args:
+        dynamics: T_θ.
+        policy: π_λ.
+        tasks: the task of each start (a leading axis of starts).
+        behavior: the agent's backup and β.
+        key: draws everything random.
+        states: s_0 of each start.
+        horizon: τ, the number of moves, 1 or more.
+        choices: the first choices to try from each start.
+        samples: rollouts of each first choice, 1 or more.
+
+    Returns:
+        Rollouts with leading axes (starts, candidates, samples).
+
+    Raises:
+        InputError: a horizon or samples below 1.
     """
     check_count(samples, 1, "samples")
     keys = jax.random.split(key, (len(states), samples))
 
-    def one(task: ContinuousTask, state: State, choice: Choice, key: PRNGKeyArray) -> RollOut:
-        return roll_out(dynamics, policy, task, behavior, key, state, horizon, choice)
+    def sample(task: ContinuousTask, state: State, choice: Choice, key: PRNGKeyArray) -> Rollout:
+        return sample_rollout(dynamics, policy, task, behavior, key, state, horizon, choice)
 
-    over_samples = jax.vmap(one, (None, None, None, 0))
-    over_options = jax.vmap(over_samples, (None, None, 0, None))
-    return jax.vmap(over_options)(tasks, states, choices, keys)
-
-
-def to_come(rolled: RollOut, discount: Float[Array, "*#batch"]) -> Float[Array, "*batch payments"]:
-    """W_0…W_τ; `discount` broadcasts against the leading axes of the roll-outs."""
-
-    def earlier(after: Array, now: Array) -> tuple[Array, Array]:
-        worth = now + discount * after
-        return worth, worth
-
-    gains = rolled.rewards[..., :-1] + rolled.bonuses - rolled.surprises
-    last = rolled.rewards[..., -1]
-    _, worths = jax.lax.scan(earlier, last, jnp.moveaxis(gains, -1, 0), reverse=True)
-    return jnp.concatenate([jnp.moveaxis(worths, 0, -1), last[..., None]], axis=-1)
+    over_samples = jax.vmap(sample, (None, None, None, 0))
+    over_candidates = jax.vmap(over_samples, (None, None, 0, None))
+    return jax.vmap(over_candidates)(tasks, states, choices, keys)
 
 
-def said(rolled: RollOut, discount: Float[Array, "*#batch"]) -> Float[Array, "*batch moves"]:
-    """Q̂_i = R_i − z_i + γ W_{i+1}, what roll-outs say of Q^π(s_i, a_i), for every move."""
-    after = to_come(rolled, discount)[..., 1:]
-    return rolled.rewards[..., :-1] - rolled.surprises + discount[..., None] * after
+def returns_to_go(rollouts: Rollout) -> Float[Array, "*batch payments"]:
+    """Return W_0…W_τ."""
+
+    def add(after: Array, gain: Array) -> tuple[Array, Array]:
+        total = gain + rollouts.task.discount * after
+        return total, total
+
+    gains = rollouts.rewards[..., :-1] + rollouts.bonuses - rollouts.transition_control_variates
+    last = rollouts.rewards[..., -1]
+    _, totals = jax.lax.scan(add, last, jnp.moveaxis(gains, -1, 0), reverse=True)
+    return jnp.concatenate([jnp.moveaxis(totals, 0, -1), last[..., None]], axis=-1)
 
 
-def returns(rolled: RollOut, discount: Float[Array, "*#batch"]) -> Float[Array, "*batch"]:
-    """Σ γ^i R_i, without bonuses."""
-    powers = discount[..., None] ** jnp.arange(rolled.rewards.shape[-1])
-    return jnp.sum(powers * rolled.rewards, axis=-1)
+def q_estimates(rollouts: Rollout) -> Float[Array, "*batch moves"]:
+    """Return Q̂_i = R_i − z_i + γ W_{i+1} for every move."""
+    after = returns_to_go(rollouts)[..., 1:]
+    return rollouts.rewards[..., :-1] - rollouts.transition_control_variates + rollouts.task.discount[..., None] * after
 
 
-def spread_over(tasks: ContinuousTask, rolled: RollOut) -> ContinuousTask:
-    """The tasks of roll-outs with the same leading axes as these, from tasks with an axis of places."""
-    leading = rolled.acting.shape[:-1]
+def discounted_returns(rollouts: Rollout) -> Float[Array, "*batch"]:
+    """Return Σ γ^i R_i, without bonuses."""
+    return jnp.sum(discount_powers(rollouts, rollouts.rewards.shape[-1]) * rollouts.rewards, axis=-1)
 
-    def over(leaf: Array) -> Array:
-        inner = leaf.reshape(leaf.shape[0], *(1,) * (len(leading) - 1), *leaf.shape[1:])
-        return jnp.broadcast_to(inner, (*leading, *leaf.shape[1:]))
 
-    return jax.tree.map(over, tasks)
+def discount_powers(rollouts: Rollout, count: int) -> Float[Array, "*batch count"]:
+    """Return γ^0…γ^{count−1} of every rollout."""
+    return rollouts.task.discount[..., None] ** jnp.arange(count)

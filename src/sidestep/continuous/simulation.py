@@ -1,7 +1,7 @@
-"""People in a continuous world, whose values are found on a lattice: demonstrations to learn from.
+"""Simulated agents in a continuous world, with values from a lattice: demonstrations to learn from.
 
-They plan with the dynamics that they believe in, exactly but for the lattice, and move in the real ones. Nothing here
-is shared with what learns from them: neither roll-outs nor policies.
+An agent plans with the dynamics that it believes in, exactly but for the lattice, and moves in the real ones. This
+module imports neither rollouts nor policies, so that the data do not depend on the methods that learn from them.
 """
 
 from collections.abc import Sequence
@@ -13,33 +13,57 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from sidestep.continuous.dynamics import GaussianDynamics
-from sidestep.continuous.lattice import Lattice, action_values, tabular, tabular_task
+from sidestep.continuous.lattice import Lattice, action_values, tabular_model, tabular_task
 from sidestep.continuous.tasks import ContinuousTask
 from sidestep.errors import InputError, NotConverged, check_count
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.demonstrations import Trajectory
-from sidestep.tabular.solve import check_proper, solve
+from sidestep.tabular.solve import SolveOptions, check_proper, solve
 
 
-def simulate(
+def simulate_trajectories(
     key: PRNGKeyArray,
     real: GaussianDynamics,
-    mark_visited_free: GaussianDynamics,
+    believed: GaussianDynamics,
     tasks: Sequence[ContinuousTask],
-    starts: Sequence[Float[np.ndarray, "walkers dimensions"]],
+    starts: Sequence[Float[np.ndarray, "agents dimensions"]],
     actions: Float[Array, "actions inputs"],
     behavior: Behavior,
     lattice: Lattice,
     moves: int,
+    options: SolveOptions | None = None,
 ) -> list[Trajectory]:
-    """Walks of people who believe in `mark_visited_free` and move in `real`, at most so many `moves` long.
+    """Simulate agents that plan with the `believed` dynamics and move in the `real` ones.
 
-    - `tasks`, `starts`: for each task, where its walkers start; those who start at the end of their task do not walk.
-    - `behavior`: how they choose. `lattice`: where their values are found.
+    Args:
+        key: draws everything random.
+        real: the dynamics of the world.
+        believed: the dynamics that agents plan with.
+        tasks: the tasks to pursue.
+        starts: for each task, the first states of its agents. Those where the task has ended give no trajectory.
+        actions: the actions to choose from.
+        behavior: the agents' backup and β.
+        lattice: the points of the values.
+        moves: the greatest length of a trajectory, 1 or more.
+        options: of the solve for the values.
 
-    Raises `InputError` for starts or actions that are not finite or have another width than the dynamics', other
-    numbers of tasks and starts, and `moves` below 1; `ImproperTask` for a task without values, `NotConverged` if
-    these cannot be found.
+    Raises:
+        InputError: starts or actions that are not finite or do not have the dynamics' width, different numbers of
+            tasks and starts, or `moves` below 1.
+        ImproperTask: a task with infinite values.
+        NotConverged: values that did not converge.
+
+    Example:
+        >>> import sidestep as ss
+        >>> import sidestep.continuous as sc
+        >>> world = sc.LinearGaussian(jnp.eye(1), jnp.eye(1), jnp.full(1, 0.01))
+        >>> task, steps = sc.reach_region((1.0,), 0.1, discount=0.9), jnp.array([[-0.5], [0.5]])
+        >>> lattice, behavior = Lattice(jnp.full(1, -1.0), jnp.ones(1), (5,)), Behavior(ss.LogSumExp(), 50.0)
+        >>> walks = simulate_trajectories(
+        ...     jax.random.key(0), world, world, [task], [np.zeros((1, 1))], steps, behavior, lattice, moves=9
+        ... )
+        >>> walks[0].actions.tolist()
+        [1, 1]
     """
     check_count(moves, 1, "moves")
     if not tasks or len(tasks) != len(starts):
@@ -47,31 +71,29 @@ def simulate(
     width = real.example_action().shape
     if not np.isfinite(actions).all() or actions.shape[1:] != width:
         raise InputError(f"expected rows of finite numbers of shape {width}, found {actions.shape}", field="actions")
-    model = tabular(mark_visited_free, lattice, actions)
+    model = tabular_model(believed, lattice, actions)
     trajectories = []
     for index, (task, own) in enumerate(zip(tasks, starts, strict=True)):
         if not np.isfinite(own).all() or np.shape(own)[1:] != real.noise.shape:
             raise InputError(f"expected rows of {len(real.noise)} finite numbers", source=f"starts of task {index}")
         table = tabular_task(task, lattice, actions)
         check_proper(table, behavior, len(actions))
-        solution = solve(model, table, behavior)
+        solution = solve(model, table, behavior, options=options)
         if not solution.converged:
             raise NotConverged(f"values did not converge for task {index}: a finer lattice or a smaller β may help")
         keys = jax.random.split(jax.random.fold_in(key, index), len(own))
-        world = _World(real, mark_visited_free, task, behavior, lattice, solution.values, actions)
-        states, choices, going = (np.asarray(part) for part in _walked(world, jnp.asarray(own), keys, moves))
-        for walker in range(len(own)):
-            taken = int(going[walker].sum())
-            if taken:
-                trajectories.append(Trajectory(states[walker, : taken + 1], choices[walker, :taken], index))
+        world = _World(real, believed, task, behavior, lattice, solution.values, actions)
+        parts = (np.asarray(part) for part in _simulate(world, jnp.asarray(own), keys, moves))
+        for states, choices, acting in zip(*parts, strict=True):
+            length = int(acting.sum())
+            if length:
+                trajectories.append(Trajectory(states[: length + 1], choices[:length], index))
     return trajectories
 
 
 class _World(eqx.Module):
-    """What walkers believe, want and meet."""
-
     real: GaussianDynamics
-    mark_visited_free: GaussianDynamics
+    believed: GaussianDynamics
     task: ContinuousTask
     behavior: Behavior
     lattice: Lattice
@@ -80,20 +102,22 @@ class _World(eqx.Module):
 
 
 @eqx.filter_jit
-def _walked(world: _World, starts: Array, keys: Key[Array, " walkers"], moves: int) -> tuple[Array, Array, Array]:
-    """States, choices, and whether a walker was still going, of all walkers."""
+def _simulate(world: _World, starts: Array, keys: Key[Array, " agents"], moves: int) -> tuple[Array, Array, Array]:
+    """Return states, choices, and whether the task had not ended, of all agents at all moves."""
 
     def move(carry: tuple[Array, Array], key: PRNGKeyArray) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:
         state, over = carry
-        choosing, moving = jax.random.split(key)
+        choice_key, transition_key = jax.random.split(key)
         over = over | world.task.terminal(state)
-        q = action_values(world.mark_visited_free, world.lattice, world.task, world.values, state, world.actions)
-        choice = jax.random.categorical(choosing, world.behavior.log_policy(q))
-        after = jnp.where(over, state, world.real.sample(moving, state, world.actions[choice]))
+        q = action_values(world.believed, world.lattice, world.task, world.values, state, world.actions)
+        choice = jax.random.categorical(choice_key, world.behavior.log_policy(q))
+        after = jnp.where(over, state, world.real.sample(transition_key, state, world.actions[choice]))
         return (after, over), (state, choice, ~over)
 
-    def walk(start: Array, key: PRNGKeyArray) -> tuple[Array, Array, Array]:
-        (last, _), passed = jax.lax.scan(move, (start, jnp.zeros((), bool)), jax.random.split(key, moves))
-        return jnp.concatenate([passed[0], last[None]]), *passed[1:]
+    def simulate(start: Array, key: PRNGKeyArray) -> tuple[Array, Array, Array]:
+        (last, _), (states, choices, acting) = jax.lax.scan(
+            move, (start, jnp.zeros((), bool)), jax.random.split(key, moves)
+        )
+        return jnp.concatenate([states, last[None]]), choices, acting
 
-    return jax.vmap(walk)(starts, keys)
+    return jax.vmap(simulate)(starts, keys)

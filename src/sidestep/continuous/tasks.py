@@ -1,7 +1,7 @@
-"""Tasks in continuous worlds: the tabular ones with functions where those have arrays.
+"""Tasks in continuous worlds: rewards, ends and features as functions of the state.
 
-An action a in a state s pays R(s, a). A terminal state ends the task: no action is taken there, it pays its final
-reward once. `features` are what a policy for many tasks sees of a state and of the goal.
+An action a in a state s pays R(s, a). A terminal state ends the task: no action is taken there, and it pays its
+terminal reward once. `features` are the input of a policy that serves many tasks: state and goal as one vector.
 """
 
 import abc
@@ -12,23 +12,23 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Scalar, Shaped
 
-from sidestep.continuous.dynamics import Action, State
-from sidestep.errors import InputError
+from sidestep.continuous.dynamics import Action, State, check_finite
+from sidestep.errors import InputError, check_positive
 from sidestep.tabular.tasks import Task, check_discount
 
 _Task = TypeVar("_Task", bound="ContinuousTask")
 
 
 class ContinuousTask(eqx.Module):
-    """One task, or (with a leading `tasks` axis on every array, see `stack`) several.
+    """One task, or several with a leading `tasks` axis on every array (see `batch_tasks`).
 
-    - `discount`: γ in (0, 1].
-    - `smooth`: whether returns move smoothly with the states passed, so that gradients may pass along a path.
+    A new kind of task is a subclass with `reward` and `features`, and with the other two methods if tasks end.
 
-    A new kind of task is a subclass with `reward` and `features`, and with the other two if tasks end.
+    Attributes:
+        discount: γ in (0, 1].
+        smooth: whether returns are smooth in the states of a path, so that gradients may pass along it.
     """
 
     discount: eqx.AbstractVar[Float[Array, "*tasks"]]
@@ -36,28 +36,32 @@ class ContinuousTask(eqx.Module):
 
     @abc.abstractmethod
     def reward(self, state: State, action: Action) -> Float[Scalar, ""]:
-        """R(s, a)."""
+        """Return R(s, a)."""
 
     @abc.abstractmethod
     def features(self, state: State) -> Float[Array, " features"]:
-        """What a policy sees: the state and the goal as a vector."""
+        """Return the state and the goal as the input of a policy."""
 
     def terminal_reward(self, state: State) -> Float[Scalar, ""]:
-        """What a terminal state pays."""
+        """Return the reward of ending in a terminal state."""
         del state
         return jnp.zeros((), self.discount.dtype)
 
     def terminal(self, state: State) -> Bool[Scalar, ""]:
-        """Whether the task ends here."""
+        """Return whether the task ends in this state."""
         del state
         return jnp.zeros((), bool)
 
 
-class Reach(ContinuousTask):
-    """The task of coming within `radius` of a goal.
+class ReachTask(ContinuousTask):
+    """The task of coming within a radius of a goal.
 
-    - `goal`: a place, compared with the first components of the state.
-    - `step_cost`: what an action costs; `goal_reward`: what arriving pays.
+    Attributes:
+        goal: a place, compared with the first components of the state.
+        radius: in the units of places, above 0.
+        step_cost: the cost of an action.
+        goal_reward: the reward of arriving.
+        discount: γ in (0, 1].
     """
 
     goal: Float[Array, "*tasks dimensions"]
@@ -68,48 +72,70 @@ class Reach(ContinuousTask):
     smooth: ClassVar[bool] = False
 
     def reward(self, state: State, action: Action) -> Float[Scalar, ""]:
-        """Minus the cost of a step."""
+        """Return minus the cost of a step."""
         del state, action
         return -self.step_cost
 
     def features(self, state: State) -> Float[Array, " features"]:
-        """The state, the goal, and the way to it."""
+        """Return the state, the goal, and the vector to the goal."""
         return jnp.concatenate([state, self.goal, self.goal - state[: len(self.goal)]])
 
     def terminal_reward(self, state: State) -> Float[Scalar, ""]:
-        """The goal's reward."""
+        """Return the goal's reward."""
         del state
         return self.goal_reward
 
     def terminal(self, state: State) -> Bool[Scalar, ""]:
-        """Whether the goal is within the radius."""
+        """Return whether the goal is within the radius."""
         return jnp.sum((state[: len(self.goal)] - self.goal) ** 2) <= self.radius**2
 
 
-def reach(goal: Sequence[float], radius: float, *, discount: float = 0.95, step_cost: float | None = None) -> Reach:
-    """The task of coming within `radius` of a goal.
+def reach_region(
+    goal: Sequence[float], radius: float, *, discount: float = 0.95, step_cost: float | None = None
+) -> ReachTask:
+    """Return the task of coming within `radius` of a goal.
 
-    `discount` and `step_cost` as for the tabular `reach`: without a step cost the goal pays 1. Raises `InputError` for
-    a goal that is not finite, a radius or step cost not above 0, and a discount outside (0, 1], or 1 without a cost.
+    Args:
+        goal: a place, compared with the first components of the state.
+        radius: in the units of places, above 0.
+        discount: γ in (0, 1]; below 1 without a step cost.
+        step_cost: the cost of an action, above 0. Without it the goal pays 1.
+
+    Raises:
+        InputError: a goal that is not finite, a radius or step cost not above 0, or a discount outside its range.
+
+    Example:
+        >>> task = reach_region((1.0, 2.0), radius=0.5)
+        >>> bool(task.terminal(jnp.array([1.0, 2.4]))), float(task.terminal_reward(jnp.array([1.0, 2.4])))
+        (True, 1.0)
     """
     check_discount(discount)
     if step_cost is None and discount == 1:
         raise InputError("a goal that pays 1 needs a discount below 1 (or give a step cost)", field="discount")
     if not np.isfinite(np.asarray(goal)).all():
         raise InputError(f"expected finite numbers, found {tuple(goal)}", field="goal")
-    for name, value in (("radius", radius), ("step_cost", step_cost)):
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise InputError(f"expected a finite number above 0, found {value}", field=name)
-    pays = 1.0 if step_cost is None else 0.0
+    check_positive(radius, "radius")
+    if step_cost is not None:
+        check_positive(step_cost, "step_cost")
+    goal_reward = 1.0 if step_cost is None else 0.0
     real = jnp.result_type(float)
-    numbers = (jnp.asarray(value, real) for value in (goal, radius, step_cost or 0.0, pays, discount))
-    return Reach(*numbers)
+    numbers = (jnp.asarray(value, real) for value in (goal, radius, step_cost or 0.0, goal_reward, discount))
+    return ReachTask(*numbers)
 
 
 class QuadraticTask(ContinuousTask):
     """The task of staying near a goal at a quadratic cost: R(s, a) = −(s − g)ᵀ C (s − g) − aᵀ D a; it never ends.
 
-    - `goal`: g; `state_cost`, `action_cost`: C and D.
+    Attributes:
+        goal: g.
+        state_cost: C.
+        action_cost: D.
+        discount: γ in (0, 1].
+
+    Example:
+        >>> task = QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.eye(1), jnp.asarray(0.9))
+        >>> float(task.reward(jnp.array([2.0]), jnp.array([1.0])))
+        -5.0
     """
 
     goal: Float[Array, "*tasks dimensions"]
@@ -119,19 +145,28 @@ class QuadraticTask(ContinuousTask):
     smooth: ClassVar[bool] = True
 
     def reward(self, state: State, action: Action) -> Float[Scalar, ""]:
-        """Minus the quadratic costs."""
-        away = state - self.goal
-        return -away @ self.state_cost @ away - action @ self.action_cost @ action
+        """Return minus the quadratic costs."""
+        error = state - self.goal
+        return -error @ self.state_cost @ error - action @ self.action_cost @ action
 
     def features(self, state: State) -> Float[Array, " features"]:
-        """The way from the goal."""
+        """Return s − g."""
         return state - self.goal
 
 
-class Hold(ContinuousTask):
-    """The task of holding a pendulum at an angle, with the reward of Gymnasium's `Pendulum-v1`.
+class PendulumTask(ContinuousTask):
+    """The task of holding a pendulum at an angle, with the reward of Gymnasium's `Pendulum-v1`; it never ends.
 
     R = −(φ − g)² − 0.1 ω² − 0.001 u² with φ − g in [−π, π); `Pendulum-v1` itself has the goal g = 0, upright.
+
+    Attributes:
+        goal: g, in radians from upright.
+        discount: γ in (0, 1].
+
+    Example:
+        >>> task = PendulumTask(goal=jnp.zeros(()), discount=jnp.asarray(0.9))
+        >>> round(float(task.reward(jnp.array([0.0, 1.0]), jnp.array([2.0]))), 3)
+        -0.104
     """
 
     goal: Float[Array, "*tasks"]
@@ -139,22 +174,24 @@ class Hold(ContinuousTask):
     smooth: ClassVar[bool] = True
 
     def reward(self, state: State, action: Action) -> Float[Scalar, ""]:
-        """Minus the costs of being away, of speed and of torque."""
-        away = jnp.mod(state[0] - self.goal + jnp.pi, 2 * jnp.pi) - jnp.pi
-        return -(away**2) - 0.1 * state[1] ** 2 - 0.001 * action[0] ** 2
+        """Return minus the costs of the angle, the speed and the torque."""
+        error = jnp.mod(state[0] - self.goal + jnp.pi, 2 * jnp.pi) - jnp.pi
+        return -(error**2) - 0.1 * state[1] ** 2 - 0.001 * action[0] ** 2
 
     def features(self, state: State) -> Float[Array, " features"]:
-        """Where the pendulum is seen from the goal, how fast it is, and where it would stand upright."""
-        away = state[0] - self.goal
-        seen = [jnp.cos(away), jnp.sin(away), state[1], jnp.cos(self.goal), jnp.sin(self.goal)]
-        return jnp.stack(jnp.broadcast_arrays(*seen))
+        """Return cosine and sine of φ − g, the speed, and cosine and sine of g."""
+        error = state[0] - self.goal
+        parts = [jnp.cos(error), jnp.sin(error), state[1], jnp.cos(self.goal), jnp.sin(self.goal)]
+        return jnp.stack(jnp.broadcast_arrays(*parts))
 
 
 class TableTask(ContinuousTask):
-    """A tabular task seen as a continuous one, for `TableDynamics`; its features are one 1, where state and task are.
+    """A tabular task as a continuous one, for `TableDynamics`; its features are a one-hot code of task and state.
 
-    - `task`: with rewards for every state and action.
-    - `index`: which of the tasks it is, so that a policy can tell them apart.
+    Attributes:
+        task: the tabular task, with rewards for every state and action.
+        index: a one-hot code of the task, so that a policy can tell tasks from one another.
+        discount: γ in (0, 1].
     """
 
     task: Task
@@ -163,34 +200,42 @@ class TableTask(ContinuousTask):
     smooth: ClassVar[bool] = False
 
     def reward(self, state: State, action: Action) -> Float[Scalar, ""]:
-        """R(s, a), from the table."""
+        """Return R(s, a), from the table."""
         return self.task.reward[state, action]
 
     def terminal_reward(self, state: State) -> Float[Scalar, ""]:
-        """What a terminal state pays, from the table."""
+        """Return the reward of ending in a terminal state, from the table."""
         return self.task.terminal_reward[state]
 
     def terminal(self, state: State) -> Bool[Scalar, ""]:
-        """From the table."""
+        """Return whether the task ends in this state, from the table."""
         return self.task.terminal[state]
 
     def features(self, state: State) -> Float[Array, " features"]:
-        """One where both the state and the task are these."""
+        """Return a one-hot code of task and state."""
         states = jax.nn.one_hot(state, self.task.terminal.shape[-1], dtype=self.discount.dtype)
         return jnp.outer(self.index, states).ravel()
 
 
 def table_tasks(tasks: Task, states: int, actions: int) -> TableTask:
-    """Stacked tabular tasks as continuous ones, in a world of so many states and actions."""
+    """Return stacked tabular tasks as continuous ones, in a world with this number of states and actions."""
     count = len(tasks.terminal)
     reward = jnp.broadcast_to(tasks.reward, (count, states, actions))
-    final = jnp.broadcast_to(tasks.terminal_reward, (count, states))
-    table = Task(reward, final, tasks.terminal, tasks.discount)
+    terminal_reward = jnp.broadcast_to(tasks.terminal_reward, (count, states))
+    table = Task(reward, terminal_reward, tasks.terminal, tasks.discount)
     return TableTask(task=table, index=jnp.eye(count, dtype=reward.dtype), discount=tasks.discount)
 
 
-def stack(tasks: Sequence[_Task]) -> _Task:
-    """Several tasks of a kind as one with a leading axis; raises `InputError` for none, or tasks of different kinds."""
+def batch_tasks(tasks: Sequence[_Task]) -> _Task:
+    """Return several tasks of one kind as one object with a leading axis.
+
+    Raises:
+        InputError: no task, or tasks of different kinds or shapes.
+
+    Example:
+        >>> batch_tasks([reach_region((0.0,), 0.1), reach_region((1.0,), 0.1)]).goal.tolist()
+        [[0.0], [1.0]]
+    """
     kinds = {(jax.tree.structure(task), *map(np.shape, jax.tree.leaves(task))) for task in tasks}
     if len(kinds) != 1:
         raise InputError("expected at least one task, all of a kind", field="tasks")
@@ -198,21 +243,24 @@ def stack(tasks: Sequence[_Task]) -> _Task:
 
 
 def task_at(tasks: _Task, index: Array | int) -> _Task:
-    """One of stacked tasks (or several, for several indices)."""
+    """Return one of a batch of tasks, or several for an array of indices."""
     return jax.tree.map(lambda leaf: leaf[index], tasks)
 
 
-def ended_at(
-    tasks: ContinuousTask, task: Int[Array, " places"], states: Shaped[Array, "places *state"]
-) -> Bool[np.ndarray, " places"]:
-    """Whether the task of each place has ended there; `task` are indices into stacked tasks."""
-    return np.asarray(jax.vmap(lambda own, state: own.terminal(state))(task_at(tasks, task), states))
+def task_features(tasks: ContinuousTask, states: Shaped[Array, "states *state"]) -> Float[Array, "states features"]:
+    """Return the features of every state under its own task (`tasks` has an axis of states)."""
+    return jax.vmap(lambda task, state: task.features(state))(tasks, states)
+
+
+def has_ended(
+    tasks: ContinuousTask, task: Int[Array, " states"], states: Shaped[Array, "states *state"]
+) -> Bool[np.ndarray, " states"]:
+    """Return whether every state is terminal in its task; `task` holds indices into a batch of tasks."""
+    return np.asarray(jax.vmap(lambda task, state: task.terminal(state))(task_at(tasks, task), states))
 
 
 def check_tasks(tasks: ContinuousTask) -> None:
-    """Raises `InputError` unless all discounts lie in (0, 1] and everything in the tasks is finite."""
-    for leaf in jax.tree.leaves(tasks):
-        if not isinstance(leaf, Tracer) and not np.isfinite(leaf).all():
-            raise InputError("expected finite numbers", field="tasks")
+    """Refuse discounts outside (0, 1] and numbers that are not finite."""
+    check_finite(tasks, field="tasks")
     for discount in np.ravel(tasks.discount):
         check_discount(float(discount))

@@ -1,39 +1,29 @@
-"""What the choice of representation does: one room, the same walks, three ways to say where walls may be.
+"""Three representations of walls, learned from the same walks in one room.
 
-Basis functions and a network are fields under a fit by roll-outs; a fine grid of cells goes through the tabular half,
-which solves for values exactly: the walks become moves between cells half a metre wide, in eight directions.
+Basis functions and a network are fields under a fit by rollouts. A fine grid of cells is learned with exact values
+instead: the walks become moves between cells half a meter wide, in eight directions.
 """
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
-import pyarrow as pa
 from jaxtyping import Array, Float, PyTree
 
 from sidestep._files import write_json
 from sidestep.continuous.likelihood import FitProgress
-from sidestep.continuous.obstacles import Field, ObstacleMotion, network_field, radial_field
-from sidestep.experiments.room import (
-    BETA,
-    CENTRES,
-    PRIOR_MEAN,
-    PRIOR_VARIANCE,
-    SCHEDULE,
-    blocked_in,
-    demonstrated,
-    learned,
-    scores,
-    tasks_of,
-)
+from sidestep.continuous.obstacles import Field, ObstacleMotion, network_field
+from sidestep.experiments.room import Report, RoomConfig, blocked_map, fit_field, score_map
 from sidestep.inference.fit import fit
+from sidestep.inference.optimizers import LBFGS, Optimizer
 from sidestep.inference.priors import Normal, Prior
-from sidestep.io.demonstrations import demonstrations_from_walks as on_grid
+from sidestep.io.demonstrations import demonstrations_from_walks
 from sidestep.io.walks import Walks, walks_from_table
-from sidestep.plotting.maps import Panel, figure_learned, save
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Grid
@@ -41,27 +31,75 @@ from sidestep.tabular.models import ObstacleGrid
 from sidestep.worlds.continuous_room import RESOLUTION, SIDE, Room, room
 
 CELL = 0.5
-"""The side of the tabular half's cells, in metres."""
-Report = Callable[[str], None]
+"""The side of the grid's cells, in meters."""
+
+LearnedField = tuple[Float[np.ndarray, "rows columns"], int, bool, str]
+"""P(blocked) in small cells, the number of parameters, whether the fit converged, and its message."""
 
 
-def run(folder: Path, seed: int = 0, report: Report = lambda _: None) -> dict[str, Any]:
-    """Runs the experiment, writes `representations.png` and `summary.json` to a folder, and returns the summary.
+@dataclass(frozen=True)
+class RepresentationsConfig(RoomConfig):
+    """Settings of the experiment.
 
-    The figures of the best representation, by AUC, are also the summary's own.
+    Attributes:
+        network_rate: the learning rate of a network's weights.
+        grid_optimizer: the optimizer of the grid's cells.
     """
-    started = time.monotonic()
-    world = room()
-    report("people walk around the wall")
-    demonstrations, _ = demonstrated(world, seed)
-    ways = {"basis functions": _by_basis_functions, "network": _by_network, "fine grid": _by_grid}
+
+    network_rate: float = 0.02
+    grid_optimizer: Optimizer = field(default_factory=LBFGS)
+
+
+class FunctionSpacePrior(Prior):
+    """A prior on the logits of a field at some places, whatever its parameters mean.
+
+    A prior on a network's weights would leave its logits free. A network with all logits low would then hardly learn,
+    because the gradient of each logit is proportional to P(blocked) (1 − P(blocked)).
+
+    Attributes:
+        field: the field; only its structure counts.
+        places: where its logits have the prior.
+        each: the prior on every logit.
+    """
+
+    field: Field
+    places: Float[Array, "places dimensions"]
+    each: Normal
+
+    def log_density(self, parameters: PyTree[Float[Array, "..."]]) -> Float[Array, ""]:
+        """Return the log-density of the logits at the places."""
+        field = eqx.tree_at(lambda field: field.parameters, self.field, parameters)
+        return self.each.log_density(jax.vmap(field.logit)(self.places))
+
+
+def run(
+    folder: Path, seed: int = 0, report: Report = lambda _: None, config: RepresentationsConfig | None = None
+) -> dict[str, Any]:
+    """Run the experiment, and write `representations.png` and `summary.json` to a folder.
+
+    Args:
+        folder: the folder to write to.
+        seed: draws everything random.
+        report: called with a line of progress.
+        config: the experiment's settings.
+
+    Returns:
+        The summary. The scores of the best representation, by AUC, are also the summary's own.
+    """
+    from sidestep.plotting.maps import Panel, figure_learned, save
+
+    started, config = time.monotonic(), config or RepresentationsConfig()
+    world = room(config.lattice_points)
+    report("agents walk around the wall")
+    demonstrations, _ = config.demonstrations(world, seed)
+    methods = {"basis functions": _fit_basis_functions, "network": _fit_network, "fine grid": _fit_grid}
     results, panels = {}, []
-    for name, learn in ways.items():
+    for name, method in methods.items():
         report(f"learning with {name}")
         began = time.monotonic()
-        blocked, parameters, converged, message = learn(world, demonstrations, seed, report)
+        blocked, parameters, converged, message = method(world, demonstrations, config, seed, report)
         results[name] = {
-            **scores(blocked, world)._asdict(),
+            **score_map(blocked, world)._asdict(),
             "parameters": parameters,
             "converged": converged,
             "message": message,
@@ -82,70 +120,65 @@ def run(folder: Path, seed: int = 0, report: Report = lambda _: None) -> dict[st
     return summary
 
 
-class Said(Prior):
-    """A prior on what a field says at some places, whatever its parameters mean.
-
-    A prior on a network's weights would leave its logits free, and one that has once said that all is free hears of no
-    wall any more: what people do changes by P(blocked) (1 − P(blocked)) with each logit.
-    """
-
-    field: Field
-    places: Float[Array, "places dimensions"]
-    each: Normal
-
-    def log_density(self, parameters: PyTree[Float[Array, "..."]]) -> Float[Array, ""]:
-        """That of the logits at the places."""
-        return self.each.log_density(jax.vmap(lambda place: self.field.logit(place, parameters))(self.places))
+def _fit_basis_functions(
+    world: Room, demonstrations: Demonstrations, config: RepresentationsConfig, seed: int, report: Report
+) -> LearnedField:
+    progress = _reporting(report, "basis functions", config)
+    field = config.radial_field(world)
+    result = fit_field(world, field, config.prior, demonstrations, config, seed=seed, report=progress)
+    return blocked_map(result.dynamics, world), field.parameters.size, result.converged, result.message
 
 
-ModelResult = tuple[Float[np.ndarray, "rows columns"], int, bool, str]
-"""P(blocked) in small cells, how many parameters there are, whether the fit converged, and why it ended."""
-
-
-def _by_basis_functions(world: Room, demonstrations: Demonstrations, seed: int, report: Report) -> ModelResult:
+def _fit_network(
+    world: Room, demonstrations: Demonstrations, config: RepresentationsConfig, seed: int, report: Report
+) -> LearnedField:
+    """Fit a network under the prior of the basis functions, on its logits at their centers."""
     low, high = world.dynamics.low, world.dynamics.high
-    field = radial_field(low, high, (CENTRES, CENTRES), PRIOR_MEAN)
-    prior = Normal(PRIOR_MEAN, PRIOR_VARIANCE)
-    found = learned(world, field, prior, demonstrations, seed, report=_saying(report, "basis functions"))
-    return blocked_in(found.dynamics, world), field.parameters.size, found.converged, found.message
-
-
-def _by_network(world: Room, demonstrations: Demonstrations, seed: int, report: Report) -> ModelResult:
-    """The prior is that of the basis functions, on what the network says where their centres are."""
-    low, high = world.dynamics.low, world.dynamics.high
-    field = network_field(jax.random.key(seed), low, high, logit=PRIOR_MEAN)
-    prior = Said(field, radial_field(low, high, (CENTRES, CENTRES)).centres, Normal(PRIOR_MEAN, PRIOR_VARIANCE))
-    found = learned(world, field, prior, demonstrations, seed, report=_saying(report, "network"), rate=0.02)
+    field = network_field(jax.random.key(seed), low, high, logit=config.prior_mean)
+    prior = FunctionSpacePrior(field, config.radial_field(world).centers, config.prior)
+    config = replace(config, schedule=replace(config.schedule, learning_rate=config.network_rate))
+    progress = _reporting(report, "network", config)
+    result = fit_field(world, field, prior, demonstrations, config, seed=seed, report=progress)
     count = sum(leaf.size for leaf in jax.tree.leaves(field.parameters))
-    return blocked_in(found.dynamics, world), count, found.converged, found.message
+    return blocked_map(result.dynamics, world), count, result.converged, result.message
 
 
-def _by_grid(world: Room, demonstrations: Demonstrations, seed: int, report: Report) -> ModelResult:
-    """People's costs and sharpness are the same a metre; the Boltzmann average is proper however short a move is."""
+def _fit_grid(
+    world: Room, demonstrations: Demonstrations, config: RepresentationsConfig, seed: int, report: Report
+) -> LearnedField:
+    """Fit cells with exact values: costs and β a meter are the same, under the Boltzmann average.
+
+    The Boltzmann average has finite values however short a move is.
+    """
     del world, seed, report
     count = round(SIDE / CELL)
     grid = Grid(np.full((count, count), -1), resolution=CELL, connectivity=8)
-    moves = on_grid(_walks(demonstrations), grid, discount=1.0, step_cost=CELL)
-    people = Behavior(BoltzmannAverage(), BETA)
-    found = fit(ObstacleGrid(grid, PRIOR_MEAN), moves, people, prior=Normal(PRIOR_MEAN, PRIOR_VARIANCE))
+    moves = demonstrations_from_walks(_walks(demonstrations), grid, discount=1.0, step_cost=CELL)
+    behavior = Behavior(BoltzmannAverage(), config.beta)
+    model = ObstacleGrid(grid, config.prior_mean)
+    result = fit(model, moves, behavior, prior=config.prior, optimizer=config.grid_optimizer)
     finer = np.ones((round(CELL / RESOLUTION),) * 2)
-    return np.kron(np.asarray(found.model.blocked), finer), grid.size, found.converged, found.message
+    return np.kron(np.asarray(result.model.blocked), finer), grid.size, result.converged, result.message
 
 
 def _walks(demonstrations: Demonstrations) -> Walks:
-    """The walks as a table of positions; the noise of moves can carry them past the room's border, by little."""
+    """Return the walks as a table of positions, clipped to the room, which noise can leave by a little."""
+    import pyarrow as pa
+
     edge = 1e-6
-    goals = np.asarray(demonstrations.tasks.goal)  # pyright: ignore[reportAttributeAccessIssue]
+    goals = np.asarray(demonstrations.tasks.goal)[np.asarray(demonstrations.task)[demonstrations.first_moves()]]  # pyright: ignore[reportAttributeAccessIssue]
     rows = [
         {"walk": walk, "step": step, "x": x, "y": y, "goal_x": goal[0], "goal_y": goal[1]}
-        for walk, (places, goal) in enumerate(zip(demonstrations.paths(), goals[tasks_of(demonstrations)], strict=True))
+        for walk, (places, goal) in enumerate(zip(demonstrations.paths(), goals, strict=True))
         for step, (x, y) in enumerate(np.clip(places, edge, SIDE - edge))
     ]
     return walks_from_table(pa.Table.from_pylist(rows))
 
 
-def _saying(report: Report, name: str) -> Callable[[FitProgress, ObstacleMotion], None]:
-    def say(progress: FitProgress, _: ObstacleMotion) -> None:
-        report(f"learning with {name}, iteration {progress.iteration} of {SCHEDULE.iterations}")
+def _reporting(
+    report: Report, name: str, config: RepresentationsConfig
+) -> Callable[[FitProgress, ObstacleMotion], None]:
+    def progress(progress: FitProgress, _: ObstacleMotion) -> None:
+        report(f"learning with {name}, iteration {progress.iteration} of {config.schedule.iterations}")
 
-    return say
+    return progress

@@ -1,8 +1,8 @@
 """A farm: terrain is entered only with the right machine, and machines are swapped where they stand.
 
-After a later work of the paper's first author: a state is a cell and the machine that one drives. A move into terrain
-that the machine cannot enter stays put; which machine can enter which terrain is what there is to learn. Who enters a
-cell where a machine stands drives that one from there on.
+After a later work of the paper's first author. A state is a cell and the machine that is driven. A move into terrain
+that the machine cannot enter stays in place; the machine for each terrain is learned. On entering a cell where a
+machine stands, an agent drives that one from there on.
 """
 
 from typing import NamedTuple
@@ -17,14 +17,15 @@ from sidestep.tabular.graph import graph, straight_moves
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import FIXED, IMPOSSIBLE, TiedModel
 
-_SURE = 12.0
+_CERTAIN_LOGIT = 12.0
 
 
 class Farm(NamedTuple):
     """A map of terrain and machines. State `machines * cell + machine` is driving that machine in that cell.
 
-    - `terrain`: 0 for ground that everyone enters, 1…n for terrain.
-    - `machine`: which machine stands in each cell, 0…m−1, or −1 for none.
+    Attributes:
+        terrain: 0 for ground that every machine enters, 1…n for terrain.
+        machine: the machine that stands in each cell, 0…m−1, or −1 for none.
     """
 
     terrain: Int[np.ndarray, "rows columns"]
@@ -32,13 +33,14 @@ class Farm(NamedTuple):
 
     @property
     def machines(self) -> int:
-        """How many machines there are."""
+        """The number of machines."""
         return int(self.machine.max()) + 1
 
     def model(self, logits: Float[Array | np.ndarray, "terrains machines"] | float = 0.0) -> TiedModel:
-        """The model at the given logits: terrain t stops machine m with probability σ(logits[t − 1, m]).
+        """Return the model in which terrain t stops machine m with probability σ(logits[t − 1, m]).
 
-        Raises `InputError` for maps of different shapes, or without terrain or machines.
+        Raises:
+            InputError: maps of different shapes, or without terrain or machines.
         """
         count, terrains = self.machines, int(self.terrain.max())
         if self.terrain.shape != self.machine.shape or terrains < 1 or count < 1:
@@ -54,10 +56,10 @@ class Farm(NamedTuple):
         flat = jnp.broadcast_to(jnp.asarray(logits, jnp.result_type(float)), (terrains, count)).ravel()
         return TiedModel(graph(np.stack([after, staying], axis=-1)), index, flat)
 
-    def ruled(self, enters: Bool[np.ndarray, "terrains machines"]) -> TiedModel:
-        """The model of people who know which machine enters which terrain."""
-        return self.model(np.where(enters, -_SURE, _SURE))
+    def known_model(self, enters: Bool[np.ndarray, "terrains machines"]) -> TiedModel:
+        """Return the model of an agent that knows which machine enters which terrain."""
+        return self.model(np.where(enters, -_CERTAIN_LOGIT, _CERTAIN_LOGIT))
 
-    def stopped(self, model: TiedModel) -> Float[Array, "terrains machines"]:
-        """The probability that each terrain stops each machine, under a model from `model`."""
+    def stop_probabilities(self, model: TiedModel) -> Float[Array, "terrains machines"]:
+        """Return the probability that each terrain stops each machine, under a model from `model`."""
         return jax.nn.sigmoid(model.parameters).reshape(-1, self.machines)

@@ -1,9 +1,9 @@
-"""A world with gravity: one direction of four pulls, nobody moves against it, and coloured cells turn it.
+"""A world with gravity: it pulls in one of four directions, forbids moves against it, and colored cells turn it.
 
-After a later work of the paper's first author: a state is a cell and the direction in which gravity pulls. A move
-against gravity, or off the map, stays put. Who enters a coloured cell meets gravity turned to the direction that the
-colour stands for; by which rule, is what there is to learn. The rule is the same all over the map, so one colour's
-effect in one place tells of all places.
+After a later work of the paper's first author. A state is a cell and the direction of gravity. A move against gravity,
+or off the map, stays in place. Entering a colored cell turns gravity to the direction of the color. This rule is
+learned. It is the same all over the map, so that one color's effect in one place is evidence
+for all places.
 """
 
 from typing import NamedTuple
@@ -18,43 +18,45 @@ from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import FIXED, IMPOSSIBLE, TiedModel
 
 DIRECTIONS = ("up", "down", "left", "right")
-_AGAINST = np.array([1, 0, 3, 2])
+_OPPOSITE = np.array([1, 0, 3, 2])
 """The move that each direction of gravity forbids."""
-_SURE = 12.0
+_CERTAIN_LOGIT = 12.0
 
 
 class Gravity(NamedTuple):
-    """A coloured map. State `4 * cell + gravity` is being in that cell while gravity pulls in one of `DIRECTIONS`.
+    """A colored map. State `4 * cell + gravity` is that cell with gravity in one of `DIRECTIONS`.
 
-    - `colours`: 0 where gravity stays as it is, and 1…n for the colours.
+    Attributes:
+        colors: 0 where gravity stays the same, and 1…n for the colors.
     """
 
-    colours: Int[np.ndarray, "rows columns"]
+    colors: Int[np.ndarray, "rows columns"]
 
-    def model(self, logits: Float[Array | np.ndarray, "colours 4"] | float = 0.0) -> TiedModel:
-        """The model at the given logits: colour c turns gravity to direction g with the softmax of `logits[c - 1]`.
+    def model(self, logits: Float[Array | np.ndarray, "colors 4"] | float = 0.0) -> TiedModel:
+        """Return the model in which color c turns gravity to direction g with the softmax of `logits[c - 1]`.
 
-        Raises `InputError` for a map without colours.
+        Raises:
+            InputError: a map without colors.
         """
-        count = int(self.colours.max())
-        if self.colours.min() < 0 or count == 0:
-            raise InputError("expected colours 0…n, and one above 0", field="colours")
-        cells, gravity = np.divmod(np.arange(4 * self.colours.size), 4)
-        target = straight_moves(Grid.unknown(*self.colours.shape))[cells]
-        moved = (target != cells[:, None]) & (np.arange(4) != _AGAINST[gravity][:, None])
+        count = int(self.colors.max())
+        if self.colors.min() < 0 or count == 0:
+            raise InputError("expected colors 0…n, and one above 0", field="colors")
+        cells, gravity = np.divmod(np.arange(4 * self.colors.size), 4)
+        target = straight_moves(Grid.unknown(*self.colors.shape))[cells]
+        moved = (target != cells[:, None]) & (np.arange(4) != _OPPOSITE[gravity][:, None])
         target = np.where(moved, target, cells[:, None])
-        colour = np.where(moved, self.colours.ravel()[target], 0)[..., None]
-        turned = np.where(colour > 0, np.arange(4), gravity[:, None, None])
-        index = np.where(colour > 0, 4 * (colour - 1) + np.arange(4), IMPOSSIBLE)
-        index[..., 0] = np.where(colour[..., 0] > 0, index[..., 0], FIXED)
+        color = np.where(moved, self.colors.ravel()[target], 0)[..., None]
+        turned = np.where(color > 0, np.arange(4), gravity[:, None, None])
+        index = np.where(color > 0, 4 * (color - 1) + np.arange(4), IMPOSSIBLE)
+        index[..., 0] = np.where(color[..., 0] > 0, index[..., 0], FIXED)
         flat = jnp.broadcast_to(jnp.asarray(logits, jnp.result_type(float)), (count, 4)).ravel()
         return TiedModel(graph(4 * target[..., None] + turned), index, flat)
 
-    def ruled(self, rule: Int[np.ndarray, " colours"]) -> TiedModel:
-        """The model of people who know that colour c turns gravity to direction `rule[c - 1]`."""
-        return self.model(_SURE * np.eye(4)[np.asarray(rule)])
+    def known_model(self, rule: Int[np.ndarray, " colors"]) -> TiedModel:
+        """Return the model of an agent that knows that color c turns gravity to direction `rule[c - 1]`."""
+        return self.model(_CERTAIN_LOGIT * np.eye(4)[np.asarray(rule)])
 
 
-def rule_of(model: TiedModel) -> Int[np.ndarray, " colours"]:
-    """The direction that each colour most probably stands for, under a model from `Gravity.model`."""
+def most_probable_rule(model: TiedModel) -> Int[np.ndarray, " colors"]:
+    """Return the most probable direction of each color, under a model from `Gravity.model`."""
     return np.asarray(model.parameters).reshape(-1, 4).argmax(axis=1)

@@ -1,8 +1,8 @@
-"""The worlds of the paper's experiments: small grids with obstacles, and starts and goals all around them.
+"""The worlds of the paper's experiments: small grids with obstacles, and starts and goals around them.
 
-The two maps of the paper's figure 1 survive only as pictures that we do not have. `block` and `wall` are the
-two 9×9 maps of its first author's later work; `rooms` is our own. The starts and goals of all three are ours,
-chosen so that optimal walks between them pass on every side of the obstacles.
+The two maps of the paper's figure 1 are published as pictures only. `block` and `wall` are the two 9×9 maps of its
+first author's later work; `rooms` is our own. The starts and goals of all three are ours, chosen so that optimal walks
+between them pass on every side of the obstacles.
 """
 
 from dataclasses import dataclass
@@ -17,11 +17,14 @@ _LATER_WORK = "a map of the first author's later work; starts and goals are our 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A map that walkers know, and the places that they walk between.
+    """A map that agents know, and the places that they walk between.
 
-    - `truth`: the map, fully known.
-    - `starts`, `goals`: states; walkers go from every start to every goal.
-    - `source`: where the map comes from.
+    Attributes:
+        name: the key in `WORLDS`.
+        truth: the map, fully known.
+        starts: states; agents walk from every start to every goal.
+        goals: states.
+        source: the origin of the map.
     """
 
     name: str
@@ -32,7 +35,7 @@ class World:
 
 
 def block() -> World:
-    """A 9×9 room with a 3×3 block in the middle (rows and columns 3–5)."""
+    """Return a 9×9 room with a 3×3 block in the middle (rows and columns 3–5)."""
     return _world(
         "block",
         _LATER_WORK,
@@ -49,7 +52,7 @@ def block() -> World:
 
 
 def wall() -> World:
-    """A 9×9 room with a thick wall (columns 3–5 in rows 0–5) between its left and its right side."""
+    """Return a 9×9 room with a thick wall (columns 3–5 in rows 0–5) between its left and its right side."""
     return _world(
         "wall",
         _LATER_WORK,
@@ -66,7 +69,7 @@ def wall() -> World:
 
 
 def rooms() -> World:
-    """A 9×9 flat of four rooms: walls one cell thick, and a door between each two neighbours."""
+    """Return a 9×9 flat of four rooms: walls one cell thick, and a door between each two neighbors."""
     return _world(
         "rooms",
         "our own",
@@ -87,7 +90,7 @@ WORLDS = MappingProxyType({"block": block, "wall": wall, "rooms": rooms})
 
 
 def _world(name: str, source: str, *drawing: str) -> World:
-    """A world from a drawing, top row first: `#` occupied, `S` start, `G` goal, anything else free."""
+    """Return the world of a drawing, top row first: `#` occupied, `S` start, `G` goal, anything else free."""
     signs = np.array([row.split() for row in drawing])
     truth = Grid(np.where(signs == "#", int(Cell.OCCUPIED), int(Cell.FREE)))
     starts, goals = (tuple(np.flatnonzero(signs == sign).tolist()) for sign in "SG")

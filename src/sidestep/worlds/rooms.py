@@ -1,4 +1,4 @@
-"""Flats: two or three rooms in a row, walls one cell thick between them, and a door in each wall."""
+"""Two or three rooms in a row, with walls one cell thick between them, and a door in each wall."""
 
 import numpy as np
 
@@ -7,32 +7,44 @@ from sidestep.tabular.grid import Cell, Connectivity, Grid
 
 
 def two_rooms(rows: int, columns: int, door: int, connectivity: Connectivity = 4) -> Grid:
-    """Two rooms side by side, the wall in the middle column; fully known, cells of one metre.
+    """Return a fully known map of two rooms with the wall in the middle column, in cells of one meter.
 
-    - `door`: the row of the free cell in the wall, 0 at the top.
+    Args:
+        rows: 1 or more.
+        columns: 3 or more.
+        door: the row of the free cell in the wall, 0 at the top.
+        connectivity: 4 or 8 directions.
 
-    Raises `InputError` for fewer than 3 columns, no row, and a door outside the wall.
+    Raises:
+        InputError: too few columns or rows, or a door outside the wall.
 
-    >>> two_rooms(3, 5, door=2).known.tolist()
-    [[0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 0, 0]]
+    Example:
+        >>> two_rooms(3, 5, door=2).known.tolist()
+        [[0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 0, 0]]
     """
-    return _in_a_row(rows, columns, (door,), connectivity)
+    return _rooms_in_a_row(rows, columns, (door,), connectivity)
 
 
 def three_rooms(rows: int, columns: int, doors: tuple[int, int], connectivity: Connectivity = 4) -> Grid:
-    """Three rooms side by side, as wide as one another but for a column; fully known, cells of one metre.
+    """Return a fully known map of three rooms of equal width, up to a column, in cells of one meter.
 
-    - `doors`: the rows of the free cells in the left and in the right wall, 0 at the top.
+    Args:
+        rows: 1 or more.
+        columns: 5 or more.
+        doors: the rows of the free cells in the left and in the right wall, 0 at the top.
+        connectivity: 4 or 8 directions.
 
-    Raises `InputError` for fewer than 5 columns, no row, and doors outside the walls.
+    Raises:
+        InputError: too few columns or rows, or a door outside its wall.
 
-    >>> three_rooms(2, 5, doors=(0, 1)).known.tolist()
-    [[0, 0, 0, 1, 0], [0, 1, 0, 0, 0]]
+    Example:
+        >>> three_rooms(2, 5, doors=(0, 1)).known.tolist()
+        [[0, 0, 0, 1, 0], [0, 1, 0, 0, 0]]
     """
-    return _in_a_row(rows, columns, doors, connectivity)
+    return _rooms_in_a_row(rows, columns, doors, connectivity)
 
 
-def _in_a_row(rows: int, columns: int, doors: tuple[int, ...], connectivity: Connectivity) -> Grid:
+def _rooms_in_a_row(rows: int, columns: int, doors: tuple[int, ...], connectivity: Connectivity) -> Grid:
     if columns < 2 * len(doors) + 1:
         raise InputError(f"expected at least {2 * len(doors) + 1}, found {columns}", field="columns")
     if rows < 1:

@@ -1,18 +1,16 @@
-"""People in continuous worlds: they arrive, keep out of walls that they know, and act on what they believe."""
-
-from functools import partial
+"""Simulated agents: they arrive, avoid walls that they know, and act on their beliefs."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.continuous import gather, simulation
-from sidestep.continuous.lattice import Lattice, action_values, tabular, tabular_task
+from sidestep.continuous.lattice import Lattice, action_values, tabular_model, tabular_task
 from sidestep.continuous.obstacles import ObstacleMotion, Walls
 from sidestep.continuous.physical import Pendulum
-from sidestep.continuous.simulation import simulate
-from sidestep.continuous.tasks import Hold, reach, stack
+from sidestep.continuous.simulation import simulate_trajectories
+from sidestep.continuous.tasks import PendulumTask, batch_tasks, reach_region
+from sidestep.continuous.trajectories import gather_trajectories
 from sidestep.errors import ImproperTask, InputError, NotConverged
 from sidestep.tabular.backups import Behavior, LogSumExp
 from sidestep.tabular.demonstrations import Trajectory
@@ -27,35 +25,36 @@ WALL = Walls(low=jnp.asarray([[2.4, 0.0]]), high=jnp.asarray([[3.6, 4.0]]))
 ROOM = ObstacleMotion(WALL, LOW, HIGH, jnp.full(2, 0.05))
 SQUARES = Lattice(LOW, HIGH, (13, 13))
 WAYS = jnp.asarray([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-GOALS = [reach(goal, 0.8, discount=1.0, step_cost=1.0) for goal in ((5.0, 1.0), (1.0, 1.0))]
+GOALS = [reach_region(goal, 0.8, discount=1.0, step_cost=1.0) for goal in ((5.0, 1.0), (1.0, 1.0))]
 RANDOM = np.random.default_rng(0)
 COUNT = 1000
 STARTS = [RANDOM.uniform([0.2, 0.2], [1.8, 3.0], (COUNT, 2)), RANDOM.uniform([4.0, 0.2], [5.8, 3.0], (COUNT, 2))]
 SHARP, SOFT = Behavior(LogSumExp(), 40.0), Behavior(LogSumExp(), 2.0)
 
 
-def people(mark_visited_free, behavior, tasks=1, starts=STARTS):
-    """Walks to the first goals. Always as many and as long, so that this is compiled but once."""
-    return simulate(KEY, ROOM, mark_visited_free, GOALS[:tasks], starts[:tasks], WAYS, behavior, SQUARES, 30)
+def simulate(believed, behavior, tasks=1, starts=STARTS, options=None):
+    """Walks to the first goals; always the same number and length, so that this is compiled once."""
+    world = WAYS, behavior, SQUARES, 30, options
+    return simulate_trajectories(KEY, ROOM, believed, GOALS[:tasks], starts[:tasks], *world)
 
 
-def aims(walks):
-    """Where walkers aim, all of their moves together."""
+def targets(walks):
+    """The targets of all moves."""
     places = [walk.states[:-1] + np.asarray(WAYS)[walk.actions] for walk in walks]
     return np.clip(np.concatenate(places), LOW, HIGH)
 
 
-def walled(places):
+def in_wall(places):
     return np.asarray(jax.vmap(WALL.inside)(jnp.asarray(places)))
 
 
 @pytest.fixture(scope="module")
 def walks():
-    """Around a wall, from either side to the other."""
-    return people(ROOM, SHARP, tasks=2)
+    """Walks around a wall, from either side to the other."""
+    return simulate(ROOM, SHARP, tasks=2)
 
 
-def test_walkers_start_where_they_are_told_and_arrive(walks):
+def test_simulate_trajectories_start_as_asked_and_arrive(walks):
     assert [walk.task for walk in walks] == [0] * COUNT + [1] * COUNT
     np.testing.assert_array_equal([walk.states[0] for walk in walks], np.concatenate(STARTS))
     for walk in walks:
@@ -64,15 +63,15 @@ def test_walkers_start_where_they_are_told_and_arrive(walks):
         assert away[-1] <= 0.8 < away[:-1].min()
 
 
-def test_walkers_never_aim_into_walls_that_they_know(walks):
-    assert not walled(aims(walks)).any()
+def test_simulate_trajectories_known_wall_is_never_a_target(walks):
+    assert not in_wall(targets(walks)).any()
     ends = np.concatenate([walk.states[1:] for walk in walks])
-    np.testing.assert_allclose(ends, aims(walks), atol=0.3)
+    np.testing.assert_allclose(ends, targets(walks), atol=0.3)
     assert min(len(walk.actions) for walk in walks) >= 6
 
 
-def test_walks_are_demonstrations(walks):
-    demonstrations = gather(walks, GOALS)
+def test_gather_trajectories_keeps_every_move(walks):
+    demonstrations = gather_trajectories(walks, GOALS)
     assert demonstrations.trajectories == 2 * COUNT
     assert len(demonstrations) == sum(len(walk.actions) for walk in walks)
     ends = np.append(np.diff(demonstrations.trajectory) > 0, True)
@@ -85,39 +84,41 @@ def test_walks_are_demonstrations(walks):
     assert demonstrations.tasks.goal.shape == (2, 2)
 
 
-def test_walkers_who_believe_in_no_wall_run_into_it():
-    misled = people(ObstacleMotion(Walls(low=WALL.low + 90, high=WALL.high + 90), LOW, HIGH, jnp.full(2, 0.05)), SHARP)
+def test_simulate_trajectories_unknown_wall_is_run_into():
+    misled = simulate(
+        ObstacleMotion(Walls(low=WALL.low + 90, high=WALL.high + 90), LOW, HIGH, jnp.full(2, 0.05)), SHARP
+    )
     assert len(misled) == COUNT
-    assert walled(aims(misled)).mean() > 0.5
+    assert in_wall(targets(misled)).mean() > 0.5
     assert np.mean([len(walk.actions) == 30 for walk in misled]) > 0.8
 
 
-def test_those_who_stand_at_their_goal_do_not_walk():
+def test_simulate_trajectories_start_at_goal_gives_none():
     starts = np.array(STARTS[0])
     starts[[0, 2]] = [[5.0, 1.2], [5.0, 1.0]]
-    walking = people(ROOM, SHARP, starts=[starts])
+    walking = simulate(ROOM, SHARP, starts=[starts])
     np.testing.assert_array_equal([walk.states[0] for walk in walking], np.delete(starts, [0, 2], axis=0))
 
 
-def test_soft_people_choose_as_often_as_their_values_say():
-    """Values of the corners around, by a solve; a move ahead from where the walkers stand."""
+def test_simulate_trajectories_soft_choices_match_action_values():
     place = np.array([4.2, 4.0])
-    walking = people(ROOM, SOFT, starts=[np.tile(place, (COUNT, 1))])
-    values = solve(tabular(ROOM, SQUARES, WAYS), tabular_task(GOALS[0], SQUARES, WAYS), SOFT).values
+    walking = simulate(ROOM, SOFT, starts=[np.tile(place, (COUNT, 1))])
+    values = solve(tabular_model(ROOM, SQUARES, WAYS), tabular_task(GOALS[0], SQUARES, WAYS), SOFT).values
     q = np.asarray(action_values(ROOM, SQUARES, GOALS[0], values, jnp.asarray(place), WAYS))
     odds = np.exp(2 * (q - q.max()))
-    found = np.bincount([walk.actions[0] for walk in walking], minlength=4) / COUNT
-    np.testing.assert_allclose(found, odds / odds.sum(), atol=0.05)
-    assert found.min() < 0.1 < np.sort(found)[1]
+    frequencies = np.bincount([walk.actions[0] for walk in walking], minlength=4) / COUNT
+    np.testing.assert_allclose(frequencies, odds / odds.sum(), atol=0.05)
+    assert frequencies.min() < 0.1 < np.sort(frequencies)[1]
 
 
-def test_a_belief_in_another_gravity_changes_what_people_do():
-    """Who takes a pendulum for light pushes less, and so holds it lower; it swings as the real one does."""
+def test_simulate_trajectories_wrong_gravity_changes_actions():
+    """Agents that believe in less gravity push less, and hold it lower; it swings as the real one."""
     lattice = Lattice(jnp.asarray([-np.pi, -8.0]), jnp.asarray([np.pi, 8.0]), (20, 17), (True, False))
     goal, torques, real = np.pi - 0.4, jnp.linspace(-2, 2, 5)[:, None], Pendulum(10.0)
-    task, starts = Hold(jnp.asarray(goal), jnp.asarray(0.9)), RANDOM.normal([goal, 0], 0.1, (8, 2))
+    task, starts = PendulumTask(jnp.asarray(goal), jnp.asarray(0.9)), RANDOM.normal([goal, 0], 0.1, (8, 2))
     right, light = (
-        simulate(KEY, real, Pendulum(gravity), [task], [starts], torques, SHARP, lattice, 30) for gravity in (10.0, 2.0)
+        simulate_trajectories(KEY, real, Pendulum(gravity), [task], [starts], torques, SHARP, lattice, 30)
+        for gravity in (10.0, 2.0)
     )
     pushes = [np.mean([np.asarray(torques)[walk.actions].mean() for walk in walks]) for walks in (right, light)]
     assert pushes[0] + 0.2 < pushes[1] < 0
@@ -132,25 +133,25 @@ def test_a_belief_in_another_gravity_changes_what_people_do():
 # Refusals
 
 
-def test_walkers_start_somewhere():
+def test_simulate_trajectories_bad_starts_are_refused():
     with pytest.raises(InputError, match="starts of task 0: expected rows of 2 finite numbers"):
-        people(ROOM, SHARP, starts=[np.array([[1.0, np.nan]])])
+        simulate(ROOM, SHARP, starts=[np.array([[1.0, np.nan]])])
     with pytest.raises(InputError, match="starts of task 0: expected rows of 2 finite numbers"):
-        people(ROOM, SHARP, starts=[np.ones((2, 3))])
+        simulate(ROOM, SHARP, starts=[np.ones((2, 3))])
     with pytest.raises(InputError, match="'starts': expected as many as tasks, found 0 for 1"):
-        people(ROOM, SHARP, starts=[])
+        simulate(ROOM, SHARP, starts=[])
 
 
-def test_people_who_never_want_to_arrive_are_no_examples():
-    """At β = 1/2 and four ways to go, every step is worth ln 4/β − 1 > 0 to them."""
+def test_simulate_trajectories_improper_task_is_refused():
+    """At β = 1/2 and four actions, every step is worth ln 4/β − 1 > 0."""
     with pytest.raises(ImproperTask, match="never wants to arrive"):
-        people(ROOM, Behavior(LogSumExp(), 0.5))
+        simulate(ROOM, Behavior(LogSumExp(), 0.5))
 
 
-def test_values_that_were_not_found_are_not_acted_on(monkeypatch):
-    monkeypatch.setattr(simulation, "solve", partial(solve, options=SolveOptions(solver=Jacobi(max_sweeps=2))))
+def test_simulate_trajectories_values_not_converged_raise():
+    options = SolveOptions(solver=Jacobi(max_sweeps=2))
     with pytest.raises(NotConverged, match=r"values did not converge for task 0: a finer lattice or a smaller β"):
-        people(ROOM, SHARP)
+        simulate(ROOM, SHARP, options=options)
 
 
 ONE = Trajectory(np.zeros((3, 2)), np.array([0, 1]), 0)
@@ -166,16 +167,16 @@ ONE = Trajectory(np.zeros((3, 2)), np.array([0, 1]), 0)
     (Trajectory(np.zeros((3, 2)), np.array([0, 1]), 2), r"trajectory, row 2: expected a task in 0…1, found 2"),
     (Trajectory(np.zeros((3, 2)), np.array([0, 1]), -1), r"row 2: expected a task in 0…1, found -1"),
 ])  # fmt: skip
-def test_trajectories_that_do_not_fit(wrong, match):
+def test_gather_trajectories_inconsistent_trajectory_is_refused(wrong, match):
     with pytest.raises(InputError, match=match):
-        gather([ONE, wrong], GOALS)
+        gather_trajectories([ONE, wrong], GOALS)
 
 
-def test_demonstrations_need_trajectories_and_proper_tasks():
+def test_gather_trajectories_without_trajectories_or_proper_tasks_is_refused():
     with pytest.raises(InputError, match="field 'trajectories': expected at least one trajectory"):
-        gather([], GOALS)
+        gather_trajectories([], GOALS)
     with pytest.raises(InputError, match="field 'tasks': expected at least one task"):
-        gather([ONE], [])
-    endless = stack([Hold(goal=jnp.zeros(()), discount=jnp.asarray(0.9))])
+        gather_trajectories([ONE], [])
+    endless = batch_tasks([PendulumTask(goal=jnp.zeros(()), discount=jnp.asarray(0.9))])
     with pytest.raises(InputError, match="field 'discount'"):
-        gather([ONE], [Hold(goal=endless.goal[0], discount=jnp.asarray(1.5))])
+        gather_trajectories([ONE], [PendulumTask(goal=endless.goal[0], discount=jnp.asarray(1.5))])
