@@ -22,7 +22,7 @@ from sidestep.inference.priors import Normal
 from sidestep.io.roads import Roads, demonstrations_from_trips, read_roads, read_trips
 from sidestep.tabular.backups import BACKUPS, Behavior
 from sidestep.tabular.demonstrations import Demonstrations
-from sidestep.tabular.likelihood import action_log_likelihood
+from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import TiedModel, closed, road_network
 from two_way import FEATURES, TwoWay, turn_features, two_way
 
@@ -100,7 +100,8 @@ def learn_tastes(town: Town, demos: Demonstrations, people: Behavior, turns: boo
     @eqx.filter_jit
     @eqx.filter_value_and_grad
     def loss(weights: Array, demos: Demonstrations) -> Array:
-        return -action_log_likelihood(model, town.paying(demos, weights), people) / len(demos)
+        shown = town.paying(demos, weights)
+        return -log_likelihood(model, shown, people, terms=("actions",)).actions / len(demos)
 
     def loss_and_slope(weights: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = loss(jnp.asarray(weights), demos)
@@ -128,7 +129,7 @@ class ModelResult(NamedTuple):
     def log_likelihood(self, town: Town, trips: Sequence[Trip]) -> float:
         """That of the turns of some trips, in nats a turn."""
         demos = town.paying(town.demonstrations(trips), self.weights)
-        return float(action_log_likelihood(self.found.model, demos, self.people)) / len(demos)
+        return float(log_likelihood(self.found.model, demos, self.people, terms=("actions",)).actions) / len(demos)
 
 
 def learn(town: Town, trips: Sequence[Trip], settings: Settings) -> ModelResult:

@@ -1,4 +1,4 @@
-"""What is learned of people beside the dynamics: sharpness, lapses, discount, tastes."""
+"""What is learned of behavior beside the dynamics: β, lapse, discount, reward weights, costs of states."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from sidestep.inference.objective import MEMORY, Objective, Problem
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
 from sidestep.tabular.behavior_model import LEARNABLE, behavior_model
-from sidestep.tabular.demonstrations import Trajectory, gather
+from sidestep.tabular.demonstrations import gather, split_by_person
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import ALL_TERMS
 from sidestep.tabular.models import ObstacleGrid, true_model
@@ -26,15 +26,22 @@ OPEN = true_model(GRID.passable())
 GOALS = (0, 17, 29)
 
 
-def walks(behavior, count=40, discount=0.9, seed=0):
-    """People who cross an open room."""
-    tasks = [reach(GRID, goal, discount=discount) for goal in GOALS]
+def tasks_of():
+    return [reach(GRID, goal, discount=0.9) for goal in GOALS]
+
+
+def simulated(behavior, count, seed=0):
+    """Agents who cross an open room."""
     starts = np.random.default_rng(seed).integers(GRID.size, size=(len(GOALS), count))
     starts = [own[own != goal] for own, goal in zip(starts, GOALS, strict=True)]
-    return gather(simulate(jax.random.key(seed), OPEN, tasks, starts, behavior), tasks)
+    return simulate(jax.random.key(seed), OPEN, tasks_of(), starts, behavior)
 
 
-def test_lapses_are_a_share_of_actions_at_random():
+def walks(behavior, count=40):
+    return gather(simulated(behavior, count), tasks_of())
+
+
+def test_log_policy_with_a_lapse_mixes_in_random_actions():
     q = jnp.array([[0.0, 1.0, 3.0]])
     sharp, lapsing = Behavior(LogSumExp(), 2.0), Behavior(LogSumExp(), 2.0, lapse=0.3)
     mixed = 0.7 * jnp.exp(sharp.log_policy(q)) + 0.1
@@ -43,8 +50,8 @@ def test_lapses_are_a_share_of_actions_at_random():
 
 
 @pytest.mark.parametrize("backup", [BoltzmannAverage(), LogSumExp()], ids=lambda backup: type(backup).__name__)
-def test_the_slope_of_all_that_is_learned_is_that_of_the_objective(backup):
-    """Central differences of the objective: by two persons, two features, lapses, a discount and costs of places."""
+def test_objective_of_all_parameters_has_the_gradient_of_central_differences(backup):
+    """By two persons, two features, a lapse, a discount and costs of states."""
     shown = walks(Behavior(BoltzmannAverage(), 8.0, lapse=0.1), count=4)
     features = np.random.default_rng(1).normal(size=(GRID.size, 4, 2))
     someone = behavior_model(
@@ -53,7 +60,7 @@ def test_the_slope_of_all_that_is_learned_is_that_of_the_objective(backup):
         discount=0.85,
         person=np.array([0, 1, 1]),
         features=features,
-        tastes=np.array([0.02, -0.01]),
+        reward_weights=np.array([0.02, -0.01]),
         aimed_at=np.asarray(OPEN.graph.successors[..., 0]),
     )
     model = ObstacleGrid(GRID, 0.3 * np.sin(np.arange(GRID.size)))
@@ -72,9 +79,9 @@ def test_the_slope_of_all_that_is_learned_is_that_of_the_objective(backup):
         assert slope[index] == pytest.approx(-(ends[1] - ends[0]) / 2e-5, rel=1e-5, abs=1e-6)
 
 
-def test_sharpness_and_lapses_are_found_with_the_room_known():
+def test_fit_of_beta_and_lapse_in_a_known_room_recovers_them():
     shown = walks(Behavior(BoltzmannAverage(), 60.0, lapse=0.15), count=400)
-    found = fit(OPEN, shown, behavior_model(Behavior(BoltzmannAverage(), 30.0), ["sharpness", "lapses"]))
+    found = fit(OPEN, shown, behavior_model(Behavior(BoltzmannAverage(), 30.0), ["beta", "lapse"]))
     assert found.converged
     assert float(found.people.behavior_of().beta) == pytest.approx(60, rel=0.15)
     lapse = found.people.behavior_of().lapse
@@ -82,28 +89,21 @@ def test_sharpness_and_lapses_are_found_with_the_room_known():
     assert float(lapse) == pytest.approx(0.15, abs=0.03)
 
 
-def test_a_discount_is_found_with_the_room_known():
+def test_fit_of_discount_in_a_known_room_recovers_it():
     sharp = Behavior(BoltzmannAverage(), 60.0)
     shown = walks(sharp, count=200)
     found = fit(OPEN, shown, behavior_model(sharp, ["discount"], discount=0.8))
     np.testing.assert_allclose(found.people.tasks_of(shown.tasks).discount, 0.9, atol=0.01)
 
 
-def test_each_person_has_a_sharpness_pooled_with_the_others():
-    """Two people of a hundred walks to each goal, and one of a single walk, who is taken to be in between."""
-    sharp, dull, few = (
-        walks(Behavior(BoltzmannAverage(), beta), count, seed=seed)
-        for beta, count, seed in ((20.0, 100, 0), (6.0, 100, 1), (11.0, 1, 2))
-    )
-    shown = gather(
-        [
-            walk
-            for person, own in enumerate((sharp, dull, few))
-            for walk in _trajectories(own, shift=person * len(GOALS))
-        ],
-        [reach(GRID, goal, discount=0.9) for _ in range(3) for goal in GOALS],
-    )
-    someone = behavior_model(Behavior(BoltzmannAverage(), 8.0), person=np.repeat([0, 1, 2], len(GOALS)))
+def test_fit_with_persons_pools_their_betas():
+    """Two persons with a hundred walks to each goal, and one with a single walk, whose β is drawn to the others."""
+    trajectories = []
+    for beta, count, seed in ((20.0, 100, 0), (6.0, 100, 1), (11.0, 1, 2)):
+        trajectories.append(simulated(Behavior(BoltzmannAverage(), beta), count, seed=seed))
+    person = np.repeat([0, 1, 2], [len(own) for own in trajectories])
+    shown, of_tasks = split_by_person(gather([walk for own in trajectories for walk in own], tasks_of()), person)
+    someone = behavior_model(Behavior(BoltzmannAverage(), 8.0), person=of_tasks)
     found = fit(OPEN, shown, someone).people
     betas = [float(found.behavior_of(person).beta) for person in range(3)]
     assert betas[0] == pytest.approx(20, rel=0.25)
@@ -112,19 +112,7 @@ def test_each_person_has_a_sharpness_pooled_with_the_others():
     assert float(found.behavior_of().beta) == pytest.approx(np.exp(np.mean(np.log(betas))), rel=1e-9)
 
 
-def _trajectories(demonstrations, shift):
-    """The walks, with tasks that begin at another number."""
-    moves = np.flatnonzero(np.diff(np.asarray(demonstrations.trajectory))) + 1
-    actions = np.split(np.asarray(demonstrations.actions), moves)
-    tasks = np.split(np.asarray(demonstrations.task), moves)
-    return [
-        Trajectory(path, own, int(task[0]) + shift)
-        for path, own, task in zip(demonstrations.paths(), actions, tasks, strict=True)
-    ]
-
-
-def test_tastes_are_found_with_the_walls_that_nobody_touched():
-    """People who dislike a carpet and know a wall: each is told from the other."""
+def test_fit_of_reward_weights_tells_a_disliked_carpet_from_a_wall():
     wall = np.zeros(GRID.shape, dtype=int)
     wall[1:4, 3] = 1
     carpet = np.zeros((GRID.size, 1, 1))
@@ -138,39 +126,39 @@ def test_tastes_are_found_with_the_walls_that_nobody_touched():
     sharp = Behavior(LogSumExp(), 40.0)
     shown = simulate(jax.random.key(0), true_model(Grid(wall)), disliked, [np.tile(own, 4) for own in starts], sharp)
     found = fit(ObstacleGrid(GRID, -2.0), gather(shown, plain), behavior_model(sharp, features=carpet))
-    tastes = found.people.parameters.tastes
-    assert tastes is not None
-    assert float(tastes[0]) == pytest.approx(-0.05, abs=0.01)
+    weights = found.people.parameters.reward_weights
+    assert weights is not None
+    assert float(weights[0]) == pytest.approx(-0.05, abs=0.01)
     blocked, hidden = np.asarray(found.model.blocked).ravel(), wall.ravel() == 1
     assert blocked[hidden].min() > blocked[~hidden].max()
 
 
-def test_costs_start_at_the_mode_of_their_prior_and_are_paid_by_who_aims():
+def test_tasks_of_with_costs_charges_the_state_that_is_aimed_at():
     """A cost of ln(1 + exp −4) to begin with; k has a standard deviation of 2."""
     aimed_at = np.asarray(OPEN.graph.successors[..., 0])
     someone = behavior_model(Behavior(LogSumExp(), 5.0), aimed_at=aimed_at)
     assert float(someone.log_density()) == 0
     assert someone.costs is not None
     np.testing.assert_allclose(someone.costs, np.log1p(np.exp(-4)))
-    dearer = someone.with_parameters(someone.parameters._replace(costs=jnp.linspace(-4, 0, GRID.size)))
+    dearer = someone.with_parameters(someone.parameters._replace(cost_parameters=jnp.linspace(-4, 0, GRID.size)))
     assert float(dearer.log_density()) == pytest.approx(-np.sum(np.linspace(0, 4, GRID.size) ** 2) / 8)
     paid = dearer.tasks_of(reach(GRID, 0, discount=1.0, step_cost=1.0)).reward
     assert float(paid[7, 3]) == pytest.approx(-1 - np.log1p(np.exp(-4 + 8 * 4 / 29)))  # to the right, at 8
-    assert float(paid[29, 3]) == pytest.approx(-1 - np.log(2))  # off the map one aims at where one is
+    assert float(paid[29, 3]) == pytest.approx(-1 - np.log(2))  # off the map an action aims at its own state
 
 
-def test_what_cannot_be_learned_is_refused():
+def test_behavior_model_of_wrong_arguments_raises():
     behavior = Behavior(LogSumExp(), 5.0)
-    with pytest.raises(InputError, match=r"'learned': expected some of .*'lapse'"):
-        behavior_model(behavior, ["lapse"])
+    with pytest.raises(InputError, match=r"'learn': expected some of .*'lapses'"):
+        behavior_model(behavior, ["lapses"])
     with pytest.raises(InputError, match=r"'discount': .*between 0 and 1"):
         behavior_model(behavior, ["discount"], discount=1.0)
     with pytest.raises(InputError, match=r"'person': expected persons numbered from 0"):
         behavior_model(behavior, person=np.array([0, 2]))
     with pytest.raises(InputError, match=r"'features': expected finite numbers"):
         behavior_model(behavior, features=np.full((3, 1, 1), np.nan))
-    with pytest.raises(InputError, match=r"'tastes': expected 1 finite numbers"):
-        behavior_model(behavior, features=np.zeros((3, 1, 1)), tastes=np.full(1, np.inf))
+    with pytest.raises(InputError, match=r"'reward_weights': expected 1 finite numbers"):
+        behavior_model(behavior, features=np.zeros((3, 1, 1)), reward_weights=np.full(1, np.inf))
     with pytest.raises(InputError, match=r"'aimed_at': expected states 0…29"):
         behavior_model(behavior, aimed_at=np.full((30, 4), 30))
     with pytest.raises(InputError, match=r"'lapse': expected a share"):

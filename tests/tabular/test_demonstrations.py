@@ -113,16 +113,14 @@ def test_moves_count_once_or_by_their_weight():
     assert found.with_only(np.array([False, True])).weights.tolist() == [0, 0, 1]
 
 
-def test_filled_up_with_the_first_moves_and_tasks_again():
+def test_pad_to_power_of_two_adds_moves_that_count_nothing_and_tasks_that_end_at_once():
     found = gather([trajectory([1, 2, 2, 3], [3, 3, 3]), trajectory([2, 1, 0], [2, 2], task=1)], [*TASKS, TASKS[1]])
-    filled = pad_to_power_of_two(found)
-    assert (len(found), len(filled), len(filled.tasks.terminal)) == (5, 8, 4)
-    assert filled.states.tolist() == [*found.states.tolist(), 1, 1, 1]
-    assert filled.task.tolist() == [*found.task.tolist(), 0, 0, 0]
-    np.testing.assert_allclose(filled.tasks.discount, [0.95, 0.5, 0.5, 0.95])
-    assert filled.weight is None
-    weighed = pad_to_power_of_two(found.with_only(np.array([False, True])))
-    assert weighed.weights.tolist() == [0, 0, 0, 1, 1, 0, 0, 0]
+    padded = pad_to_power_of_two(found)
+    assert (len(found), len(padded), len(padded.tasks.terminal)) == (5, 64, 8)
+    assert padded.states.tolist() == [*found.states.tolist(), *[1] * 59]
+    assert padded.weights.tolist() == [1] * 5 + [0] * 59
+    np.testing.assert_allclose(padded.tasks.discount, [0.95, 0.5, 0.5, *[0.95] * 5])
+    assert padded.tasks.terminal[3:].all()
 
 
 @pytest.mark.parametrize(("count", "expected"), [(1, 1), (2, 2), (3, 4), (16, 16), (17, 32)])

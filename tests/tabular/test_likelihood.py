@@ -1,12 +1,15 @@
 """The likelihood by hand, its terms, and what gives none."""
 
+from contextlib import contextmanager
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.tabular.backups import Behavior, HardMax
+from sidestep.inference.calibration import scores
+from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax
 from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Grid
@@ -14,7 +17,8 @@ from sidestep.tabular.likelihood import (
     arrival_log_likelihood,
     arrivals_of,
     log_likelihood,
-    transition_log_likelihood,
+    log_policies,
+    transition_probabilities,
 )
 from sidestep.tabular.models import ObstacleGrid, TabularModel
 from sidestep.tabular.solve import SolveOptions, solve
@@ -107,36 +111,64 @@ def test_arrivals_are_the_moves_counted():
     model = ObstacleGrid(grid, jnp.asarray([0.0, -1.0, -2.0]))
     walks = [WALK, Trajectory(np.array([0, 0, 1]), np.array([3, 3]), 1)]
     shown = gather(walks, [reach(grid, 2, discount=0.5), reach(grid, 1)])
-    for weight, counts in ((None, [1, 2, 2, 1]), (jnp.asarray([0.0, 1, 2, 0, 3, 0.5]), [0, 4, 2.5, 0])):
-        weighed = eqx.tree_at(lambda demos: demos.weight, shown, weight, is_leaf=lambda leaf: leaf is None)
+    for weights, counts in ((np.ones(6), [1, 2, 2, 1]), (np.array([0.0, 1, 2, 0, 3, 0.5]), [0, 4, 2.5, 0])):
+        weighed = eqx.tree_at(lambda demos: demos.weights, shown, jnp.asarray(weights))
         arrivals = arrivals_of(weighed)
         kinds = zip(arrivals.states.tolist(), arrivals.actions.tolist(), arrivals.next_states.tolist(), strict=True)
         assert list(kinds)[:4] == [(0, 2, 0), (0, 3, 0), (0, 3, 1), (1, 3, 2)]
         assert arrivals.counts.tolist() == [*counts, *[0] * 12]
-        expected = transition_log_likelihood(model, weighed)
-        assert float(arrival_log_likelihood(model, arrivals)) == pytest.approx(float(expected), rel=1e-12)
+        expected = np.log(transition_probabilities(model, shown)) @ weights
+        assert float(arrival_log_likelihood(model, arrivals)) == pytest.approx(expected, rel=1e-12)
+        found = log_likelihood(model, weighed, Behavior(HardMax(), BETA), terms=("transitions",))
+        assert float(found.transitions) == pytest.approx(expected, rel=1e-12)
 
 
-@pytest.mark.parametrize("connectivity", [4, 8])
-def test_solves_are_compiled_once(connectivity):
-    """Of a map of this size and so many tasks; each compilation takes longer than many solves."""
-    grid = Grid.unknown(3, 7, connectivity=connectivity)
-    compiled = []
+@contextmanager
+def compilations():
+    """The compilations within a block, one entry each."""
+    events = []
 
     def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
         del duration_secs, kwargs
-        compiled.append("backend_compile" in event)
+        events.extend([event] * ("backend_compile" in event))
 
-    people = Behavior(HardMax(), BETA)
-    makers = [lambda logit, goal=goal: (ObstacleGrid(grid, logit), reach(grid, goal)) for goal in (3, 8)]
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
-        for make in makers:
-            solve(*make(-1.0), people)
-        assert any(compiled)
-        compiled.clear()
-        for make in makers:
-            solve(*make(-2.0), people)
-        assert not any(compiled)
+        yield events
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def test_solve_of_other_parameters_and_goals_compiles_once():
+    grid = Grid.unknown(3, 7)
+    with compilations() as first:
+        solve(ObstacleGrid(grid, -1.0), reach(grid, 3), Behavior(HardMax(), BETA))
+    with compilations() as again:
+        solve(ObstacleGrid(grid, -2.0), reach(grid, 8), Behavior(HardMax(), 2 * BETA))
+    assert first
+    assert not again
+
+
+def test_likelihoods_of_subjects_of_any_length_compile_once():
+    """Ten subjects of 1 to 41 moves towards one to five goals."""
+    grid = Grid.unknown(2, 7)
+    model, behavior = ObstacleGrid(grid, -1.0), Behavior(BoltzmannAverage(), 5.0)
+
+    def look(moves: int, goals: int) -> tuple[np.ndarray, np.ndarray]:
+        walk = np.resize([8, 9], moves + 1), np.resize([3, 2], moves)
+        walks = [Trajectory(*walk, goal) for goal in range(goals)]
+        shown = gather(walks, [reach(grid, goal) for goal in range(goals)])
+        each, scored = np.asarray(log_policies(model, shown, behavior)), scores(model, shown, behavior)
+        assert len(each) == len(scored.score) == len(transition_probabilities(model, shown)) == moves * goals
+        assert float(log_likelihood(model, shown, behavior).actions) == pytest.approx(each.sum(), rel=1e-12)
+        np.testing.assert_allclose(scored.log_policy, each, rtol=1e-12)
+        return each, scored.score
+
+    with compilations() as first:
+        expected = look(41, 1)
+    with compilations() as again:
+        for moves, goals in ((1, 1), (2, 5), (3, 2), (7, 3), (11, 5), (12, 4), (18, 1), (29, 2), (33, 1), (41, 1)):
+            found = look(moves, goals)
+    assert first
+    assert not again
+    np.testing.assert_array_equal(found, expected)

@@ -98,7 +98,7 @@ def test_a_plan_bumps_for_ever_into_a_wall_that_it_does_not_know():
     corridor = Grid(np.array([[0, 0, 1, 0]]))
     made = plan(true_model(Grid(np.zeros((1, 4), dtype=int))), reach(corridor, 3))
     walked = roll_out(
-        jax.random.key(0), true_model(corridor), made.policy, made.terminal, jnp.array([0, 1, 3]), moves=6
+        jax.random.key(0), true_model(corridor), made.policy, made.terminal, jnp.array([0, 1, 3]), max_moves=6
     )
     assert walked.states.tolist() == [[0, 1, 1, 1, 1, 1, 1], [1] * 7, [3] * 7]
     assert walked.actions.tolist() == [[RIGHT] * 6, [RIGHT] * 6, [-1] * 6]
@@ -109,7 +109,7 @@ def test_a_plan_bumps_for_ever_into_a_wall_that_it_does_not_know():
 
 def test_nothing_is_done_after_arriving():
     made = plan(true_model(OPEN), reach(OPEN, 2))
-    walked = roll_out(jax.random.key(1), true_model(OPEN), made.policy, made.terminal, jnp.array([0, 1]), moves=4)
+    walked = roll_out(jax.random.key(1), true_model(OPEN), made.policy, made.terminal, jnp.array([0, 1]), max_moves=4)
     assert walked.states.tolist() == [[0, 1, 2, 2, 2], [1, 2, 2, 2, 2]]
     assert walked.actions.tolist() == [[RIGHT, RIGHT, -1, -1], [RIGHT, -1, -1, -1]]
     assert walked.moves.tolist() == [2, 1]
@@ -119,7 +119,9 @@ def test_nothing_is_done_after_arriving():
 
 def test_walkers_stay_where_they_arrive_even_if_their_policy_would_lead_on():
     always_right = jnp.zeros((9, 4)).at[:, RIGHT].set(1.0)
-    walked = roll_out(jax.random.key(0), true_model(OPEN), always_right, jnp.arange(9) == 1, jnp.array([0, 3]), moves=3)
+    walked = roll_out(
+        jax.random.key(0), true_model(OPEN), always_right, jnp.arange(9) == 1, jnp.array([0, 3]), max_moves=3
+    )
     assert walked.states.tolist() == [[0, 1, 1, 1], [3, 4, 5, 5]]
     assert walked.arrived.tolist() == [True, False]
 
@@ -136,7 +138,7 @@ def stochastic(seed):
     ends = jnp.array([False, True, True])
     starts = jnp.zeros(WALKERS, dtype=int)
     return roll_out(
-        jax.random.key(seed), TabularModel(world, jnp.asarray(logits)), jnp.asarray(POLICY), ends, starts, moves=1
+        jax.random.key(seed), TabularModel(world, jnp.asarray(logits)), jnp.asarray(POLICY), ends, starts, max_moves=1
     )
 
 

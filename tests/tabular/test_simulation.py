@@ -94,7 +94,7 @@ def test_walkers_of_different_tasks_choose_on_their_own():
     (CORRIDOR, 0, 1),
 ])  # fmt: skip
 def test_walkers_who_cannot_arrive_are_refused(cells, start, moves):
-    with pytest.raises(InputError, match=rf"task 0: a walker from state {start} had not arrived after"):
+    with pytest.raises(InputError, match=rf"task 0: an agent from state {start} had not arrived after"):
         walked(Grid(cells), [5], [[4, start]], moves=moves)
 
 

@@ -13,13 +13,12 @@ import numpy as np
 from jaxtyping import Float
 
 from sidestep.evaluation.metrics import visit_ranking
-from sidestep.inference.batching import LARGE
 from sidestep.maps.config import MapConfig
 from sidestep.maps.fit import behavior_of, fit_map
 from sidestep.robots.planners import Planner
 from sidestep.robots.robot import risk_averse_robot
 from sidestep.tabular.backups import Behavior
-from sidestep.tabular.demonstrations import Demonstrations, pad_to_power_of_two
+from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import log_policies
 from sidestep.tabular.models import ObstacleGrid
@@ -91,10 +90,7 @@ class ModelResult(NamedTuple):
         goals = np.asarray(demonstrations.tasks.terminal).argmax(axis=-1)
         tasks = stack_tasks([self.reward.reach(self.model.blank, int(goal)) for goal in goals])
         pursued = eqx.tree_at(lambda demos: demos.tasks, demonstrations, tasks)
-        # where solves take long, compiling once more is the lesser evil
-        few = self.model.graph.states < LARGE
-        shown = pad_to_power_of_two(pursued) if few else pursued
-        return np.asarray(log_policies(self.model, shown, self.behavior))[: len(demonstrations)]
+        return np.asarray(log_policies(self.model, pursued, self.behavior))
 
 
 Method = Callable[[Grid, Demonstrations, MapConfig], BaselineResult]

@@ -19,14 +19,15 @@ and Firth 2011): log L^κ. A share above 1 says that people are more regular tha
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from sidestep.errors import NotConverged
 from sidestep.tabular.backups import Behavior
-from sidestep.tabular.demonstrations import Demonstrations
+from sidestep.tabular.demonstrations import Demonstrations, pad_to_power_of_two
 from sidestep.tabular.likelihood import visited_action_values
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import SolveOptions, solve
@@ -52,24 +53,29 @@ def scores(
 
     `options`: as for `solve`. Raises `NotConverged` if values are not found.
     """
-    solution = solve(model, demonstrations.tasks, behavior, options=options)
-    if not bool(solution.converged.all()):
+    padded = pad_to_power_of_two(demonstrations)
+    converged, *numbers = _scores(model, padded, behavior, options)
+    if not bool(converged):
         raise NotConverged("the values of a task were not found: a smaller β may help")
+    counts = np.asarray(padded.weights) > 0
+    return Scores(*(np.asarray(each)[counts] for each in (*numbers, padded.trajectory)))
+
+
+@eqx.filter_jit
+def _scores(
+    model: TransitionModel, demonstrations: Demonstrations, behavior: Behavior, options: SolveOptions | None
+) -> tuple[Bool[Array, ""], Float[Array, " moves"], Float[Array, " moves"], Float[Array, " moves"]]:
+    """Whether all values converged, and of each move: u, Σ_a π u² and log π(a | s)."""
+    solution = solve(model, demonstrations.tasks, behavior, options=options)
     q = visited_action_values(model, demonstrations.tasks, solution.values, demonstrations.task, demonstrations.states)
     log_policy, by_log_beta = jax.jvp(
         lambda log_beta: Behavior(behavior.backup, jnp.exp(log_beta), behavior.lapse).log_policy(q),
         (jnp.log(behavior.beta),),
         (jnp.ones_like(behavior.beta),),
     )
-    information = np.asarray(jnp.sum(jnp.exp(log_policy) * by_log_beta**2, axis=-1))
-    moves, actions = np.arange(len(q)), np.asarray(demonstrations.actions)
-    counts = np.asarray(demonstrations.weights) > 0
-    return Scores(
-        np.asarray(by_log_beta)[moves, actions][counts],
-        information[counts],
-        np.asarray(log_policy)[moves, actions][counts],
-        np.asarray(demonstrations.trajectory)[counts],
-    )
+    information = jnp.sum(jnp.exp(log_policy) * by_log_beta**2, axis=-1)
+    taken = jnp.arange(len(q)), demonstrations.actions
+    return solution.converged.all(), by_log_beta[taken], information, log_policy[taken]
 
 
 def effective_sample_ratio(held_out: Sequence[Scores]) -> float:

@@ -1,4 +1,4 @@
-"""Backups: how people value a state by its actions, V(s) = B(Q(s, ·)).
+"""Backups: how agents value a state by its actions, V(s) = B(Q(s, ·)).
 
 | backup             | V(s)                           | weights ∂V/∂Q(a)      | fixed-policy weights |
 |--------------------|--------------------------------|-----------------------|----------------------|
@@ -7,7 +7,7 @@
 | `LogSumExp`        | (1/β) log Σ_a exp βQ(a)        | π                     | π                    |
 | `Mellowmax`        | (1/β) log mean_a exp βQ(a)     | π                     | π                    |
 
-with π(a) ∝ exp βQ(a), which is how people act under every backup (eqs. 2 and 3). Weights always sum to one.
+with π(a) ∝ exp βQ(a), which is the policy under every backup (eqs. 2 and 3). Weights always sum to one.
 Equation numbers are those of the behavior-aware modeling paper; mellowmax is from Asadi & Littman (2017), the
 log-sum-exp from Ziebart's maximum causal entropy (2010).
 """
@@ -20,74 +20,82 @@ from typing import ClassVar, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Scalar
 
 from sidestep.errors import InputError
 
 Gradient = Literal["exact", "fixed_policy"]
-"""Which derivative a backup has: its own, or that of the average under the policy held fixed (eqs. 9 and 10)."""
+"""The derivative of a backup: its own, or that of the average under the policy held fixed (eqs. 9 and 10)."""
 
 Values = Float[Array, "*states"]
 ActionValues = Float[Array, "*states actions"]
 
 
 class Backup(eqx.Module):
-    """How the values of a state's actions make the value of the state, at sharpness β.
+    """The value of a state as a function of the values of its actions, at inverse temperature β.
 
-    `above_maximum` says on which side of the best action's value the backup lies: never below it, or never above.
+    Attributes:
+        above_maximum: whether the backup is never below the best action's value; otherwise it is never above.
     """
 
     above_maximum: ClassVar[bool] = False
 
     @abc.abstractmethod
     def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
-        """V = B(q) over the last axis, differentiable in both arguments with the exact gradient."""
+        """Return V = B(q) over the last axis, differentiable in both arguments with the exact gradient."""
 
     @abc.abstractmethod
     def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
-        """The exact gradient ∂V/∂q; sums to one over the last axis."""
+        """Return the exact gradient ∂V/∂q; it sums to one over the last axis."""
 
     def fixed_policy_weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
-        """The weights of the average under a policy that is held fixed: π for the soft backups (eq. 9)."""
+        """Return the weights of the average under the policy held fixed: π for the soft backups (eq. 9)."""
         return jax.nn.softmax(beta * _below_best(q), axis=-1)
 
     def bonus(self, entropy: Values, actions: int | None, beta: Float[Scalar, ""]) -> Values:
-        """What V has beyond Σ_a π(a) Q(a), by the policy's entropy: nothing, unless a backup says otherwise.
+        """Return V − Σ_a π(a) Q(a), from the policy's entropy; 0 by default.
 
-        `actions` is how many there are, `None` where an action is a vector.
+        `actions` is the number of actions, `None` where an action is a vector.
         """
         del actions, beta
         return jnp.zeros_like(entropy)
 
 
 class HardMax(Backup):
-    """V = max_a Q(a): people who follow an optimal policy (eq. 2).
+    """V = max_a Q(a): agents with an optimal policy (eq. 2).
 
-    Actions within the share `tie` of the best value (or within rounding) count as ties and share the gradient equally
-    (eq. 10). It is small, for in a nearly trapped state values are far larger than the differences that matter.
+    Attributes:
+        tie: actions within this relative difference of the best value (or within rounding) are ties and have equal
+            parts of the gradient (eq. 10). It is small, because in a nearly trapped state values are far larger than
+            the differences that matter.
+
+    Example:
+        >>> float(HardMax().value(jnp.array([1.0, 3.0]), jnp.array(10.0)))
+        3.0
     """
 
     tie: float = eqx.field(default=4e-12, static=True)
 
     def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
-        """The best action's value."""
+        """Return the best action's value."""
         best = jax.lax.stop_gradient(q.max(axis=-1))
         weights = jax.lax.stop_gradient(self.weights(q, beta))
         return best + jnp.sum(weights * (q - jax.lax.stop_gradient(q)), axis=-1)
 
     def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
-        """One over the number of best actions, on each of them."""
+        """Return one over the number of best actions, for each of them."""
         del beta
         best = q.max(axis=-1, keepdims=True)
         tolerance = jnp.maximum(self.tie, 64 * jnp.finfo(q.dtype).eps) * jnp.abs(best)
-        # the first of the best counts even if a compiler, rounding twice, finds none as good as the best
+        # the first of the best counts even if a compiler, rounding twice, makes none equal to the best
         first = jax.nn.one_hot(q.argmax(axis=-1), q.shape[-1], dtype=bool)
         ties = ((q >= best - tolerance) | first).astype(q.dtype)
         return ties / ties.sum(axis=-1, keepdims=True)
 
     def fixed_policy_weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
-        """The optimal policy, uniform over ties (eq. 10), which is also the gradient of the maximum."""
+        """Return the optimal policy, uniform over ties (eq. 10), which is also the gradient of the maximum."""
         return self.weights(q, beta)
 
 
@@ -95,55 +103,75 @@ class BoltzmannAverage(Backup):
     """V = Σ_a π(a) Q(a): the expected value of acting by π (eqs. 3–5), the paper's choice.
 
     It lies below the maximum and is neither monotone nor in general a contraction, so a solve may fail to converge.
+
+    Example:
+        >>> bool(BoltzmannAverage().value(jnp.array([1.0, 3.0]), jnp.array(1.0)) < 3)
+        True
     """
 
     def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
-        """The average of the actions' values under π."""
+        """Return the average of the actions' values under π."""
         return jnp.sum(self.fixed_policy_weights(q, beta) * q, axis=-1)
 
     def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
-        """π(1 + β(Q − V)), eq. 8: an action's own value counts, and how its share grows with it."""
+        """Return π(1 + β(Q − V)), eq. 8: the effect of an action's value directly and through its probability."""
         policy = self.fixed_policy_weights(q, beta)
         value = jnp.sum(policy * q, axis=-1, keepdims=True)
         return policy * (1 + beta * (q - value))
 
 
 class LogSumExp(Backup):
-    """V = (1/β) log Σ_a exp βQ(a): maximum causal entropy; every choice adds to the value of a state."""
+    """V = (1/β) log Σ_a exp βQ(a): maximum causal entropy; every further action adds to the value of a state.
+
+    Example:
+        >>> bool(LogSumExp().value(jnp.array([1.0, 3.0]), jnp.array(1.0)) > 3)
+        True
+
+    References:
+        Ziebart, "Modeling purposeful adaptive behavior with the principle of maximum causal entropy" (2010).
+    """
 
     above_maximum: ClassVar[bool] = True
 
     def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
-        """The soft maximum, above the maximum by at most log(actions)/β."""
+        """Return the soft maximum, above the maximum by at most log(actions)/β."""
         best = jax.lax.stop_gradient(q.max(axis=-1))
         return best + jax.nn.logsumexp(beta * _below_best(q), axis=-1) / beta
 
     def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
-        """π, so that eq. 9 is exact here."""
+        """Return π: eq. 9 is exact here."""
         return self.fixed_policy_weights(q, beta)
 
     def bonus(self, entropy: Values, actions: int | None, beta: Float[Scalar, ""]) -> Values:
-        """The entropy over β."""
+        """Return the entropy over β."""
         del actions
         return entropy / beta
 
 
 class Mellowmax(Backup):
-    """V = (1/β) log mean_a exp βQ(a): the log-sum-exp without its bonus of log(actions)/β a step."""
+    """V = (1/β) log mean_a exp βQ(a): the log-sum-exp without its bonus of log(actions)/β for every step.
+
+    Example:
+        >>> bool(Mellowmax().value(jnp.array([1.0, 3.0]), jnp.array(1.0)) < 3)
+        True
+
+    References:
+        Asadi and Littman, "An alternative softmax operator for reinforcement learning" (2017).
+    """
 
     def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
-        """A soft maximum between the mean and the maximum."""
+        """Return a soft maximum between the mean and the maximum."""
         best = jax.lax.stop_gradient(q.max(axis=-1))
         # log mean exp, without adding 1 to what may be far smaller
         mean = jnp.mean(jnp.expm1(beta * _below_best(q)), axis=-1)
         return best + jnp.log1p(mean) / beta
 
     def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
-        """π, as for the log-sum-exp."""
+        """Return π, as for the log-sum-exp."""
         return self.fixed_policy_weights(q, beta)
 
     def bonus(self, entropy: Values, actions: int | None, beta: Float[Scalar, ""]) -> Values:
-        """By how much the policy's entropy is below that of acting at random, over −β."""
+        """Return the policy's entropy minus that of acting at random, over β."""
         if actions is None:
             raise InputError("the mellowmax needs a finite number of actions: expected another", field="backup")
         return (entropy - jnp.log(actions)) / beta
@@ -156,17 +184,26 @@ BACKUPS: Mapping[str, Callable[[], Backup]] = MappingProxyType(
 
 
 class Behavior(eqx.Module):
-    """How people act: the backup they value states with, how sharply they choose, and how often they lapse.
+    """How agents act: the backup that they value states with, their inverse temperature and their lapses.
 
-    The probability of an action is ∝ exp(β Q(s, a)) (eqs. 2 and 3). With the probability `lapse` people do anything at
-    all instead; they do not reckon with that when they value states.
+    The probability of an action is ∝ exp(β Q(s, a)) (eqs. 2 and 3). With probability `lapse` agents take a uniformly
+    random action instead; the values of states do not account for that.
 
-    - `beta`: β in units of one over reward, above 0.
-    - `lapse`: a share of actions, at least 0 and below 1; None for none.
+    Attributes:
+        backup: the value of a state from the values of its actions.
+        beta: the inverse temperature β, above 0, in units of one over reward.
+        lapse: the fraction of random actions, at least 0 and below 1; None for none.
 
-    Raises `InputError` for β ≤ 0 or not finite, and for a share of lapses out of that range.
+    Raises:
+        InputError: for β ≤ 0 or not finite, and for a lapse out of its range.
 
-    >>> people = Behavior(BoltzmannAverage(), beta=10.0)
+    Example:
+        >>> float(Behavior(BoltzmannAverage(), beta=5.0).beta)
+        5.0
+
+    References:
+        Equations 2 and 3 of the behavior-aware modeling paper. Lapses are those of psychometrics (Wichmann and Hill,
+        2001).
     """
 
     backup: Backup
@@ -179,13 +216,17 @@ class Behavior(eqx.Module):
         self.backup = backup
         self.beta = jnp.asarray(beta, dtype=jnp.result_type(float))
         self.lapse = None if lapse is None else jnp.asarray(lapse, dtype=jnp.result_type(float))
-        if not isinstance(self.beta, Tracer) and not (jnp.isfinite(self.beta) and self.beta > 0):
+        if not isinstance(self.beta, Tracer) and not 0 < float(self.beta) < np.inf:
             raise InputError(f"expected a finite number above 0, found {beta}", field="beta")
-        if self.lapse is not None and not isinstance(self.lapse, Tracer) and not 0 <= self.lapse < 1:
+        if self.lapse is not None and not isinstance(self.lapse, Tracer) and not 0 <= float(self.lapse) < 1:
             raise InputError(f"expected a share, at least 0 and below 1, found {lapse}", field="lapse")
 
     def log_policy(self, q: ActionValues) -> ActionValues:
-        """log π(a | s) from action values."""
+        """Return log π(a | s) from action values.
+
+        Args:
+            q: Q(s, a), with actions on the last axis.
+        """
         chosen = jax.nn.log_softmax(self.beta.astype(q.dtype) * _below_best(q), axis=-1)
         if self.lapse is None:
             return chosen
@@ -194,9 +235,9 @@ class Behavior(eqx.Module):
 
 
 def _below_best(q: ActionValues) -> ActionValues:
-    """q − max q, with the gradient of q.
+    """Return q − max q, with the gradient of q.
 
-    Everything here moves with a constant. Multiplied by β before the maximum is taken off, large values may be rounded
-    once with and once without a fused multiply-add, and the exponential of the difference overflows.
+    All backups move with a constant. Were q multiplied by β before the maximum is subtracted, large values could be
+    rounded once with and once without a fused multiply-add, and the exponential of the difference would overflow.
     """
     return q - jax.lax.stop_gradient(q.max(axis=-1, keepdims=True))

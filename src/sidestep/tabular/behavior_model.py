@@ -1,17 +1,15 @@
-"""People of whom not everything is known: what is learned of them beside the transition model.
+"""Behavior models: which numbers of the agents' behavior are learned beside the transition model.
 
-Between the tasks that people pursue and what they do stand some numbers that nobody has written down:
+    beta              β_p = exp b_p                            of all agents, or of each person p
+    lapse             ε = σ(e)                                 the fraction of random actions (see `Behavior`)
+    discount          γ = σ(g)                                 of all tasks
+    reward_weights    R(s, a) + Σ_f w_f φ_f(s, a)              of the features φ of states and actions
+    costs             R(s, a) − ln(1 + exp k_c(s, a))          of aiming at state c(s, a), whatever the goal
 
-    sharpness   β_p = exp b_p                            of all people alike, or of each person p
-    lapses      ε = σ(e)                                 the share of actions at random (see `Behavior`)
-    discount    γ = σ(g)                                 of all tasks
-    tastes      R(s, a) + Σ_f w_f φ_f(s, a)              what they like or dislike on the way, by features φ
-    costs       R(s, a) − ln(1 + exp k_c(s, a))          what it costs to aim at place c(s, a), whatever the goal
-
-Each may be held to be known or be learned with θ, from the likelihood of the actions. What is learned has a normal
-prior around where it starts: the typical b and g, and e, with standard deviation 1, the w with standard deviation
-`taste_spread`, and the k with 2, around −4: a cost of .02, give or take a factor of seven. One person's b differs from
-the typical one with standard deviation ½; so people are pooled, and who is seen little is taken to be like the others.
+Each is known, or learned together with θ from the likelihood of the actions. Learned parameters have a normal prior
+around their start, with standard deviation 1 for e, g and the mean of the b_p, `reward_weight_std` for the w, and 2 for
+the k around −4 (a cost of .02, within a factor of seven). One person's b differs from the mean with standard deviation
+½: this partial pooling pulls a person with few moves towards the others.
 """
 
 from collections.abc import Sequence
@@ -25,42 +23,51 @@ from jax.scipy.special import logit
 from jaxtyping import Array, Float, Int
 
 from sidestep.errors import InputError
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.tasks import Task, with_state_costs
 
-LEARNABLE = ("sharpness", "lapses", "discount")
-"""What may be learned of people, beside tastes."""
+LEARNABLE = ("beta", "lapse", "discount")
+"""The numbers that can be learned by name."""
 
-_PERSONS_DIFFER = 0.5
-"""The standard deviation of one person's log β around that of all."""
-_A_FEW_LAPSES = 0.05
-"""The share of lapses to start from where they are learned and none are given."""
-_COST, _COSTS_DIFFER = -4.0, 2.0
-"""The mean and the standard deviation of the k."""
+_PERSON_STD = 0.5
+"""The standard deviation of one person's log β around the mean."""
+_INITIAL_LAPSE = 0.05
+"""Where a lapse starts that is learned, if the behavior has none."""
+_COST_MEAN, _COST_STD = -4.0, 2.0
+"""The mean and the standard deviation of the prior of k."""
 
 
 class BehaviorParameters(NamedTuple):
-    """The numbers that are learned; None for what is known.
+    """The learned numbers, unconstrained; None for what is known.
 
-    - `sharpness`: b of every person; one number where people are alike. `lapses`: e. `discount`: g. `tastes`: w.
-    - `costs`: k of every place.
+    Attributes:
+        log_beta: b of each person; a single number where persons are not distinguished.
+        logit_lapse: e.
+        logit_discount: g.
+        reward_weights: w of each feature.
+        cost_parameters: k of each state.
     """
 
-    sharpness: Float[Array, " persons"] | None = None
-    lapses: Float[Array, ""] | None = None
-    discount: Float[Array, ""] | None = None
-    tastes: Float[Array, " features"] | None = None
-    costs: Float[Array, " states"] | None = None
+    log_beta: Float[Array, " persons"] | None = None
+    logit_lapse: Float[Array, ""] | None = None
+    logit_discount: Float[Array, ""] | None = None
+    reward_weights: Float[Array, " features"] | None = None
+    cost_parameters: Float[Array, " states"] | None = None
 
 
 class BehaviorModel(eqx.Module):
-    """How people behave, what is known of them and what is to be learned.
+    """How agents behave: what is known, and what is learned; made by `behavior_model`.
 
-    - `behavior`: what is known, and where sharpness and lapses start from. `discount`: likewise.
-    - `parameters`: what is learned.
-    - `person`: whose each task is, where people differ (see `split_by_person` in `sidestep.tabular.demonstrations`).
-    - `features`: φ(s, a); an axis of length 1 holds for all states or all actions.
-    - `aimed_at`: c(s, a), where places may cost something.
+    Attributes:
+        behavior: the known numbers, and the start of a learned β and lapse.
+        parameters: the learned numbers.
+        start: the mean of their prior.
+        person: the person of each task, where persons are distinguished (see
+            `sidestep.tabular.demonstrations.split_by_person`).
+        features: φ(s, a); an axis of length 1 holds for all states or all actions.
+        aimed_at: c(s, a), where states have costs.
+        reward_weight_std: the standard deviation of the prior of w.
     """
 
     behavior: Behavior
@@ -69,127 +76,139 @@ class BehaviorModel(eqx.Module):
     person: Int[Array, " tasks"] | None
     features: Float[Array, "#states #actions features"] | None
     aimed_at: Int[Array, "states actions"] | None
-    taste_spread: float = eqx.field(static=True)
+    reward_weight_std: float = eqx.field(static=True)
 
     def with_parameters(self, parameters: BehaviorParameters) -> "BehaviorModel":
-        """The same people with other traits."""
-        return eqx.tree_at(lambda people: people.parameters, self, parameters, is_leaf=lambda leaf: leaf is None)
+        """Return the same model at other parameters.
+
+        Args:
+            parameters: with None for the same numbers.
+        """
+        return eqx.tree_at(lambda model: model.parameters, self, parameters, is_leaf=lambda leaf: leaf is None)
 
     @property
     def costs(self) -> Float[Array, " states"] | None:
-        """What it costs to aim at each place, in units of reward; None where nothing does."""
-        return None if self.parameters.costs is None else jax.nn.softplus(self.parameters.costs)
+        """Return the cost of aiming at each state, in units of reward; None where there are none."""
+        return None if self.parameters.cost_parameters is None else jax.nn.softplus(self.parameters.cost_parameters)
 
     def behavior_of(self, person: Int[Array, ""] | int | None = None) -> Behavior:
-        """How one person behaves; without a person, a typical one: the mean of log β."""
-        sharpness, lapses = self.parameters.sharpness, self.parameters.lapses
+        """Return the behavior of one person.
+
+        Args:
+            person: its index; None for a typical person, of the mean log β.
+        """
+        log_beta, logit_lapse = self.parameters.log_beta, self.parameters.logit_lapse
         beta, lapse = self.behavior.beta, self.behavior.lapse
-        if sharpness is not None:
-            beta = jnp.exp(sharpness.mean() if person is None else sharpness[person])
-        if lapses is not None:
-            lapse = jax.nn.sigmoid(lapses)
+        if log_beta is not None:
+            beta = jnp.exp(log_beta.mean() if person is None else log_beta[person])
+        if logit_lapse is not None:
+            lapse = jax.nn.sigmoid(logit_lapse)
         return Behavior(self.behavior.backup, beta, lapse)
 
     def tasks_of(self, tasks: Task) -> Task:
-        """What people pursue, one task or a stack, with their discount, their tastes and their costs."""
+        """Return tasks with the agents' discount, reward weights and costs.
+
+        Args:
+            tasks: one task or a stack of tasks.
+        """
         if self.costs is not None and self.aimed_at is not None:
             tasks = with_state_costs(tasks, self.costs, self.aimed_at)
         reward, discount = tasks.reward, tasks.discount
-        if self.parameters.tastes is not None and self.features is not None:
-            reward = reward + self.features @ self.parameters.tastes
-        if self.parameters.discount is not None:
-            discount = jnp.broadcast_to(jax.nn.sigmoid(self.parameters.discount), discount.shape)
+        if self.parameters.reward_weights is not None and self.features is not None:
+            reward = reward + self.features @ self.parameters.reward_weights
+        if self.parameters.logit_discount is not None:
+            discount = jnp.broadcast_to(jax.nn.sigmoid(self.parameters.logit_discount), discount.shape)
         return Task(reward, tasks.terminal_reward, tasks.terminal, discount)
 
     def log_density(self) -> Float[Array, ""]:
-        """The logarithm of the prior density of the traits, in nats, without the constant."""
+        """Return the logarithm of the prior density of the parameters, in nats, without its constant."""
         deviations = [jnp.zeros(1)]
         now, start = self.parameters, self.start
-        if now.sharpness is not None and start.sharpness is not None:
-            typical = now.sharpness.mean()
-            deviations += [(typical - start.sharpness.mean())[None], (now.sharpness - typical) / _PERSONS_DIFFER]
-        if now.lapses is not None and start.lapses is not None:
-            deviations.append((now.lapses - start.lapses)[None])
-        if now.discount is not None and start.discount is not None:
-            deviations.append((now.discount - start.discount)[None])
-        if now.tastes is not None and start.tastes is not None:
-            deviations.append((now.tastes - start.tastes) / self.taste_spread)
-        if now.costs is not None and start.costs is not None:
-            deviations.append((now.costs - start.costs) / _COSTS_DIFFER)
+        if now.log_beta is not None and start.log_beta is not None:
+            mean = now.log_beta.mean()
+            deviations += [(mean - start.log_beta.mean())[None], (now.log_beta - mean) / _PERSON_STD]
+        for value, mean, std in (
+            (now.logit_lapse, start.logit_lapse, 1.0),
+            (now.logit_discount, start.logit_discount, 1.0),
+            (now.reward_weights, start.reward_weights, self.reward_weight_std),
+            (now.cost_parameters, start.cost_parameters, _COST_STD),
+        ):
+            if value is not None and mean is not None:
+                deviations.append(jnp.atleast_1d((value - mean) / std))
         return -0.5 * jnp.sum(jnp.concatenate(deviations) ** 2)
 
 
 def behavior_model(
     behavior: Behavior,
-    learned: Sequence[str] = (),
+    learn: Sequence[str] = (),
     *,
     discount: float | None = None,
     person: Int[np.ndarray, " tasks"] | None = None,
     features: Float[np.ndarray, "#states #actions features"] | None = None,
-    tastes: Float[np.ndarray, " features"] | None = None,
-    taste_spread: float = 1.0,
+    reward_weights: Float[np.ndarray, " features"] | None = None,
+    reward_weight_std: float = 1.0,
     aimed_at: Int[np.ndarray, "states actions"] | None = None,
 ) -> BehaviorModel:
-    """People who behave as `behavior` says, but for what is to be learned of them.
+    """Return a model of agents who behave as `behavior` describes, except for what is learned.
 
-    - `learned`: those of `LEARNABLE` that are learned, from where `behavior` and `discount` have them (lapses from a
-      share
-      of .05 if it has none).
-    - `person`: whose each task is, 0…persons − 1; then each has a sharpness of their own.
-    - `features`: what people may like or dislike; `tastes` are the weights to start from, 0 by default, in units of
-      reward for a feature of 1, and `taste_spread` is by how much they may differ from that.
-    - `aimed_at`: the state that each action aims at, if it costs something to aim at states and that is to be learned.
+    Args:
+        behavior: the known behavior, and the start of a learned β and lapse (.05 if it has no lapse).
+        learn: names out of `LEARNABLE`.
+        discount: the start of a learned discount, between 0 and 1.
+        person: the person of each task, 0…persons − 1; with it, each person's β is learned.
+        features: φ(s, a) of rewards with learned weights; an axis of length 1 holds for all states or all actions.
+        reward_weights: their start, in units of reward; 0 by default.
+        reward_weight_std: the standard deviation of their prior, in units of reward.
+        aimed_at: the state that each action aims at; with it, the costs of states are learned.
 
-    Raises `InputError` for a trait that there is not, a discount that is to be learned and not between 0 and 1, persons
-    who are not numbered from 0, features that are not finite, as many tastes as there are not features, and aims that
-    are not states.
+    Raises:
+        InputError: for a name that is not in `LEARNABLE`, a learned discount that is not between 0 and 1, persons
+            that are not numbered from 0, features or weights that are not finite, another number of weights than of
+            features, and aims that are not states.
 
-    >>> from sidestep.tabular.backups import BoltzmannAverage
-    >>> float(behavior_model(Behavior(BoltzmannAverage(), 7.0), ["sharpness"]).behavior_of().beta)
-    7.0
+    Example:
+        >>> from sidestep.tabular.backups import BoltzmannAverage
+        >>> round(float(behavior_model(Behavior(BoltzmannAverage(), 7.0), learn=["beta"]).behavior_of().beta), 3)
+        7.0
     """
-    unknown = [trait for trait in learned if trait not in LEARNABLE]
+    unknown = [name for name in learn if name not in LEARNABLE]
     if unknown:
-        raise InputError(f"expected some of {LEARNABLE}, found {unknown[0]!r}", field="learned")
+        raise InputError(f"expected some of {LEARNABLE}, found {unknown[0]!r}", field="learn")
     if person is not None and not np.array_equal(np.unique(person), np.arange(np.max(person) + 1)):
         raise InputError("expected persons numbered from 0, each with a task", field="person")
-    start = BehaviorParameters(
-        sharpness=_sharpness(behavior, person) if "sharpness" in learned or person is not None else None,
-        lapses=logit(jnp.asarray(_A_FEW_LAPSES if behavior.lapse is None else behavior.lapse))
-        if "lapses" in learned
-        else None,
-        discount=_logit_of(discount) if "discount" in learned else None,
-        tastes=None if features is None else _tastes(features, tastes),
-        costs=None if aimed_at is None else _costs(aimed_at),
+    log_beta = logit_lapse = logit_discount = weights = cost_parameters = None
+    if "beta" in learn or person is not None:
+        log_beta = jnp.full(1 if person is None else int(np.max(person)) + 1, jnp.log(behavior.beta))
+    if "lapse" in learn:
+        logit_lapse = logit(jnp.asarray(_INITIAL_LAPSE if behavior.lapse is None else behavior.lapse))
+    if "discount" in learn:
+        if discount is None or not 0 < discount < 1:
+            raise InputError(f"to be learned, it must start between 0 and 1: found {discount}", field="discount")
+        logit_discount = logit(jnp.asarray(discount, jnp.result_type(float)))
+    if features is not None:
+        weights = _initial_weights(features, reward_weights)
+    if aimed_at is not None:
+        if aimed_at.min() < 0 or aimed_at.max() >= len(aimed_at):
+            raise InputError(f"expected states 0…{len(aimed_at) - 1}", field="aimed_at")
+        cost_parameters = to_jax(np.full(len(aimed_at), _COST_MEAN))
+    start = BehaviorParameters(log_beta, logit_lapse, logit_discount, weights, cost_parameters)
+    return BehaviorModel(
+        behavior,
+        start,
+        start,
+        None if person is None else to_jax(person, jnp.int32),
+        None if features is None else to_jax(features, jnp.result_type(float)),
+        None if aimed_at is None else to_jax(aimed_at, jnp.int32),
+        reward_weight_std,
     )
-    whose = None if person is None else jnp.asarray(person, jnp.int32)
-    given = None if features is None else jnp.asarray(features, jnp.result_type(float))
-    aims = None if aimed_at is None else jnp.asarray(aimed_at, jnp.int32)
-    return BehaviorModel(behavior, start, start, whose, given, aims, taste_spread)
 
 
-def _sharpness(behavior: Behavior, person: Int[np.ndarray, " tasks"] | None) -> Float[Array, " persons"]:
-    return jnp.full(1 if person is None else int(np.max(person)) + 1, jnp.log(behavior.beta))
-
-
-def _logit_of(discount: float | None) -> Float[Array, ""]:
-    if discount is None or not 0 < discount < 1:
-        raise InputError(f"to be learned, it must start between 0 and 1: found {discount}", field="discount")
-    return logit(jnp.asarray(discount, jnp.result_type(float)))
-
-
-def _tastes(
-    features: Float[np.ndarray, "#states #actions features"], tastes: Float[np.ndarray, " features"] | None
+def _initial_weights(
+    features: Float[np.ndarray, "#states #actions features"], weights: Float[np.ndarray, " features"] | None
 ) -> Float[Array, " features"]:
     if features.ndim != 3 or not np.isfinite(features).all():
         raise InputError("expected finite numbers of shape (states, actions, features)", field="features")
-    weights = np.zeros(features.shape[-1]) if tastes is None else np.asarray(tastes)
+    weights = np.zeros(features.shape[-1]) if weights is None else np.asarray(weights)
     if weights.shape != features.shape[-1:] or not np.isfinite(weights).all():
-        raise InputError(f"expected {features.shape[-1]} finite numbers, found {weights}", field="tastes")
-    return jnp.asarray(weights, jnp.result_type(float))
-
-
-def _costs(aimed_at: Int[np.ndarray, "states actions"]) -> Float[Array, " states"]:
-    if aimed_at.min() < 0 or aimed_at.max() >= len(aimed_at):
-        raise InputError(f"expected states 0…{len(aimed_at) - 1}", field="aimed_at")
-    return jnp.full(len(aimed_at), _COST, jnp.result_type(float))
+        raise InputError(f"expected {features.shape[-1]} finite numbers, found {weights}", field="reward_weights")
+    return to_jax(weights, jnp.result_type(float))

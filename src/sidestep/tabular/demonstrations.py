@@ -1,26 +1,36 @@
-"""Demonstrations: what people did, as flat arrays over all their moves, and the tasks that they pursued."""
+"""Demonstrations: the moves of agents as flat arrays, one trajectory after another, and the tasks that they pursued."""
 
 from collections.abc import Sequence
 from typing import Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from sidestep.errors import InputError
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.tasks import Task, stack_tasks
 
 Tasks = TypeVar("Tasks", bound=eqx.Module)
-"""What tasks are: arrays in discrete worlds (`Task`), functions in continuous ones (`ContinuousTask`)."""
+"""The type of the tasks: arrays in discrete worlds (`Task`), functions in continuous ones (`ContinuousTask`)."""
+
+_MIN_MOVES, _MIN_TASKS = 64, 8
+"""Demonstrations with fewer moves or tasks are padded to these, so that one compiled function serves them all."""
 
 
 class Trajectory(NamedTuple):
-    """One walk: s₁, a₁, …, s_{τ+1}, and the index of its task.
+    """The states and actions of one agent: s₁, a₁, …, s_{τ+1}.
 
-    States are whole numbers in discrete worlds and vectors in continuous ones. An action is its index where there are
-    finitely many, and a vector otherwise.
+    Attributes:
+        states: s₁ … s_{τ+1}; integers in discrete worlds, vectors in continuous ones.
+        actions: a₁ … a_τ; indices where there are finitely many actions, vectors otherwise.
+        task: the index of the task that the agent pursued.
+
+    Example:
+        >>> Trajectory(np.array([0, 1, 2]), np.array([3, 3]), task=0).task
+        0
     """
 
     states: Shaped[np.ndarray, "moves+1 *state"]
@@ -29,12 +39,16 @@ class Trajectory(NamedTuple):
 
 
 class Demonstrations(eqx.Module, Generic[Tasks]):
-    """Moves (s, a, s′) of many trajectories on many tasks, one after another.
+    """The moves (s, a, s′) of many trajectories on many tasks, one after another; made by `gather`.
 
-    - `states`, `actions`, `next_states`: the moves; whole numbers in discrete worlds, in continuous ones vectors.
-    - `task`, `trajectory`: which task (index into `tasks`) and which trajectory each move belongs to.
-    - `tasks`: all tasks, stacked.
-    - `weight`: how much each move counts in the likelihood of discrete worlds; None where all count once.
+    Attributes:
+        states: the state before each move; integers in discrete worlds, vectors in continuous ones.
+        actions: the action of each move.
+        next_states: the state after each move.
+        task: the index (into `tasks`) of the task of each move.
+        trajectory: the index of the trajectory of each move; 0, 1, … in order.
+        tasks: all tasks, stacked.
+        weights: how much each move counts in the likelihood of discrete worlds; 1 by default.
     """
 
     states: Shaped[Array, "moves *state"]
@@ -43,119 +57,163 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
     task: Int[Array, " moves"]
     trajectory: Int[Array, " moves"]
     tasks: Tasks
-    weight: Float[Array, " moves"] | None = None
+    weights: Float[Array, " moves"]
+
+    def __init__(
+        self,
+        states: Shaped[Array, "moves *state"],
+        actions: Shaped[Array, "moves *action"],
+        next_states: Shaped[Array, "moves *state"],
+        task: Int[Array, " moves"],
+        trajectory: Int[Array, " moves"],
+        tasks: Tasks,
+        weights: Float[Array, " moves"] | None = None,
+    ):
+        self.states, self.actions, self.next_states = states, actions, next_states
+        self.task, self.trajectory, self.tasks = task, trajectory, tasks
+        self.weights = to_jax(np.ones(len(states))) if weights is None else weights
 
     def __len__(self) -> int:
-        """The number of moves."""
+        """Return the number of moves."""
         return len(self.states)
 
     @property
     def trajectories(self) -> int:
-        """The number of trajectories."""
-        return int(self.trajectory[-1]) + 1
-
-    @property
-    def weights(self) -> Float[Array, " moves"]:
-        """How much each move counts: its weight, or once."""
-        return jnp.ones(len(self)) if self.weight is None else self.weight
+        """Return the number of trajectories."""
+        return int(np.asarray(self.trajectory)[-1]) + 1
 
     def with_only(self, trajectories: Bool[np.ndarray, " trajectories"]) -> "Demonstrations[Tasks]":
-        """The same moves, of which only those of some trajectories count."""
-        weight = np.asarray(trajectories, dtype=np.float64)[np.asarray(self.trajectory)]
-        return eqx.tree_at(lambda demos: demos.weight, self, jnp.asarray(weight), is_leaf=lambda leaf: leaf is None)
+        """Return the same moves, with weight 1 for those of the chosen trajectories and 0 for the others.
+
+        Args:
+            trajectories: whether each trajectory counts.
+        """
+        weights = np.asarray(trajectories, dtype=np.float64)[np.asarray(self.trajectory)]
+        return eqx.tree_at(lambda demonstrations: demonstrations.weights, self, to_jax(weights))
 
     def first_moves(self) -> Int[np.ndarray, " trajectories"]:
-        """The index of the first move of each trajectory."""
+        """Return the index of the first move of each trajectory."""
         return np.flatnonzero(np.diff(np.asarray(self.trajectory), prepend=-1))
 
     def paths(self) -> list[Shaped[np.ndarray, "_ *state"]]:
-        """The states along each trajectory, the last one included."""
+        """Return the states along each trajectory, the last one included."""
         cuts = self.first_moves()[1:]
         states, ends = np.asarray(self.states), np.asarray(self.next_states)
         pieces = zip(np.split(states, cuts), np.split(ends, cuts), strict=True)
         return [np.concatenate([piece, end[-1:]]) for piece, end in pieces]
 
     def visited_state_goals(self: "Demonstrations[Task]") -> Int[np.ndarray, "visits 2"]:
-        """The different (state, goal) pairs of all that people passed, where they arrived or stopped included.
+        """Return the distinct (state, goal) pairs of all visited states, final states included.
 
         The goal is the first terminal state of the task.
         """
         goals = np.asarray(self.tasks.terminal).argmax(axis=-1)[np.asarray(self.task)]
-        passed = np.concatenate([np.asarray(self.states), np.asarray(self.next_states)])
-        return np.unique(np.stack([passed, np.tile(goals, 2)], axis=1), axis=0)
+        visited = np.concatenate([np.asarray(self.states), np.asarray(self.next_states)])
+        return np.unique(np.stack([visited, np.tile(goals, 2)], axis=1), axis=0)
 
 
 def split_by_person(
     demonstrations: Demonstrations[Task], person: Int[np.ndarray, " trajectories"]
 ) -> tuple[Demonstrations[Task], Int[np.ndarray, " tasks"]]:
-    """The same moves with a task of its own for every person who pursues it, and whose each task is.
+    """Return the same moves with a separate task for every person who pursues it, and the person of each task.
 
-    - `person`: whose each trajectory is, 0…persons − 1.
+    Args:
+        demonstrations: the moves of all persons.
+        person: the person of each trajectory, 0…persons − 1.
     """
-    whose = np.asarray(person)[np.asarray(demonstrations.trajectory)]
-    kinds, task = np.unique(np.stack([np.asarray(demonstrations.task), whose], axis=1), axis=0, return_inverse=True)
-    tasks = jax.tree.map(lambda leaf: leaf[kinds[:, 0]], demonstrations.tasks)
-    own = eqx.tree_at(lambda demos: (demos.task, demos.tasks), demonstrations, (flat_moves([task]), tasks))
-    return own, kinds[:, 1]
+    of_moves = np.asarray(person)[np.asarray(demonstrations.trajectory)]
+    pairs, task = np.unique(np.stack([np.asarray(demonstrations.task), of_moves], axis=1), axis=0, return_inverse=True)
+    tasks = jax.tree.map(lambda leaf: to_jax(np.asarray(leaf)[pairs[:, 0]]), demonstrations.tasks)
+    split = eqx.tree_at(lambda each: (each.task, each.tasks), demonstrations, (flat_moves([task]), tasks))
+    return split, pairs[:, 1]
 
 
 def gather(trajectories: Sequence[Trajectory], tasks: Sequence[Task]) -> Demonstrations[Task]:
-    """Demonstrations from trajectories in any discrete world.
+    """Return demonstrations from trajectories in any discrete world.
 
-    Raises `InputError` for an empty trajectory, lengths that do not fit, a task that is not there, or a trajectory
-    that goes on after a terminal state of its task.
+    Args:
+        trajectories: at least one, each with at least one move.
+        tasks: the tasks that `Trajectory.task` counts through.
+
+    Raises:
+        InputError: for no or an empty trajectory, lengths that do not fit, a task or state that does not exist, or a
+            trajectory that continues after a terminal state of its task.
+
+    Example:
+        >>> from sidestep.tabular.grid import Grid
+        >>> from sidestep.tabular.tasks import reach
+        >>> walk = Trajectory(np.array([0, 1, 2]), np.array([3, 3]), task=0)
+        >>> len(gather([walk], [reach(Grid.unknown(rows=1, columns=3), 2)]))
+        2
     """
     stacked = stack_tasks(tasks)
     terminal = np.asarray(stacked.terminal)
-    for index, (states, actions, task) in enumerate(trajectories, start=1):
-        if len(actions) == 0 or len(states) != len(actions) + 1:
-            raise InputError(
-                f"expected moves and one state more, found {len(actions)} and {len(states)}",
-                source="trajectory",
-                row=index,
-            )
-        if not 0 <= task < len(tasks):
-            raise InputError(f"expected a task in 0…{len(tasks) - 1}, found {task}", source="trajectory", row=index)
-        if min(states) < 0 or max(states) >= terminal.shape[1] or min(actions) < 0:
-            raise InputError(f"expected states in 0…{terminal.shape[1] - 1}", source="trajectory", row=index)
-        if terminal[task, states[:-1]].any():
-            raise InputError("goes on after a terminal state of its task", source="trajectory", row=index)
-    lengths = [len(trajectory.actions) for trajectory in trajectories]
-    if not lengths:
+    if not trajectories:
         raise InputError("expected at least one trajectory", field="trajectories")
+    for row, (states, actions, task) in enumerate(trajectories, start=1):
+        if len(actions) == 0 or len(states) != len(actions) + 1:
+            message = f"expected moves and one state more, found {len(actions)} and {len(states)}"
+        elif not 0 <= task < len(tasks):
+            message = f"expected a task in 0…{len(tasks) - 1}, found {task}"
+        elif min(states) < 0 or max(states) >= terminal.shape[1] or min(actions) < 0:
+            message = f"expected states in 0…{terminal.shape[1] - 1}"
+        elif terminal[task, states[:-1]].any():
+            message = "goes on after a terminal state of its task"
+        else:
+            continue
+        raise InputError(message, source="trajectory", row=row)
+    lengths = [len(trajectory.actions) for trajectory in trajectories]
     return Demonstrations(
         states=flat_moves([trajectory.states[:-1] for trajectory in trajectories]),
         actions=flat_moves([trajectory.actions for trajectory in trajectories]),
         next_states=flat_moves([trajectory.states[1:] for trajectory in trajectories]),
-        task=jnp.asarray(np.repeat([trajectory.task for trajectory in trajectories], lengths), dtype=jnp.int32),
-        trajectory=jnp.asarray(np.repeat(np.arange(len(lengths)), lengths), dtype=jnp.int32),
+        task=flat_moves([np.repeat([trajectory.task for trajectory in trajectories], lengths)]),
+        trajectory=flat_moves([np.repeat(np.arange(len(lengths)), lengths)]),
         tasks=stacked,
     )
 
 
 def flat_moves(parts: Sequence[np.ndarray]) -> Int[Array, " moves"]:
-    """Pieces of a flat array, one after another."""
-    return jnp.asarray(np.concatenate(parts), dtype=jnp.int32)
+    """Return pieces of a flat array of integers, one after another."""
+    return to_jax(np.concatenate(parts), np.int32)
 
 
 def pad_to_power_of_two(demonstrations: Demonstrations[Task]) -> Demonstrations[Task]:
-    """The same moves and tasks, and after them the first ones again, up to powers of two; see `next_power_of_two`.
+    """Return the same moves and tasks, padded to powers of two so that one compiled function serves many lengths.
 
-    Of results for every move, those from `len(demonstrations)` on are to be thrown away. Trajectories mean nothing any
-    more, and weights count twice.
+    The padding of the moves repeats the first one with weight 0. That of the tasks ends in every state, so that there
+    is nothing to solve. Of results for every move, those from `len(demonstrations)` on are to be dropped.
+    Demonstrations that JAX is tracing are returned unchanged: their length is already fixed.
     """
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(demonstrations)):
+        return demonstrations
     moves, tasks = len(demonstrations), len(demonstrations.tasks.terminal)
+    padded_moves = next_power_of_two(max(moves, _MIN_MOVES))
+    padded_tasks = next_power_of_two(max(tasks, _MIN_TASKS))
 
-    def filled(leaf: Array, count: int) -> Array:
+    def repeated(leaf: Array, count: int) -> Array:
         array = np.asarray(leaf)
-        return jnp.asarray(np.concatenate([array, np.repeat(array[:1], next_power_of_two(count) - count, axis=0)]))
+        return to_jax(np.concatenate([array, np.repeat(array[:1], count - len(array), axis=0)]))
 
-    own = eqx.tree_at(lambda demos: demos.tasks, demonstrations, None)
-    filled_tasks = jax.tree.map(lambda leaf: filled(leaf, tasks), demonstrations.tasks)
-    filled_moves = jax.tree.map(lambda leaf: filled(leaf, moves), own)
-    return eqx.tree_at(lambda demos: demos.tasks, filled_moves, filled_tasks, is_leaf=lambda leaf: leaf is None)
+    def extended(leaf: Array, count: int, fill: bool | float) -> Array:
+        return to_jax(np.concatenate([leaf, np.full((count - len(leaf), *leaf.shape[1:]), fill, leaf.dtype)]))
+
+    own, pursued = demonstrations, demonstrations.tasks
+    return Demonstrations(
+        *(
+            repeated(leaf, padded_moves)
+            for leaf in (own.states, own.actions, own.next_states, own.task, own.trajectory)
+        ),
+        tasks=Task(
+            repeated(pursued.reward, padded_tasks),
+            repeated(pursued.terminal_reward, padded_tasks),
+            extended(pursued.terminal, padded_tasks, fill=True),
+            repeated(pursued.discount, padded_tasks),
+        ),
+        weights=extended(own.weights, padded_moves, fill=0.0),
+    )
 
 
 def next_power_of_two(count: int) -> int:
-    """The next power of two, so that one compiled function serves data of many sizes."""
-    return 2 ** int(np.ceil(np.log2(count)))
+    """Return the smallest power of two that is at least `count`."""
+    return 1 << (count - 1).bit_length()

@@ -6,20 +6,22 @@ state (their probabilities add up) and an outcome may be the state itself.
 """
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.sparse import csr_array
 
 from sidestep.errors import InputError
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.grid import Cell, Grid
 
 
 class Graph(eqx.Module):
-    """The possible outcomes of each action, and how long each action is.
+    """The possible outcomes of each action, and its length; made by `graph` or `grid_graph`.
 
-    - `successors`: the state that outcome k of action a in state s leads to, in 0…states−1.
-    - `lengths`: how long each action is, for tasks that charge by length; a cell side on grids. Either axis may be 1.
+    Attributes:
+        successors: the state, in 0…states − 1, that outcome k of action a in state s leads to.
+        lengths: the length of each action, for tasks that charge by length; in cell sides on grids. An axis of length 1
+            holds for all states or all actions.
     """
 
     successors: Int[Array, "states actions outcomes"]
@@ -27,48 +29,64 @@ class Graph(eqx.Module):
 
     @property
     def states(self) -> int:
-        """The number of states."""
+        """Return the number of states."""
         return self.successors.shape[0]
 
     @property
     def actions(self) -> int:
-        """The number of actions."""
+        """Return the number of actions."""
         return self.successors.shape[1]
 
 
 def graph(successors: Int[np.ndarray, "states actions outcomes"]) -> Graph:
-    """A graph from a table of successors, every action of length 1.
+    """Return a graph from a table of successors, in which every action has length 1.
 
-    Raises `InputError` for an empty table or a successor that is not a state.
+    Args:
+        successors: the state that each outcome of each action leads to.
 
-    >>> graph(np.array([[[0], [1]], [[1], [0]]])).states
-    2
+    Raises:
+        InputError: for an empty table or a successor that is not a state.
+
+    Example:
+        >>> graph(np.array([[[0], [1]], [[1], [0]]])).states
+        2
     """
     if successors.size == 0:
         raise InputError("expected at least one state, action and outcome", field="successors")
     if successors.min() < 0 or successors.max() >= len(successors):
         raise InputError(f"expected states 0…{len(successors) - 1}", field="successors")
-    return Graph(jnp.asarray(successors, dtype=jnp.int32), jnp.ones((1, 1)))
+    return Graph(to_jax(successors, np.int32), to_jax(np.ones((1, 1))))
 
 
 def grid_graph(grid: Grid) -> Graph:
-    """The graph of a grid: outcome 0 is the cell moved into, outcome 1 staying put; moves off the map stay put.
+    """Return the graph of a grid: outcome 0 of a move is the cell entered, outcome 1 staying.
 
-    A diagonal is √2 long, other moves 1 (in cell sides).
+    Moves off the map stay. A diagonal has length √2, other moves 1 (in cell sides).
+
+    Args:
+        grid: the cells, which are the states, and the moves, which are the actions.
+
+    Example:
+        >>> grid_graph(Grid.unknown(rows=1, columns=2)).successors[0, 3].tolist()  # from the left cell to the right
+        [1, 0]
     """
+    return Graph(to_jax(grid_successors(grid), np.int32), to_jax(grid.lengths[None]))
+
+
+def grid_successors(grid: Grid) -> Int[np.ndarray, "states actions 2"]:
+    """Return the successors of `grid_graph` as a NumPy array."""
     entered = moves_into(grid)[:, :, 0]
     staying = np.broadcast_to(np.arange(grid.size)[:, None], entered.shape)
-    target = np.where(entered == grid.size, staying, entered)
-    return Graph(jnp.asarray(np.stack([target, staying], -1), dtype=jnp.int32), jnp.asarray(grid.lengths[None]))
+    return np.stack([np.where(entered == grid.size, staying, entered), staying], axis=-1)
 
 
 def straight_moves(grid: Grid) -> Int[np.ndarray, "cells 4"]:
-    """The cell that each straight move leads to; off the map one stays."""
-    return np.asarray(grid_graph(grid).successors[:, :4, 0])
+    """Return the cell that each straight move enters; moves off the map stay."""
+    return grid_successors(grid)[:, :4, 0]
 
 
 def moves_into(grid: Grid) -> Int[np.ndarray, "states actions 3"]:
-    """The cells that must be free for each move to succeed: the one moved into, then the two beside a diagonal.
+    """Return the cells that must be free for each move to succeed: the one moved into, then the two beside a diagonal.
 
     A diagonal does not cut corners, so both cells beside it must be free. Where there is no such cell the entry is
     `grid.size`, one past the last state; off the map, the first entry is.
@@ -90,7 +108,7 @@ def moves_into(grid: Grid) -> Int[np.ndarray, "states actions 3"]:
 
 
 def walkable_graph(truth: Grid) -> csr_array:
-    """The legal moves between free cells of a map, as a sparse matrix of lengths in cell sides (1 or √2).
+    """Return the legal moves between free cells of a map, as a sparse matrix of lengths in cell sides (1 or √2).
 
     Entry (s, s′) is the length of the move from state s to s′. Diagonals do not cut corners, and a cell that
     the map does not know counts as not walkable. The matrix is symmetric.
@@ -111,10 +129,10 @@ def free_cells(truth: Grid) -> Bool[np.ndarray, " states"]:
 
 
 def clear_moves(truth: Grid, needed: Int[np.ndarray, "states actions cells"]) -> Bool[np.ndarray, "states actions"]:
-    """Whether a move stays on the map and all cells that it needs are free."""
+    """Return whether each move stays on the map and all cells that it needs are free."""
     return clear_cells(truth)[needed].all(axis=-1) & (needed[..., 0] < truth.size)
 
 
 def clear_cells(truth: Grid) -> Bool[np.ndarray, " cells"]:
-    """Which cells are free, and true one past the last: the entry of `moves_into` for "no such cell"."""
+    """Return which cells are free, and true one past the last: the entry of `moves_into` for "no such cell"."""
     return np.append(free_cells(truth), True)

@@ -1,4 +1,4 @@
-"""Grids: where cells are in the world, which are known already, and which moves a walker has.
+"""Occupancy grids: the position of cells in the world, what is known of them, and the moves between them.
 
 A grid is a rectangle of square cells. Row 0 is the *top* row, as in an image; cell (row, column) is the state
 `row * columns + column`. Positions are in metres in the map's frame: the lower-left corner of the grid lies at
@@ -22,7 +22,12 @@ STEPS = np.array([[-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [-1, 1], [1, -1], 
 
 
 class Cell(IntEnum):
-    """What a map says of a cell."""
+    """The state of a cell on a map.
+
+    Example:
+        >>> int(Cell.UNKNOWN)
+        -1
+    """
 
     UNKNOWN = -1
     FREE = 0
@@ -31,19 +36,22 @@ class Cell(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """The geometry of a map, what is already known of it, and the moves on it.
+    """The geometry of a map, what is known of its cells, and the moves on it.
 
-    - `known`: one `Cell` value a cell, row 0 at the top.
-    - `resolution`: the side of a cell in metres.
-    - `origin`: x, y (metres) and yaw (radians) of the lower-left corner.
-    - `connectivity`: 4 (up, down, left, right) or 8 (and diagonals).
+    Attributes:
+        known: a `Cell` value for each cell, row 0 at the top.
+        resolution: the side of a cell, in metres.
+        origin: x, y (metres) and yaw (radians) of the lower-left corner.
+        connectivity: 4 (up, down, left, right) or 8 (and diagonals).
 
-    Raises `InputError` for an empty grid, values that are not `Cell`s, a resolution that is not positive, an origin
-    that is not finite, or another connectivity.
+    Raises:
+        InputError: for an empty grid, values that are not `Cell`s, a resolution that is not positive, an origin that
+            is not finite, or another connectivity.
 
-    >>> grid = Grid.unknown(rows=2, columns=3)
-    >>> int(grid.states(np.array([[0.5, 0.5]]))[0])  # the lower-left cell: row 1, column 0
-    3
+    Example:
+        >>> grid = Grid.unknown(rows=2, columns=3)
+        >>> int(grid.states(np.array([[0.5, 0.5]]))[0])  # the lower-left cell: row 1, column 0
+        3
     """
 
     known: Int[np.ndarray, "rows columns"]
@@ -60,44 +68,44 @@ class Grid:
             raise InputError(f"expected three finite numbers x, y, yaw, found {self.origin}", field="origin")
         if self.connectivity not in (4, 8):
             raise InputError(f"expected 4 or 8, found {self.connectivity}", field="connectivity")
-        # a byte a cell, whatever they came in: maps may have ten million
+        # one byte for each cell: maps may have ten million
         object.__setattr__(self, "known", self.known.astype(np.int8))
 
     @classmethod
     def unknown(cls, rows: int, columns: int, connectivity: Connectivity = 4) -> "Grid":
-        """A grid of which nothing is known, cells one metre wide, its lower-left corner at (0, 0)."""
+        """Return a grid of which nothing is known, with cells of one metre and its lower-left corner at (0, 0)."""
         return cls(np.full((rows, columns), Cell.UNKNOWN, dtype=np.int8), connectivity=connectivity)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """Return the numbers of rows and columns."""
         return self.known.shape[0], self.known.shape[1]
 
     @property
     def size(self) -> int:
-        """The number of cells, which is the number of states."""
+        """Return the number of cells, which is the number of states."""
         return self.known.size
 
     @property
     def steps(self) -> Int[np.ndarray, "actions 2"]:
-        """Row and column change of each action: up, down, left, right, then (8-connected) the diagonals."""
+        """Return the row and column change of each action: up, down, left, right, then the diagonals if any."""
         return STEPS[: self.connectivity]
 
     @property
     def lengths(self) -> Float[np.ndarray, " actions"]:
-        """How long each action is, in cell sides: 1, and √2 for diagonals."""
+        """Return the length of each action, in cell sides: 1, and √2 for diagonals."""
         return np.linalg.norm(self.steps, axis=1)
 
     def forget(self) -> "Grid":
-        """The same grid with nothing known."""
+        """Return the same grid with nothing known."""
         return replace(self, known=np.full_like(self.known, Cell.UNKNOWN))
 
     def passable(self) -> "Grid":
-        """The same grid with everything free that is not known to be occupied."""
+        """Return the same grid with everything free that is not known to be occupied."""
         return replace(self, known=np.where(self.known == Cell.OCCUPIED, Cell.OCCUPIED, Cell.FREE))
 
     def contains(self, positions: Float[np.ndarray, "points 2"]) -> Bool[np.ndarray, " points"]:
-        """Whether each position (metres) lies on the grid; a position that is not finite does not."""
+        """Return whether each position (metres) lies on the grid; a position that is not finite does not."""
         rows, columns = self.shape
         with np.errstate(invalid="ignore"):
             column, row_up = self.to_cell_units(positions).T
@@ -105,7 +113,7 @@ class Grid:
             return (column >= -slack) & (column <= columns + slack) & (row_up >= -slack) & (row_up <= rows + slack)
 
     def states(self, positions: Float[np.ndarray, "points 2"]) -> Int[np.ndarray, " points"]:
-        """The state whose cell holds each position (metres); raises `InputError` for one outside the grid."""
+        """Return the state of the cell at each position (metres); raise `InputError` for one outside the grid."""
         inside = self.contains(positions)
         if not inside.all():
             index = int(np.argmin(inside))
@@ -113,26 +121,26 @@ class Grid:
         return self.states_of_cell_units(self.to_cell_units(positions))
 
     def state(self, position: tuple[float, float]) -> int:
-        """The state whose cell holds one position (metres); raises `InputError` outside the grid."""
+        """Return the state of the cell at one position (metres); raise `InputError` outside the grid."""
         return int(self.states(np.array([position], dtype=np.float64))[0])
 
     def centres(self, states: Integer[np.ndarray, " points"]) -> Float[np.ndarray, "points 2"]:
-        """The position (metres) of the centre of each state's cell."""
+        """Return the position (metres) of the center of each state's cell."""
         rows, columns = self.shape
         row, column = np.divmod(np.asarray(states), columns)
         return self.to_metres(np.stack([column + 0.5, rows - row - 0.5], axis=-1))
 
     def to_cell_units(self, positions: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 2"]:
-        """Positions in metres as (columns from the left, rows from the *bottom*), not rounded."""
+        """Return positions in metres as (columns from the left, rows from the *bottom*), not rounded."""
         offset = np.asarray(positions, dtype=np.float64) - np.asarray(self.origin[:2])
         return offset @ _rotation(self.origin[2]) / self.resolution
 
     def to_metres(self, cell_units: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 2"]:
-        """The inverse of `to_cell_units`."""
+        """Return positions in metres; the inverse of `to_cell_units`."""
         return cell_units * self.resolution @ _rotation(self.origin[2]).T + np.asarray(self.origin[:2])
 
     def states_of_cell_units(self, cell_units: Float[np.ndarray, "points 2"]) -> Int[np.ndarray, " points"]:
-        """The state of each point given in cell units; points on the outer edge belong to the cell inside it."""
+        """Return the state of each point in cell units; points on the outer edge belong to the cell inside it."""
         rows, columns = self.shape
         # a position on a border, but for rounding, belongs to the cell above or to the right of it
         column, row_up = np.floor(cell_units + 1e-9).astype(np.int64).T
@@ -141,5 +149,5 @@ class Grid:
 
 
 def _rotation(yaw: float) -> Float[np.ndarray, "2 2"]:
-    """The matrix R that turns a vector by `yaw`; row vectors turn forward by `v @ R.T` and back by `v @ R`."""
+    """Return the matrix R that turns a vector by `yaw`; row vectors turn forward by `v @ R.T` and back by `v @ R`."""
     return np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])

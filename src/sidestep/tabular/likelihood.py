@@ -2,8 +2,8 @@
 
     log L(θ) = Σ_i Σ_t [ log π_θ(a_t | s_t)  +  ln T_θ(s_t, a_t, s_{t+1}) ],      log π_θ = βQ_θ − log Σ_a exp βQ_θ
 
-People plan with the dynamics that they know, so both terms depend on θ: the *actions* through the values, the observed
-*transitions* directly. Each can be left out. Where demonstrations have weights, each move counts by its weight.
+Agents plan with the dynamics that they know, so both terms depend on θ: the *actions* through the values, the observed
+*transitions* directly. Each can be left out. Each move counts by its weight.
 """
 
 from typing import Literal, NamedTuple
@@ -11,10 +11,12 @@ from typing import Literal, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior
-from sidestep.tabular.demonstrations import Demonstrations, next_power_of_two
+from sidestep.tabular.demonstrations import Demonstrations, next_power_of_two, pad_to_power_of_two
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import Solution, SolveOptions, solve
 from sidestep.tabular.solvers.base import WarmStart, action_values
@@ -22,17 +24,28 @@ from sidestep.tabular.tasks import Task
 
 Term = Literal["actions", "transitions"]
 ALL_TERMS: tuple[Term, ...] = ("actions", "transitions")
+_MIN_LENGTH = 16
+"""Lists of choices and of arrivals are padded to this length at least."""
 
 
 class LogLikelihood(NamedTuple):
-    """The two terms of the log-likelihood, in nats; one that was left out is 0."""
+    """The two terms of the log-likelihood, in nats.
+
+    Attributes:
+        actions: Σ log π_θ(a | s) over all moves; 0 if left out.
+        transitions: Σ ln T_θ(s, a, s′) over all moves; 0 if left out.
+
+    Example:
+        >>> float(LogLikelihood(jnp.asarray(-2.0), jnp.asarray(-1.0)).total)
+        -3.0
+    """
 
     actions: Float[Array, ""]
     transitions: Float[Array, ""]
 
     @property
     def total(self) -> Float[Array, ""]:
-        """log L(θ)."""
+        """Return log L(θ)."""
         return self.actions + self.transitions
 
 
@@ -44,29 +57,53 @@ def log_likelihood(
     terms: tuple[Term, ...] = ALL_TERMS,
     options: SolveOptions | None = None,
 ) -> LogLikelihood:
-    """log L(θ) of `demonstrations` by people who behave as `behavior` says and know `model`.
+    """Return log L(θ) of demonstrations by agents who act as `behavior` describes and know `model`.
 
-    `terms` are those that count; the other arguments are those of `solve`. The actions' term is NaN if a task's values
-    did not converge.
+    Args:
+        model: the transition model; differentiable in its parameters θ.
+        demonstrations: moves and tasks. One compiled function serves demonstrations of many lengths.
+        behavior: the policy that values of actions lead to.
+        terms: the terms that count, "actions", "transitions" or both.
+        options: how values are computed; by default `SolveOptions()`.
+
+    Returns:
+        Both terms. The actions' term is NaN if the values of a task did not converge.
+
+    Example:
+        >>> from sidestep.tabular.backups import BoltzmannAverage
+        >>> from sidestep.tabular.demonstrations import Trajectory, gather
+        >>> from sidestep.tabular.grid import Grid
+        >>> from sidestep.tabular.models import true_model
+        >>> from sidestep.tabular.tasks import reach
+        >>> grid = Grid(np.zeros((1, 3), dtype=int))
+        >>> walk = Trajectory(np.array([0, 1, 2]), np.array([3, 3]), task=0)
+        >>> shown = gather([walk], [reach(grid, 2)])
+        >>> float(log_likelihood(true_model(grid), shown, Behavior(BoltzmannAverage())).transitions)
+        0.0
+
+    References:
+        Equations 1 and 6 of the behavior-aware modeling paper.
     """
-    actions = transitions = jnp.zeros((), model.probabilities().dtype)
-    if "actions" in terms:
-        actions = action_log_likelihood(model, demonstrations, behavior, options=options)
-    if "transitions" in terms:
-        transitions = transition_log_likelihood(model, demonstrations)
-    return LogLikelihood(actions, transitions)
+    return _log_likelihood(model, pad_to_power_of_two(demonstrations), behavior, terms, options or SolveOptions())
 
 
-def action_log_likelihood(
+@eqx.filter_jit
+def _log_likelihood(
     model: TransitionModel,
     demonstrations: Demonstrations,
     behavior: Behavior,
-    *,
-    options: SolveOptions | None = None,
-) -> Float[Array, ""]:
-    """Σ log π_θ(a | s) over all moves; NaN if a task's values did not converge."""
-    each = log_policies(model, demonstrations, behavior, options=options)
-    return _weighted(demonstrations, each)
+    terms: tuple[Term, ...],
+    options: SolveOptions,
+) -> LogLikelihood:
+    actions = transitions = jnp.zeros((), model.probabilities().dtype)
+    weights = demonstrations.weights
+    if "actions" in terms:
+        each = _log_policies(model, demonstrations, behavior, options)
+        actions = jnp.sum(each * weights.astype(each.dtype))
+    if "transitions" in terms:
+        states, next_states = demonstrations.states, demonstrations.next_states
+        transitions = arrival_log_likelihood(model, Arrivals(states, demonstrations.actions, next_states, weights))
+    return LogLikelihood(actions, transitions)
 
 
 def log_policies(
@@ -76,16 +113,21 @@ def log_policies(
     *,
     options: SolveOptions | None = None,
 ) -> Float[Array, " moves"]:
-    """log π_θ(a | s) of every move; NaN if a task's values did not converge."""
-    return _log_policies(model, demonstrations, behavior, options)
+    """Return log π_θ(a | s) of every move; NaN if the values of a task did not converge.
+
+    Args:
+        model: as for `log_likelihood`, like the other arguments.
+        demonstrations: moves and tasks.
+        behavior: the policy that values of actions lead to.
+        options: how values are computed; by default `SolveOptions()`.
+    """
+    padded = pad_to_power_of_two(demonstrations)
+    return _first(_log_policies(model, padded, behavior, options or SolveOptions()), len(demonstrations))
 
 
 @eqx.filter_jit
 def _log_policies(
-    model: TransitionModel,
-    demonstrations: Demonstrations,
-    behavior: Behavior,
-    options: SolveOptions | None,
+    model: TransitionModel, demonstrations: Demonstrations, behavior: Behavior, options: SolveOptions
 ) -> Float[Array, " moves"]:
     tasks, task, states = demonstrations.tasks, demonstrations.task, demonstrations.states
     solution = solve(model, tasks, behavior, options=options)
@@ -95,10 +137,12 @@ def _log_policies(
 
 
 class Choices(NamedTuple):
-    """What was done in pursuit of a task: action `actions` in state `states`, and how much it counts in all.
+    """The distinct actions taken in pursuit of a task, with a leading `tasks` axis for several tasks.
 
-    `counts` says how often it was done, where moves have no weights. With a leading `tasks` axis, for several tasks;
-    shorter lists are filled up with counts of 0.
+    Attributes:
+        states: the state in which each action was taken.
+        actions: the action.
+        counts: the sum of the weights of these moves; 0 for padding.
     """
 
     states: Int[Array, "*tasks choices"]
@@ -116,43 +160,53 @@ def choice_log_likelihood(
     options: SolveOptions | None = None,
     region: Bool[Array, " states"] | None = None,
 ) -> tuple[Float[Array, ""], Solution]:
-    """Σ log π_θ(a | s) over the choices made in pursuit of one task, and the task's solution (from `start`).
+    """Return Σ log π_θ(a | s) over the choices made in pursuit of one task, and the task's solution.
 
-    The arguments are those of `solve`. NaN if its values did not converge. Over the tasks of
-    `choices_of(demonstrations)` it adds up to `action_log_likelihood`.
+    Over the tasks of `choices_of(demonstrations)` it adds up to the actions' term of `log_likelihood`.
+
+    Args:
+        model: as for `solve`, like the arguments that are not explained here.
+        task: one task.
+        choices: of that task.
+        behavior: the policy that values of actions lead to.
+        start: the solve's start.
+        options: how values are computed.
+        region: the states that have to be solved.
+
+    Returns:
+        The log-likelihood, NaN if the values did not converge, and the solution.
     """
-    solution = solve(
-        model,
-        task,
-        behavior,
-        options=options,
-        start=start,
-        visited=choices.states,
-        region=region,
-    )
+    solution = solve(model, task, behavior, options=options, start=start, visited=choices.states, region=region)
     q = solution.action_values
     total = jnp.sum(choices.counts.astype(q.dtype) * _log_policy(behavior, q, choices.actions))
     return total * _nan_unless(solution.converged), solution
 
 
 def choices_of(demonstrations: Demonstrations) -> Choices:
-    """The moves of each task as choices, equal ones counted."""
+    """Return the distinct choices of each task, with their counts."""
     task, states, actions = (np.asarray(getattr(demonstrations, name)) for name in ("task", "states", "actions"))
-    different, which = np.unique(np.stack([task, states, actions]), axis=1, return_inverse=True)
+    distinct, which = np.unique(np.stack([task, states, actions]), axis=1, return_inverse=True)
     counts = np.bincount(which.ravel(), np.asarray(demonstrations.weights))
-    sizes = np.bincount(different[0], minlength=len(demonstrations.tasks.terminal))
-    filled = np.arange(next_power_of_two(max(int(sizes.max()), 16))) < sizes[:, None]
+    sizes = np.bincount(distinct[0], minlength=len(demonstrations.tasks.terminal))
+    filled = np.arange(next_power_of_two(max(int(sizes.max()), _MIN_LENGTH))) < sizes[:, None]
 
     def padded(part: np.ndarray) -> Array:
         whole = np.zeros(filled.shape, part.dtype if part.dtype.kind == "f" else np.int32)
         whole[filled] = part
-        return jnp.asarray(whole)
+        return to_jax(whole)
 
-    return Choices(padded(different[1]), padded(different[2]), padded(counts))
+    return Choices(padded(distinct[1]), padded(distinct[2]), padded(counts))
 
 
 class Arrivals(NamedTuple):
-    """Where actions led: `actions` in `states` to `next_states`, and how much each counts in all."""
+    """The distinct transitions (s, a, s′) of demonstrations.
+
+    Attributes:
+        states: s.
+        actions: a.
+        next_states: s′.
+        counts: the sum of the weights of these moves; 0 for padding.
+    """
 
     states: Int[Array, " arrivals"]
     actions: Int[Array, " arrivals"]
@@ -161,20 +215,19 @@ class Arrivals(NamedTuple):
 
 
 def arrivals_of(demonstrations: Demonstrations) -> Arrivals:
-    """The moves of all tasks as arrivals, equal ones counted; filled up by the first one, with counts of 0."""
+    """Return the distinct transitions of all tasks, with their counts; padded by the first one with counts of 0."""
     moves = np.stack([np.asarray(getattr(demonstrations, name)) for name in ("states", "actions", "next_states")])
-    different, which = np.unique(moves, axis=1, return_inverse=True)
+    distinct, which = np.unique(moves, axis=1, return_inverse=True)
     counts = np.bincount(which.ravel(), np.asarray(demonstrations.weights))
-    missing = next_power_of_two(max(len(counts), 16)) - len(counts)
-    filled = np.concatenate([different, np.repeat(different[:, :1], missing, axis=1)], axis=1)
-    states, actions, next_states = (jnp.asarray(part) for part in filled)
-    return Arrivals(states, actions, next_states, jnp.asarray(np.pad(counts, (0, missing))))
+    missing = next_power_of_two(max(len(counts), _MIN_LENGTH)) - len(counts)
+    padded = np.concatenate([distinct, np.repeat(distinct[:, :1], missing, axis=1)], axis=1)
+    states, actions, next_states = (to_jax(part) for part in padded)
+    return Arrivals(states, actions, next_states, to_jax(np.pad(counts, (0, missing))))
 
 
 def arrival_log_likelihood(model: TransitionModel, arrivals: Arrivals) -> Float[Array, ""]:
-    """Σ ln T_θ(s, a, s′) over arrivals; those of demonstrations add up to `transition_log_likelihood`."""
-    # what counts for nothing must not be impossible
-    each = jnp.log(jnp.where(arrivals.counts > 0, transition_probabilities(model, arrivals), 1))
+    """Return Σ ln T_θ(s, a, s′) over arrivals, each by its count; those that count 0 may be impossible."""
+    each = jnp.log(jnp.where(arrivals.counts > 0, _transition_probabilities(model, arrivals), 1))
     return jnp.sum(each * arrivals.counts.astype(each.dtype))
 
 
@@ -185,11 +238,27 @@ def visited_action_values(
     task: Int[Array, " visits"],
     states: Int[Array, " visits"],
 ) -> Float[Array, "visits actions"]:
-    """Q(s, a) of visited states, from the values of all tasks."""
+    """Return Q(s, a) of visited states, from the values of all tasks."""
     after = values[task[:, None, None], model.graph.successors[states]]
     reward = tasks.reward[task, states if tasks.reward.shape[1] > 1 else 0].astype(values.dtype)
     discount = tasks.discount[task, None].astype(values.dtype)
     return action_values(values[task, states], after, model.probabilities()[states], reward, discount)
+
+
+def transition_probabilities(model: TransitionModel, moves: Demonstrations | Arrivals) -> Float[Array, " moves"]:
+    """Return T_θ(s, a, s′) of every move."""
+    if isinstance(moves, Arrivals):
+        return _transition_probabilities(model, moves)
+    padded = pad_to_power_of_two(moves)
+    arrivals = Arrivals(padded.states, padded.actions, padded.next_states, padded.weights)
+    return _first(_transition_probabilities(model, arrivals), len(moves))
+
+
+@eqx.filter_jit
+def _transition_probabilities(model: TransitionModel, moves: Arrivals) -> Float[Array, " moves"]:
+    states, actions = moves.states, moves.actions
+    leads_there = model.graph.successors[states, actions] == moves.next_states[:, None]
+    return jnp.sum(jnp.where(leads_there, model.probabilities()[states, actions], 0), axis=-1)
 
 
 def _log_policy(
@@ -198,22 +267,10 @@ def _log_policy(
     return jnp.take_along_axis(behavior.log_policy(q), actions[:, None], axis=-1)[:, 0]
 
 
-def _weighted(demonstrations: Demonstrations, parts: Float[Array, " moves"]) -> Float[Array, ""]:
-    """The sum over moves, each by its weight."""
-    return jnp.sum(parts * demonstrations.weights.astype(parts.dtype))
-
-
 def _nan_unless(condition: Bool[Array, ""]) -> Float[Array, ""]:
     return jnp.where(condition, 1.0, jnp.nan)
 
 
-def transition_log_likelihood(model: TransitionModel, demonstrations: Demonstrations) -> Float[Array, ""]:
-    """Σ ln T_θ(s, a, s′) over all moves."""
-    return _weighted(demonstrations, jnp.log(transition_probabilities(model, demonstrations)))
-
-
-def transition_probabilities(model: TransitionModel, moves: Demonstrations | Arrivals) -> Float[Array, " moves"]:
-    """T_θ(s, a, s′) of every move."""
-    states, actions = moves.states, moves.actions
-    leads_there = model.graph.successors[states, actions] == moves.next_states[:, None]
-    return jnp.sum(jnp.where(leads_there, model.probabilities()[states, actions], 0), axis=-1)
+def _first(each: Float[Array, " padded"], count: int) -> Float[Array, " moves"]:
+    """Return the first entries, without compiling a slice for every count."""
+    return each[:count] if isinstance(each, Tracer) else to_jax(np.asarray(each)[:count])

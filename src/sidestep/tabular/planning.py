@@ -1,7 +1,7 @@
-"""Planning under a model: policies, the paths they mean to take, and what happens when they are followed.
+"""Planning under a model: policies, the paths that they intend, and roll-outs of policies in other models.
 
-A plan knows only the model it was made with. Followed in another one, the true world say, it may meet a wall that the
-model did not know: the move fails, and an optimal plan tries it again for ever. `roll_out` shows that.
+A plan knows only the model it was made with. Followed in another one, such as the true world, it may meet a wall that
+the model did not know: the move fails, and an optimal plan repeats it forever. `roll_out` shows that.
 """
 
 from typing import NamedTuple
@@ -21,13 +21,14 @@ from sidestep.tabular.tasks import Task
 
 
 class Plan(eqx.Module):
-    """What to do in every state to pursue one task under a model.
+    """A policy for one task under a model; made by `plan`.
 
-    - `policy`: the probability of each action; an optimal policy is uniform over ties.
-    - `intended`: where the best action (the first of ties) is meant to lead: its most probable outcome elsewhere, or
-      the state itself if it leads nowhere else.
-    - `terminal`: where the task ends.
-    - `solution`: values and convergence.
+    Attributes:
+        policy: the probability of each action in every state; an optimal policy is uniform over ties.
+        intended: the state that the most probable action (the first of ties) is meant to reach: its most probable
+            outcome other than the state itself, or the state itself if there is none.
+        terminal: where the task ends.
+        solution: values and convergence.
     """
 
     policy: Float[Array, "states actions"]
@@ -36,11 +37,15 @@ class Plan(eqx.Module):
     solution: Solution
 
     def path_from(self, start: int) -> Int[np.ndarray, " steps"]:
-        """The states that the plan means to pass from `start` on.
+        """Return the states that the plan intends to visit from `start` on, which is the first.
 
-        The path ends at a terminal state; or, where the plan never arrives, before the first state that would repeat.
-        Raises `InputError` for a start that is not a state or, at discount 1, from which no terminal state can be
-        reached.
+        The path ends at a terminal state; if the plan never arrives, before the first state that would repeat.
+
+        Args:
+            start: a state.
+
+        Raises:
+            InputError: for a start that is not a state or, at discount 1, from which no terminal state can be reached.
         """
         if not isinstance(start, (int, np.integer)) or not 0 <= start < len(self.terminal):
             raise InputError(f"expected a state in 0…{len(self.terminal) - 1}, found {start}", field="start")
@@ -49,48 +54,55 @@ class Plan(eqx.Module):
         return self.follow(np.array([start]))[0]
 
     def follow(self, starts: Int[np.ndarray, " starts"]) -> list[Int[np.ndarray, " _"]]:
-        """The states that the plan means to pass from each start on: `path_from`, but also where there is no way."""
+        """Return `path_from` of each start, without its checks."""
         return followed(np.asarray(self.intended), np.asarray(self.terminal), starts)
 
 
 def followed(
     intended: Int[np.ndarray, " states"], terminal: Bool[np.ndarray, " states"], starts: Int[np.ndarray, " starts"]
 ) -> list[Int[np.ndarray, " _"]]:
-    """The states from each start on, `intended` after each; they end at a terminal one, or before one would repeat."""
-    return [_followed(intended, terminal, start) for start in starts.tolist()]
+    """Return the states from each start on, `intended` after each, up to a terminal one or before one would repeat."""
 
+    def path(start: int) -> Int[np.ndarray, " steps"]:
+        states, seen = [start], {start}
+        while not terminal[states[-1]] and (state := int(intended[states[-1]])) not in seen:
+            states.append(state)
+            seen.add(state)
+        return np.asarray(states)
 
-def _followed(
-    intended: Int[np.ndarray, " states"], terminal: Bool[np.ndarray, " states"], start: int
-) -> Int[np.ndarray, " steps"]:
-    path, seen = [start], {start}
-    while not terminal[path[-1]] and (state := int(intended[path[-1]])) not in seen:
-        path.append(state)
-        seen.add(state)
-    return np.asarray(path)
+    return [path(start) for start in starts.tolist()]
 
 
 def plan(
     model: TransitionModel, task: Task, behavior: Behavior | None = None, *, options: SolveOptions | None = None
 ) -> Plan:
-    """The optimal plan for a task under a model; with `behavior`, how such people would act (∝ exp βQ).
+    """Return the optimal plan for a task under a model, or with `behavior` the plan of an agent who behaves like that.
 
-    Raises `ImproperTask` for a task without values and `NotConverged` if they are not found.
+    Args:
+        model: the transition model.
+        task: one task.
+        behavior: the agent's, π ∝ exp βQ; None for the optimal policy.
+        options: how values are computed; by default `SolveOptions()`.
 
-    >>> from sidestep.tabular.grid import Grid
-    >>> from sidestep.tabular.models import ObstacleGrid
-    >>> from sidestep.tabular.tasks import reach
-    >>> grid = Grid.unknown(rows=1, columns=4)
-    >>> plan(ObstacleGrid(grid), reach(grid, 3)).path_from(0).tolist()
-    [0, 1, 2, 3]
+    Raises:
+        ImproperTask: for a task that has no values.
+        NotConverged: if the values do not converge.
+
+    Example:
+        >>> from sidestep.tabular.grid import Grid
+        >>> from sidestep.tabular.models import ObstacleGrid
+        >>> from sidestep.tabular.tasks import reach
+        >>> grid = Grid.unknown(rows=1, columns=4)
+        >>> plan(ObstacleGrid(grid), reach(grid, 3)).path_from(0).tolist()
+        [0, 1, 2, 3]
     """
-    people = behavior or Behavior(HardMax())
-    options = options or SolveOptions()
-    check_proper(task, people, model.graph.actions, options.horizon)
-    made = _plan(model, task, people, behavior is None, options)
-    if not bool(made.solution.converged):
+    options, agent = options or SolveOptions(), behavior or Behavior(HardMax())
+    check_proper(task, agent, model.graph.actions, options.horizon)
+    made = _plan(model, task, agent, behavior is None, options)
+    solution = made.solution
+    if not bool(solution.converged):
         raise NotConverged(
-            f"values still changed by {float(made.solution.residual):.2g} in sweep {int(made.solution.sweeps)}: "
+            f"values still changed by {float(solution.residual):.2g} in sweep {int(solution.sweeps)}: "
             "a smaller β, more sweeps or another backup may help"
         )
     return made
@@ -104,32 +116,33 @@ def _plan(model: TransitionModel, task: Task, behavior: Behavior, optimal: bool,
     states = jnp.arange(model.graph.states)
     best = jnp.argmax(policy, axis=-1)
     outcomes = model.graph.successors[states, best]
-    chances = jnp.where(outcomes == states[:, None], 0, model.probabilities()[states, best])
-    meant = jnp.take_along_axis(outcomes, jnp.argmax(chances, axis=-1)[:, None], axis=-1)[:, 0]
-    intended = jnp.where(chances.max(axis=-1) > 0, meant, states)
+    elsewhere = jnp.where(outcomes == states[:, None], 0, model.probabilities()[states, best])
+    most_probable = jnp.take_along_axis(outcomes, jnp.argmax(elsewhere, axis=-1)[:, None], axis=-1)[:, 0]
+    intended = jnp.where(elsewhere.max(axis=-1) > 0, most_probable, states)
     return Plan(policy, intended.astype(jnp.int32), task.terminal, solution)
 
 
 class RollOuts(NamedTuple):
-    """Walks of several walkers in a world.
+    """Trajectories of several agents that follow a policy; made by `roll_out`.
 
-    - `states`: where each was before every action, and at the end.
-    - `actions`: what each did; −1 after it had arrived.
-    - `arrived`: whether it reached a terminal state in time.
+    Attributes:
+        states: the state before every move, and at the end.
+        actions: the action of every move; −1 after the agent has arrived.
+        arrived: whether the agent reached a terminal state.
     """
 
-    states: Int[Array, "walkers moves+1"]
-    actions: Int[Array, "walkers moves"]
-    arrived: Bool[Array, " walkers"]
+    states: Int[Array, "agents moves+1"]
+    actions: Int[Array, "agents moves"]
+    arrived: Bool[Array, " agents"]
 
     @property
-    def moves(self) -> Int[Array, " walkers"]:
-        """How many actions each walker took."""
+    def moves(self) -> Int[Array, " agents"]:
+        """Return the number of moves of each agent."""
         return jnp.sum(self.actions >= 0, axis=-1)
 
     @property
-    def failed(self) -> Int[Array, " walkers"]:
-        """How many of its actions left a walker where it was."""
+    def failed(self) -> Int[Array, " agents"]:
+        """Return the number of moves of each agent that left it in the same state."""
         return jnp.sum((self.actions >= 0) & (self.states[:, 1:] == self.states[:, :-1]), axis=-1)
 
 
@@ -139,28 +152,33 @@ def roll_out(
     world: TransitionModel,
     policy: Float[Array, "states actions"],
     terminal: Bool[Array, " states"],
-    starts: Int[Array, " walkers"],
-    moves: int,
+    starts: Int[Array, " agents"],
+    max_moves: int,
 ) -> RollOuts:
-    """Walkers who follow a policy in a world, each for at most `moves` actions or until a terminal state.
+    """Return trajectories of agents that follow a policy in a world.
 
-    The world may be another model than the policy was made for.
+    Args:
+        key: of the random choices; the trajectory of agent i does not depend on how many agents come after it.
+        world: the transition model that moves follow; the policy may have been made for another one.
+        policy: the probability of each action in every state.
+        terminal: where agents stop.
+        starts: the state that each agent starts in.
+        max_moves: the number of moves after which an agent stops anyway.
     """
-    log_policy, log_chances = jnp.log(policy), jnp.log(world.probabilities())
+    log_policy, log_probabilities = jnp.log(policy), jnp.log(world.probabilities())
 
-    def walk(key: PRNGKeyArray, start: Int[Array, ""]) -> tuple[Array, Array]:
+    def of_agent(key: PRNGKeyArray, start: Int[Array, ""]) -> tuple[Array, Array]:
         def step(state: Int[Array, ""], key: PRNGKeyArray) -> tuple[Array, tuple[Array, Array]]:
-            choosing, leading = jax.random.split(key)
-            action = jax.random.categorical(choosing, log_policy[state])
-            outcome = jax.random.categorical(leading, log_chances[state, action])
-            after = world.graph.successors[state, action, outcome]
+            action_key, outcome_key = jax.random.split(key)
+            action = jax.random.categorical(action_key, log_policy[state])
+            outcome = jax.random.categorical(outcome_key, log_probabilities[state, action])
             done = terminal[state]
-            after = jnp.where(done, state, after)
-            return after, (after, jnp.where(done, -1, action))
+            next_state = jnp.where(done, state, world.graph.successors[state, action, outcome])
+            return next_state, (next_state, jnp.where(done, -1, action))
 
-        _, (states, actions) = jax.lax.scan(step, start, jax.random.split(key, moves))
+        _, (states, actions) = jax.lax.scan(step, start, jax.random.split(key, max_moves))
         return jnp.concatenate([start[None], states]), actions
 
     starts = starts.astype(world.graph.successors.dtype)
-    states, actions = jax.vmap(walk)(jax.random.split(key, len(starts)), starts)
+    states, actions = jax.vmap(of_agent)(jax.random.split(key, len(starts)), starts)
     return RollOuts(states, actions, terminal[states[:, -1]])

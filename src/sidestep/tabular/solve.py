@@ -1,12 +1,15 @@
-"""Values of a task under a model, differentiable with respect to everything that they depend on.
+"""Values of a task under a model, differentiable by the implicit function theorem (adjoint method).
 
-The values solve V = F(V, φ), F one backup and φ all of the probabilities, rewards, discount and β. By the implicit
-function theorem a scalar with gradient g with respect to V has gradient λᵀ ∂F/∂φ with respect to φ, where
-λ = g + (∂F/∂V)ᵀ λ (the adjoint equation, solved in `sweeps`). One adjoint solve serves any number of parameters, so a
-gradient costs about what the values cost. `gradient="fixed_policy"` puts the average under the policy held fixed in the
-place of B in ∂F (eqs. 7, 9 and 10); with the Boltzmann average that is not the gradient of any function.
+The values solve the Bellman equation V = F(V, φ), where F is one backup and φ are the probabilities, rewards, discount
+and β. A scalar with gradient g with respect to V has gradient λᵀ ∂F/∂φ with respect to φ, where λ solves the adjoint
+equation λ = g + (∂F/∂V)ᵀ λ. One adjoint solve serves any number of parameters, so a gradient costs about as much as the
+values. This differs from the textbook method in two points:
 
-An adjoint that does not converge gives a gradient of NaN, never a wrong one.
+1. With `gradient="fixed_policy"`, ∂F is that of the average under the policy held fixed (eqs. 7, 9 and 10). With the
+   Boltzmann average that is not the gradient of any function.
+2. An adjoint that does not converge gives a gradient of NaN, never a wrong one.
+
+`sidestep.tabular.solvers.base` has the equations that solvers solve.
 """
 
 from functools import partial
@@ -72,17 +75,25 @@ class SolveOptions(eqx.Module):
             raise InputError(f"expected at least one action, found {self.horizon}", field="horizon")
 
     def solver_for(self, backup: Backup, states: int) -> Solver:
-        """Return `solver`, or without one the default for a problem of so many states."""
+        """Return `solver`, or without one the default for a problem of that many states.
+
+        Args:
+            backup: of the behavior.
+            states: their number.
+        """
         return self.solver or default_solver(backup, states)
 
 
 class Solution(eqx.Module):
-    """The values of a task under a model, and how the solve went (with a leading `tasks` axis for several tasks).
+    """The values of a task under a model, with a leading `tasks` axis for several tasks; made by `solve`.
 
-    - `values`: V(s); at discount 1, states that cannot reach a terminal state are near `process.neg_inf` (for −∞).
-    - `action_values`: Q(s, a); of all states, or of those that were asked for.
-    - `sweeps`, `residual`, `converged`: see `process.SolveResult`; a finite horizon takes one exact sweep an action.
-    - `start`: what a solve of the same task under a model nearby may start from.
+    Attributes:
+        values: V(s); at discount 1, near `solvers.base.neg_inf` (for −∞) where no terminal state can be reached.
+        action_values: Q(s, a) of all states, or of the `visited` ones.
+        sweeps: the number of times that each state was solved, on average; the horizon where it is finite.
+        residual: the largest relative change in the last sweep; 0 for a finite horizon.
+        converged: whether the residual is within the solver's tolerance.
+        start: the start of a later solve of the same task under a similar model.
     """
 
     values: Float[Array, "*tasks states"]
@@ -103,27 +114,45 @@ def solve(
     visited: Int[Array, "*tasks visited"] | None = None,
     region: Bool[Array, "*tasks states"] | None = None,
 ) -> Solution:
-    """The values of one task, or of a stack of tasks, for people who behave as `behavior` says under `model`.
+    """Return the values of one task, or of a stack of tasks, for agents who behave as `behavior` describes.
 
-    - `options`: how the values are computed; by default `SolveOptions()`.
-    - `start`: what an earlier solution of the same task or tasks left; without it, the solve starts from nothing. The
-      solution (in the region) does not depend on it beyond the tolerance. Differentiating with respect to
-      `start.adjoint` yields the new adjoint λ, for the next solve to start from.
-    - `visited`: the states whose action values are wanted; by default all. Asking for few saves time and memory when
-      they are differentiated.
-    - `region`: the states that have to be solved, by default all; `start.region` are those that mattered to what the
-      solve that left the start was asked for. `GaussSeidel` brings the others up to date only roughly, which saves
-      time.
-      Where they are seen to matter, derivatives are NaN; but a state that did not matter at all and does now goes
-      unseen (see `process`). So this is for guesses that are looked at again, like those of a line search.
+    Usable under `jit`, `vmap` and `grad`. The numbers have the dtype of the model's probabilities.
 
-    The numbers have the dtype of the model's probabilities. May be used under `jit`, `vmap` and `grad`. Look at
-    `converged` before you use the numbers; `check_proper` tells beforehand whether values exist.
+    Args:
+        model: the transition model.
+        task: one task, or several by `stack_tasks`.
+        behavior: the backup that agents value states with, and their β.
+        options: how the values are computed; by default `SolveOptions()`.
+        start: the `start` of an earlier solution of the same task or tasks; by default a cold start. Within the
+            region, the solution does not depend on it beyond the tolerance. The gradient with respect to
+            `start.adjoint` is the new adjoint λ, which the next solve can start from.
+        visited: the states to compute action values of; by default all. Few of them save time and memory where they
+            are differentiated.
+        region: the states that have to be solved; by default all. `start.region` has those with an adjoint other than
+            0 in the earlier solve. `GaussSeidel` updates the others only roughly, to save time. Derivatives are NaN
+            where these others are seen to matter, but a state that did not matter before and does now is not noticed:
+            use this only where the result is checked later, such as in a line search.
+
+    Returns:
+        The solution. Check `converged` before use; `check_proper` tells in advance whether values exist.
+
+    Example:
+        >>> from sidestep.tabular.backups import HardMax
+        >>> from sidestep.tabular.grid import Grid
+        >>> from sidestep.tabular.models import true_model
+        >>> from sidestep.tabular.tasks import reach
+        >>> grid = Grid(np.zeros((1, 3), dtype=int))
+        >>> solve(true_model(grid), reach(grid, 2, discount=0.5), Behavior(HardMax())).values.tolist()
+        [0.25, 0.5, 1.0]
+
+    References:
+        Equations 2-5 (values) and 7-10 (gradients) of the behavior-aware modeling paper. The adjoint method for fixed
+        points: Christianson, "Reverse accumulation and attractive fixed points" (1994).
     """
     return _solve(model, task, behavior, options or SolveOptions(), start, visited, region)
 
 
-# Compiled as a whole, or else the loops of a solver would be compiled anew with every call.
+# Compiled as a whole: otherwise every call would compile the loops of a solver again.
 @eqx.filter_jit
 def _solve(
     model: TransitionModel,
@@ -134,18 +163,13 @@ def _solve(
     visited: Int[Array, "*tasks visited"] | None,
     region: Bool[Array, "*tasks states"] | None,
 ) -> Solution:
-    solver, gradient, horizon = (
-        options.solver_for(behavior.backup, model.graph.states),
-        options.gradient,
-        options.horizon,
-    )
+    solver = options.solver_for(behavior.backup, model.graph.states)
     probabilities = model.probabilities()
     dtype = probabilities.dtype
-    behavior = eqx.tree_at(lambda people: people.beta, behavior, behavior.beta.astype(dtype))
+    behavior = eqx.tree_at(lambda agent: agent.beta, behavior, behavior.beta.astype(dtype))
 
     begin = start or _cold_start(solver, model.graph.states, dtype, task.terminal.shape[:-1])
-
-    solved = jnp.ones(task.terminal.shape, dtype=bool) if region is None else region
+    everywhere = jnp.ones(task.terminal.shape, dtype=bool) if region is None else region
 
     def one(task: Task, start: WarmStart, visited: Array | None, region: Array) -> Solution:
         process = DecisionProcess(
@@ -157,24 +181,24 @@ def _solve(
             task.discount.astype(dtype),
         )
         some = jnp.zeros(0, jnp.int32) if visited is None else visited
-        if horizon is None:
-            found, rows = _solve_fixed_point(process, behavior, gradient, solver, start, some, region)
+        if options.horizon is None:
+            result, rows = _solve_fixed_point(process, behavior, options.gradient, solver, start, some, region)
         else:
-            values = finite_horizon(process, behavior.backup, behavior.beta, horizon, gradient)
-            residual = jnp.asarray(0, values.dtype)
-            found = SolveResult(values, start.order, jnp.asarray(horizon), residual, jnp.isfinite(values).all())
+            values = finite_horizon(process, behavior.backup, behavior.beta, options.horizon, options.gradient)
+            sweeps, residual = jnp.asarray(options.horizon), jnp.asarray(0, values.dtype)
+            result = SolveResult(values, start.order, sweeps, residual, jnp.isfinite(values).all())
             rows = probabilities[some]
-        values = found.values
+        values = result.values
         if visited is None:
             q = process.action_values(values)
         else:
             reward = process.reward[visited] if len(process.reward) > 1 else process.reward
             after = values[process.successors[visited]]
             q = action_values(values[visited], after, rows, reward, process.discount)
-        left = WarmStart(jax.lax.stop_gradient(values), start.adjoint, found.order)
-        return Solution(values, q, found.sweeps, found.residual, found.converged, left)
+        next_start = WarmStart(jax.lax.stop_gradient(values), start.adjoint, result.order)
+        return Solution(values, q, result.sweeps, result.residual, result.converged, next_start)
 
-    arguments = task, begin, visited, solved
+    arguments = task, begin, visited, everywhere
     return jax.vmap(one)(*arguments) if task.terminal.ndim == 2 else one(*arguments)
 
 
@@ -184,11 +208,26 @@ def _cold_start(solver: Solver, states: int, dtype: jnp.dtype, tasks: tuple[int,
 
 
 def check_proper(task: Task, behavior: Behavior, actions: int, horizon: int | None = None) -> None:
-    """Raises `ImproperTask` unless the values of every task (one or a stack) are finite and unique.
+    """Check that the values of every task are finite and unique.
 
-    A finite horizon or a discount below 1 always is proper. At discount 1 a task must end somewhere and every action
-    must cost something; for log-sum-exp people more than log(actions)/β, which is what a choice is worth to them: if it
-    costs less they gain by never arriving.
+    Tasks with a finite horizon or a discount below 1 are proper. At discount 1 a task needs a terminal state and every
+    action must have a cost; with the log-sum-exp backup one above log(actions)/β, the entropy bonus of an action, as
+    agents otherwise gain by never arriving.
+
+    Args:
+        task: one task or a stack.
+        behavior: of the agents.
+        actions: the number of actions.
+        horizon: as in `SolveOptions`.
+
+    Raises:
+        ImproperTask: where they are not.
+
+    Example:
+        >>> from sidestep.tabular.grid import Grid
+        >>> from sidestep.tabular.tasks import reach
+        >>> goal = reach(Grid.unknown(2, 2), 0, discount=1.0, step_cost=1.0)
+        >>> check_proper(goal, Behavior(LogSumExp(), beta=10.0), actions=4)
     """
     endless = np.atleast_1d(np.asarray(task.discount)) == 1
     if horizon is not None or not endless.any():
@@ -220,15 +259,15 @@ def _solve_fixed_point(
 ) -> tuple[SolveResult, Float[Array, "visited actions outcomes"]]:
     varying = (process.probabilities, process.reward, process.terminal_reward, process.discount, behavior.beta)
     held = jax.lax.stop_gradient(varying)
-    given = (process.successors, process.terminal)
-    found = solver.values(_process(given, held), behavior.backup, held[-1], jax.lax.stop_gradient(start), region)
-    given = (*given, solver, found.order, region, visited)
-    solved: tuple[Array, Array] = _implicit(behavior.backup, gradient, given, varying, found.values, start.adjoint)
-    return found._replace(values=solved[0]), solved[1]
+    constants = (process.successors, process.terminal)
+    result = solver.values(_process(constants, held), behavior.backup, held[-1], jax.lax.stop_gradient(start), region)
+    constants = (*constants, solver, result.order, region, visited)
+    solved: tuple[Array, Array] = _implicit(behavior.backup, gradient, constants, varying, result.values, start.adjoint)
+    return result._replace(values=solved[0]), solved[1]
 
 
-def _process(given: tuple, varying: tuple) -> DecisionProcess:
-    (successors, terminal), (probabilities, reward, terminal_reward, discount, _) = given[:2], varying
+def _process(constants: tuple, varying: tuple) -> DecisionProcess:
+    (successors, terminal), (probabilities, reward, terminal_reward, discount, _) = constants[:2], varying
     return DecisionProcess(successors, probabilities, reward, terminal_reward, terminal, discount)
 
 
@@ -236,37 +275,39 @@ def _process(given: tuple, varying: tuple) -> DecisionProcess:
 def _implicit(
     backup: Backup,
     gradient: Gradient,
-    given: tuple,
+    constants: tuple,
     varying: tuple,
     values: Float[Array, " states"],
     adjoint: Float[Array, " states"],
 ) -> tuple[Float[Array, " states"], Float[Array, "visited actions outcomes"]]:
-    """`values`, the solution V of V = F(V, φ) with φ = `varying`, with their gradient by the adjoint equation.
+    """Return the solution V of V = F(V, φ), φ = `varying`, with its gradient by the adjoint equation.
 
-    And the visited states' probabilities, whose gradient is added to the one by the values where it is: two arrays of
-    the model's size would take longer to make and to add than most of the rest.
+    Also return the probabilities of the visited states. Their gradient is added in place to the one by the values: two
+    arrays of the model's size would take longer to make and to add than most of the rest.
 
     `adjoint` is where the solve of the adjoint starts. It has no influence, so its gradient is free to carry the new
     adjoint out of the backward pass.
     """
     del backup, gradient, adjoint
-    solver, visited = given[2], given[-1]
+    solver, visited = constants[2], constants[-1]
     return values, solver.rows(varying[0], visited)
 
 
-def _implicit_forward(backup: Backup, gradient: Gradient, given: tuple, varying: tuple, values: Array, adjoint: Array):
-    found = _implicit(backup, gradient, given, varying, values, adjoint)
-    return found, (given, varying, values, adjoint)
+def _implicit_forward(
+    backup: Backup, gradient: Gradient, constants: tuple, varying: tuple, values: Array, adjoint: Array
+):
+    outputs = _implicit(backup, gradient, constants, varying, values, adjoint)
+    return outputs, (constants, varying, values, adjoint)
 
 
 def _implicit_backward(backup: Backup, gradient: Gradient, saved: tuple, cotangents: tuple[Array, Array]):
-    given, varying, values, adjoint = saved
-    solver, order, region, visited = given[2:]
-    process, beta = _process(given, varying), varying[-1]
+    constants, varying, values, adjoint = saved
+    solver, order, region, visited = constants[2:]
+    process, beta = _process(constants, varying), varying[-1]
     start = WarmStart(values, adjoint, order)
-    by, found = solver.vjp(process, backup, beta, gradient, values, cotangents[0], start, region)
-    by = by._replace(probabilities=by.probabilities.at[visited].add(cotangents[1]))
-    return None, tuple(by), jnp.zeros_like(values), found.values
+    cotangent, result = solver.vjp(process, backup, beta, gradient, values, cotangents[0], start, region)
+    cotangent = cotangent._replace(probabilities=cotangent.probabilities.at[visited].add(cotangents[1]))
+    return None, tuple(cotangent), jnp.zeros_like(values), result.values
 
 
 _implicit.defvjp(_implicit_forward, _implicit_backward)

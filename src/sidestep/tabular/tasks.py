@@ -1,7 +1,7 @@
-"""Tasks: what a walker wants. A complete reward, a discount, and the states at which the task ends.
+"""Tasks: the goals of agents, each a reward function, a discount and terminal states.
 
-An action a in a state s pays R(s, a). A terminal state ends the task: no action is taken there, it pays its final
-reward once. The paper's reward R(s) "1 at the goal and 0 elsewhere" is a final reward of 1 at a terminal goal.
+An action a in a state s pays R(s, a). A terminal state ends the task: no action is taken there, it pays its terminal
+reward once. The paper's reward R(s) "1 at the goal and 0 elsewhere" is a terminal reward of 1 at the goal.
 """
 
 from collections.abc import Sequence
@@ -9,20 +9,23 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from sidestep.errors import InputError
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.grid import Grid
 
 
 class Task(eqx.Module):
-    """One task, or (with a leading `tasks` axis on every field) several.
+    """One task, or with a leading `tasks` axis on every field several; made by `reach`, `task` and `stack_tasks`.
 
-    - `reward`: R(s, a) of acting; an axis of length 1 holds for all states or all actions.
-    - `terminal_reward`: what a terminal state pays; read at terminal states only.
-    - `terminal`: where the task ends.
-    - `discount`: γ in (0, 1].
+    Attributes:
+        reward: R(s, a); an axis of length 1 holds for all states or all actions.
+        terminal_reward: the reward of terminal states; ignored elsewhere.
+        terminal: where the task ends.
+        discount: γ in (0, 1].
     """
 
     reward: Float[Array, "*tasks #states #actions"]
@@ -36,25 +39,34 @@ def task(
     discount: float,
     terminal: Bool[Array, " states"] | np.ndarray,
 ) -> Task:
-    """A task from a complete reward: per state, R(s), or per state and action, R(s, a).
+    """Return a task from a complete reward function.
 
-    A terminal state pays R(s) in the first form and nothing in the second. Raises `InputError` for a reward that is
-    not finite or has another shape, and for a discount outside (0, 1].
+    Args:
+        reward: R(s), which terminal states pay too, or R(s, a), with which terminal states pay nothing.
+        discount: γ in (0, 1].
+        terminal: whether the task ends in each state.
+
+    Raises:
+        InputError: for a reward that is not finite or has another shape, and for a discount outside (0, 1].
+
+    Example:
+        >>> task(np.array([-1.0, -1.0, 5.0]), 0.9, np.array([False, False, True])).reward.shape
+        (3, 1)
     """
-    reward, terminal = jnp.asarray(reward), jnp.asarray(terminal)
+    reward, terminal = np.asarray(reward), np.asarray(terminal)
     if reward.ndim not in (1, 2) or terminal.shape != reward.shape[:1] or terminal.dtype != bool:
         raise InputError(
             f"expected shapes (states,) or (states, actions) and booleans (states,), found {reward.shape} and "
             f"{terminal.dtype} {terminal.shape}",
             field="reward, terminal",
         )
-    if not jnp.isfinite(reward).all():
+    if not np.isfinite(reward).all():
         raise InputError("expected finite numbers", field="reward")
     check_discount(discount)
     reward = reward.astype(jnp.result_type(float))
-    per_state = reward.ndim == 1
-    final = reward if per_state else jnp.zeros(1)
-    return Task(reward[:, None] if per_state else reward, final, terminal, jnp.asarray(discount, reward.dtype))
+    if reward.ndim == 1:
+        return _task(reward[:, None], reward, terminal, discount)
+    return _task(reward, np.zeros(1), terminal, discount)
 
 
 def reach(
@@ -64,20 +76,22 @@ def reach(
     discount: float = 0.95,
     step_cost: float | None = None,
 ) -> Task:
-    """The task of reaching a goal.
+    """Return the task of reaching a goal.
 
-    - `goal`: a state, or on a `Grid` a position (x, y) in metres.
-    - `discount`: γ.
-    - `step_cost`: without it, the goal pays 1 and γ < 1 makes haste worthwhile (the paper's form). With it, every
-      action costs `step_cost` per unit of length (a cell side on grids) and the goal pays nothing; γ may be 1.
+    Args:
+        world: where; rewards are paid by the length of its actions.
+        goal: a state, or on a `Grid` a position (x, y) in metres.
+        discount: γ in (0, 1]; below 1 without a step cost.
+        step_cost: the cost of an action per unit of length (a cell side on grids), above 0; the goal then pays
+            nothing. Without it actions cost nothing and the goal pays 1 (the paper's form).
 
-    Raises `InputError` for a goal outside the world or in a known obstacle, a discount outside (0, 1] (with a goal
-    reward: (0, 1)), or a step cost that is not above 0.
+    Raises:
+        InputError: for a goal outside the world or in a known obstacle, and for a discount or step cost out of range.
 
-    >>> grid = Grid.unknown(rows=7, columns=4)
-    >>> task = reach(grid, (3.5, 6.5))
-    >>> int(jnp.argmax(task.terminal))  # the top right cell
-    3
+    Example:
+        >>> grid = Grid.unknown(rows=7, columns=4)
+        >>> int(jnp.argmax(reach(grid, (3.5, 6.5)).terminal))  # the top right cell
+        3
     """
     check_discount(discount)
     if step_cost is None and discount == 1:
@@ -85,40 +99,70 @@ def reach(
     if step_cost is not None and not (np.isfinite(step_cost) and step_cost > 0):
         raise InputError(f"expected a number above 0, found {step_cost}", field="step_cost")
     state, states = _goal_state(world, goal)
-    terminal = jnp.zeros(states, dtype=bool).at[state].set(True)
-    gamma = jnp.asarray(discount, jnp.result_type(float))
+    terminal = np.arange(states) == state
     if step_cost is None:
-        return Task(jnp.zeros((1, 1)), jnp.ones(1), terminal, gamma)
-    return Task(-step_cost * jnp.atleast_2d(jnp.asarray(world.lengths)), jnp.zeros(1), terminal, gamma)
+        return _task(np.zeros((1, 1)), np.ones(1), terminal, discount)
+    lengths = np.atleast_2d(np.asarray(world.lengths, dtype=jnp.result_type(float)))
+    return _task(-step_cost * lengths, np.zeros(1), terminal, discount)
 
 
 def stack_tasks(tasks: Sequence[Task]) -> Task:
-    """Several tasks as one `Task` with a leading axis."""
+    """Return several tasks as one `Task` with a leading axis.
+
+    Args:
+        tasks: at least one, all in the same world.
+
+    Raises:
+        InputError: for no tasks.
+
+    Example:
+        >>> grid = Grid.unknown(rows=1, columns=3)
+        >>> stack_tasks([reach(grid, 0), reach(grid, 2)]).terminal.shape
+        (2, 3)
+    """
     if not tasks:
         raise InputError("expected at least one task", field="tasks")
 
     def stacked(field: str) -> Array:
         leaves = [getattr(task, field) for task in tasks]
         shape = np.broadcast_shapes(*(leaf.shape for leaf in leaves))
-        return jnp.stack([jnp.broadcast_to(leaf, shape) for leaf in leaves])
+        if any(isinstance(leaf, Tracer) for leaf in leaves):
+            return jnp.stack([jnp.broadcast_to(leaf, shape) for leaf in leaves])
+        return to_jax(np.stack([np.broadcast_to(np.asarray(leaf), shape) for leaf in leaves]))
 
     return Task(stacked("reward"), stacked("terminal_reward"), stacked("terminal"), stacked("discount"))
 
 
 def with_state_costs(tasks: Task, costs: Float[Array, " states"], aimed_at: Int[Array, "states actions"]) -> Task:
-    """One task or a stack, in which a move also pays the cost of the state that it aims at.
+    """Return tasks in which an action also pays the cost of the state that it aims at.
 
-    >>> from sidestep.tabular.graph import grid_graph
-    >>> grid = Grid.unknown(rows=1, columns=3)
-    >>> aimed_at = grid_graph(grid).successors[..., 0]
-    >>> with_state_costs(reach(grid, 2), jnp.array([0.0, 0.25, 0.0]), aimed_at).reward[0].tolist()
-    [0.0, 0.0, 0.0, -0.25]
+    Args:
+        tasks: one task or a stack.
+        costs: of each state, in units of reward.
+        aimed_at: the state that each action aims at.
+
+    Example:
+        >>> from sidestep.tabular.graph import grid_graph
+        >>> grid = Grid.unknown(rows=1, columns=3)
+        >>> aimed_at = grid_graph(grid).successors[..., 0]
+        >>> with_state_costs(reach(grid, 2), jnp.array([0.0, 0.25, 0.0]), aimed_at).reward[0].tolist()
+        [0.0, 0.0, 0.0, -0.25]
     """
     return Task(tasks.reward - costs[aimed_at], tasks.terminal_reward, tasks.terminal, tasks.discount)
 
 
+def _task(
+    reward: Float[np.ndarray, "#states #actions"],
+    terminal_reward: Float[np.ndarray, "#states"],
+    terminal: Bool[np.ndarray, " states"],
+    discount: float,
+) -> Task:
+    gamma = jnp.asarray(discount, jnp.result_type(float))
+    return Task(to_jax(reward), to_jax(terminal_reward), to_jax(terminal), gamma)
+
+
 def check_discount(discount: float) -> None:
-    """Raises `InputError` unless the discount lies in (0, 1]."""
+    """Raise `InputError` unless the discount lies in (0, 1]."""
     if not 0 < discount <= 1:
         raise InputError(f"expected a number above 0 and at most 1, found {discount}", field="discount")
 

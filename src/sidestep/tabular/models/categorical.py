@@ -19,11 +19,22 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from sidestep.errors import InputError
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.models.base import TransitionModel
 
 FIXED, IMPOSSIBLE = -1, -2
 """In an index: an outcome whose logit is 0 and not learned, and one that cannot happen."""
+
+
+def logit_array(logits: Float[Array | np.ndarray, "..."] | float, shape: tuple[int, ...]) -> Float[Array, "..."]:
+    """Return logits of the given shape, from one number for all or one for each; arrays keep their precision."""
+    if isinstance(logits, jax.Array):
+        return jnp.broadcast_to(logits, shape)
+    array = np.asarray(logits)
+    if not (isinstance(logits, np.ndarray) and array.dtype.kind == "f"):
+        array = array.astype(jnp.result_type(float))
+    return to_jax(np.broadcast_to(array, shape))
 
 
 class TabularModel(TransitionModel):
@@ -45,10 +56,10 @@ class TabularModel(TransitionModel):
     ):
         """Raises `InputError` for shapes that differ from the graph's or an action without a possible outcome."""
         self.graph, self.parameters = graph, logits
-        self.possible = jnp.ones(logits.shape, dtype=bool) if possible is None else possible
+        self.possible = to_jax(np.ones(logits.shape, dtype=bool)) if possible is None else possible
         if not logits.shape == self.possible.shape == graph.successors.shape:
             raise InputError(f"expected the graph's shape {graph.successors.shape}", field="logits, possible")
-        if not isinstance(self.possible, Tracer) and not self.possible.any(axis=-1).all():
+        if not isinstance(self.possible, Tracer) and not np.asarray(self.possible).any(axis=-1).all():
             raise InputError("expected a possible outcome for every state and action", field="possible")
 
     def probabilities(self) -> Float[Array, "states actions outcomes"]:
@@ -87,15 +98,12 @@ class TiedModel(TransitionModel):
             raise InputError(f"expected the graph's shape {graph.successors.shape}, found {index.shape}", field="index")
         index = np.asarray(index)
         count = max(int(index.max(initial=FIXED)) + 1, 0)
-        dtype = logits.dtype if isinstance(logits, (jax.Array, np.ndarray)) else jnp.result_type(float)
-        parameters = jnp.asarray(logits, dtype)
-        if parameters.ndim == 0:
-            parameters = jnp.broadcast_to(parameters, (count,))
+        parameters = logit_array(logits, np.shape(logits) or (count,))
         if index.min() < IMPOSSIBLE or count > len(parameters):
             raise InputError(f"expected {IMPOSSIBLE}…{len(parameters) - 1}", field="index")
         if (index == IMPOSSIBLE).all(axis=-1).any():
             raise InputError("expected a possible outcome for every state and action", field="index")
-        self.graph, self.parameters, self.index = graph, parameters, jnp.asarray(index, jnp.int32)
+        self.graph, self.parameters, self.index = graph, parameters, to_jax(index, np.int32)
 
     def probabilities(self) -> Float[Array, "states actions outcomes"]:
         """The softmax of the shared logits over the possible outcomes."""

@@ -18,10 +18,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from sidestep.errors import InputError
-from sidestep.tabular.graph import Graph, grid_graph
+from sidestep.tabular.arrays import to_jax
+from sidestep.tabular.graph import Graph, grid_graph, grid_successors
 from sidestep.tabular.grid import STEPS, Cell, Grid
 from sidestep.tabular.models.base import TransitionModel
-from sidestep.tabular.models.categorical import FIXED, IMPOSSIBLE, TiedModel
+from sidestep.tabular.models.categorical import FIXED, IMPOSSIBLE, TiedModel, logit_array
 
 
 class ObstacleGrid(TransitionModel):
@@ -41,9 +42,8 @@ class ObstacleGrid(TransitionModel):
     def __init__(self, grid: Grid, logits: Float[Array | np.ndarray, " cells"] | float = -2.0):
         """A model of a grid at the given logits (one number for all, or one a cell)."""
         self.graph = grid_graph(grid)
-        self.known = jnp.asarray(grid.known)
-        dtype = logits.dtype if isinstance(logits, (jax.Array, np.ndarray)) else jnp.result_type(float)
-        self.parameters = jnp.broadcast_to(jnp.asarray(logits, dtype), (grid.size,))
+        self.known = to_jax(grid.known)
+        self.parameters = logit_array(logits, (grid.size,))
 
     @property
     def blocked(self) -> Float[Array, "rows columns"]:
@@ -94,10 +94,10 @@ class FeaturedGrid(TransitionModel):
         Raises `InputError` for features that are not finite or not those of every cell, and for a network without
         parameters or with another output.
         """
-        features = jnp.asarray(features)
+        features = to_jax(features)
         if features.shape[0] != grid.size or not np.isfinite(features).all():
             raise InputError(f"expected {grid.size} rows of finite numbers, found {features.shape}", field="features")
-        self.graph, self.known, self.features = grid_graph(grid), jnp.asarray(grid.known), features
+        self.graph, self.known, self.features = grid_graph(grid), to_jax(grid.known), features
         self.parameters, self.network = eqx.partition(network, eqx.is_inexact_array)
         if not jax.tree.leaves(self.parameters):
             raise InputError("expected parameters to learn, found none", field="network")
@@ -138,15 +138,16 @@ def walled_grid(grid: Grid, logits: Float[Array | np.ndarray, " borders"] | floa
     graph, between = grid_graph(grid), borders(grid)
     number = {(int(a), int(b)): index for index, pair in enumerate(between) for a, b in (pair, pair[::-1])}
     index = np.full(graph.successors.shape, IMPOSSIBLE)
-    for state, targets in enumerate(np.asarray(graph.successors[..., 0])):
+    for state, targets in enumerate(grid_successors(grid)[..., 0]):
         for action, target in enumerate(targets):
             if target == state or grid.known.flat[target] == Cell.OCCUPIED:
                 index[state, action, 1] = FIXED
             else:
                 index[state, action] = FIXED, number[state, int(target)]
-    return TiedModel(graph, index, jnp.broadcast_to(jnp.asarray(logits, jnp.result_type(float)), (len(between),)))
+    return TiedModel(graph, index, logit_array(logits, (len(between),)))
 
 
+@jax.jit
 def blocked_of(logits: Float[Array, " cells"], known: Int[Array, "rows columns"]) -> Float[Array, "rows columns"]:
     """P(blocked), exactly 0 or 1 where the map knows."""
     learned = jax.nn.sigmoid(logits).reshape(known.shape)

@@ -6,13 +6,13 @@ links together, so that nobody tries it who pays by length.
 """
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sidestep.errors import InputError
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph
-from sidestep.tabular.models.categorical import FIXED, IMPOSSIBLE, TiedModel
+from sidestep.tabular.models.categorical import FIXED, IMPOSSIBLE, TiedModel, logit_array
 
 
 def road_network(
@@ -48,9 +48,9 @@ def road_network(
     index[begin, action, 1] = order if by_turn else onto
     costs = np.full(successors.shape[:2], lengths.sum())
     costs[begin, action] = lengths[onto]
-    graph = Graph(jnp.asarray(successors, jnp.int32), jnp.asarray(costs))
+    graph = Graph(to_jax(successors, np.int32), to_jax(costs))
     count = len(turns) if by_turn else links
-    return TiedModel(graph, index, jnp.broadcast_to(jnp.asarray(logits, jnp.result_type(float)), (count,)))
+    return TiedModel(graph, index, logit_array(logits, (count,)))
 
 
 def closed(model: TiedModel) -> Float[Array, " logits"]:

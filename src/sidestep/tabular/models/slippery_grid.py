@@ -17,9 +17,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sidestep.errors import InputError
-from sidestep.tabular.graph import Graph, grid_graph
+from sidestep.tabular.arrays import to_jax
+from sidestep.tabular.graph import Graph, grid_successors
 from sidestep.tabular.grid import STEPS, Grid
 from sidestep.tabular.models.base import TransitionModel
+from sidestep.tabular.models.categorical import logit_array
 from sidestep.tabular.models.obstacle_grid import blocked_of, chances_of_moves
 
 _WAYS = np.array([[STEPS.tolist().index(way) for way in ([i, j], [j, -i], [-j, i])] for i, j in STEPS.tolist()])
@@ -60,13 +62,12 @@ class SlipperyGrid(TransitionModel):
         kinds = np.unique(terrain[terrain >= 0])
         if terrain.min() < -1 or len(kinds) == 0 or kinds[-1] != len(kinds) - 1:
             raise InputError("expected the kinds 0…n−1 all to be there, and −1 where nobody slips", field="terrain")
-        straight = grid_graph(grid)
-        onto, staying = straight.successors[..., 0], straight.successors[..., 1:]
-        successors = jnp.concatenate([onto[:, _WAYS[: straight.actions]], staying], axis=-1)
-        self.graph = Graph(successors, straight.lengths)
-        self.known, self.terrain = jnp.asarray(grid.known), jnp.asarray(terrain.ravel(), jnp.int32)
-        cells = jnp.broadcast_to(jnp.asarray(logits, jnp.result_type(float)), (grid.size,))
-        self.parameters = jnp.append(cells, jnp.broadcast_to(jnp.asarray(slip, cells.dtype), (len(kinds),)))
+        entered, staying = np.split(grid_successors(grid), [1], axis=-1)
+        successors = np.concatenate([entered[:, _WAYS[: grid.connectivity], 0], staying], axis=-1)
+        self.graph = Graph(to_jax(successors, np.int32), to_jax(grid.lengths[None]))
+        self.known, self.terrain = to_jax(grid.known), to_jax(terrain.ravel(), np.int32)
+        cells, slips = logit_array(logits, (grid.size,)), logit_array(slip, (len(kinds),))
+        self.parameters = jnp.concatenate([cells, slips.astype(cells.dtype)])
 
     @property
     def blocked(self) -> Float[Array, "rows columns"]:
