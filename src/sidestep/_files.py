@@ -1,4 +1,4 @@
-"""Reading a whole file, and writing a file or a folder atomically: it appears whole or not at all."""
+"""Reading a whole file, and writing a file or a folder atomically: it appears complete or not."""
 
 import io
 import json
@@ -27,7 +27,7 @@ def read_whole(path: str | Path) -> bytes:
 
 
 def write_whole(path: str | Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write a file that appears whole or not at all.
+    """Write a file that appears complete or not.
 
     A temporary file beside `path` gets the name `path` after `write` has returned; after an error, an old file
     at `path` is unchanged. The folder is created.
@@ -57,7 +57,7 @@ def write_whole(path: str | Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 def write_whole_folder(path: str | Path, fill: Callable[[Path], object]) -> None:
-    """Write a folder that appears whole or not at all.
+    """Write a folder that appears complete or not.
 
     A temporary folder beside `path` gets the name `path` after `fill` has returned; after an error it is removed.
 
@@ -84,7 +84,7 @@ def write_whole_folder(path: str | Path, fill: Callable[[Path], object]) -> None
 
 
 def write_json(path: str | Path, data: Any) -> None:
-    """Write data, which may contain NumPy numbers and arrays, as indented JSON, whole or not at all.
+    """Write data, which may contain NumPy numbers and arrays, as indented JSON atomically.
 
     Raises:
         InputError: for NaN, infinity and other data that JSON cannot represent; None is a missing value.
@@ -105,7 +105,7 @@ def read_json(path: str | Path) -> Any:
 
 
 def write_array(path: str | Path, array: np.ndarray) -> None:
-    """Write an array of numbers as a `.npy` file, whole or not at all."""
+    """Write an array of numbers as a `.npy` file atomically."""
     write_whole(path, lambda file: np.save(file, array, allow_pickle=False))
 
 

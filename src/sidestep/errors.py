@@ -48,8 +48,8 @@ def check_positive(value: float, field: str) -> None:
 
 
 class ImproperTask(SidestepError):
-    """A task whose values are infinite or not unique, such as one in which continuing is better than arriving."""
+    """A task with infinite or ambiguous values, such as one in which continuing is better than arriving."""
 
 
 class NotConverged(SidestepError):
-    """A solution whose values had not converged; its numbers must not be used."""
+    """A solution with values that have not converged; its numbers must not be used."""

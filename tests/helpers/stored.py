@@ -20,14 +20,14 @@ def buffer(observations, actions, **other) -> EpisodeBuffer:
     """An episode that ended, and paid nothing."""
     moves = len(actions)
     ended = np.arange(moves) == moves - 1
-    given = {"rewards": np.zeros(moves), "terminations": ended, "truncations": ~ended & False, **other}
-    return EpisodeBuffer(observations=observations, actions=actions, **given)
+    fields = {"rewards": np.zeros(moves), "terminations": ended, "truncations": ~ended & False, **other}
+    return EpisodeBuffer(observations=observations, actions=actions, **fields)
 
 
 def store(spaces: tuple[Space, Space], *episodes: EpisodeBuffer, metadata=(), data_format="hdf5") -> str:
     """The id of a dataset with these spaces (observations, actions), episodes, and metadata of episodes."""
     dataset = fresh()
-    with warnings.catch_warnings():  # Minari warns of every author and environment that is not told.
+    with warnings.catch_warnings():  # Minari warns of every author and environment that is missing.
         warnings.simplefilter("ignore", UserWarning)
         made = minari.create_dataset_from_buffers(
             dataset,

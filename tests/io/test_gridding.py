@@ -22,8 +22,8 @@ def cells_along(grid, *line, **options):
     """The cells of one walk, as (column, row from the bottom)."""
     moves = grid_walks(walk_along(line, **options), grid)
     np.testing.assert_array_equal(moves.next_states[:-1], moves.states[1:])
-    centres = grid.to_cell_units(grid.centres(np.append(moves.states[:1], moves.next_states)))
-    return [tuple(cell) for cell in np.floor(centres).astype(int).tolist()]
+    centers = grid.to_cell_units(grid.centres(np.append(moves.states[:1], moves.next_states)))
+    return [tuple(cell) for cell in np.floor(centers).astype(int).tolist()]
 
 
 blank = Grid.unknown(SIZE, SIZE)

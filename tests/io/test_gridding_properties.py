@@ -14,7 +14,7 @@ from sidestep.tabular.grid import Cell, Grid
 MIRRORED_ACTION = np.array([0, 1, 3, 2, 5, 4, 7, 6])
 
 anywhere = st.integers(0, 2**32 - 1).map(lambda seed: tuple(np.random.default_rng(seed).uniform(0, SIZE, 2).tolist()))
-centre = st.tuples(*[st.integers(0, SIZE - 1).map(lambda index: index + 0.5)] * 2)
+center = st.tuples(*[st.integers(0, SIZE - 1).map(lambda index: index + 0.5)] * 2)
 corner = st.tuples(*[st.integers(0, SIZE).map(float)] * 2)
 lattice = st.tuples(*[st.integers(0, 4 * SIZE).map(lambda index: index / 4)] * 2)
 connectivities = st.sampled_from([4, 8])
@@ -34,7 +34,7 @@ def moves_along(line, connectivity):
     return grid_walks(walk_along(line), Grid.unknown(SIZE, SIZE, connectivity=connectivity))
 
 
-@given(st.lists(lines(anywhere | centre | lattice), min_size=1, max_size=3), connectivities)
+@given(st.lists(lines(anywhere | center | lattice), min_size=1, max_size=3), connectivities)
 def test_grid_walks_moves_follow_their_actions(many, connectivity):
     grid = Grid.unknown(SIZE, SIZE, connectivity=connectivity)
     moves = grid_walks(walk_along(*many), grid)
@@ -74,7 +74,7 @@ def test_grid_walks_on_borders_and_corners_follows_the_rules(line, obstacles, co
     assert not (known[row, column + steps[:, 1]] == Cell.OCCUPIED).any(), "a diagonal cuts a known corner"
 
 
-@given(st.lists(lines(anywhere | centre), min_size=2, max_size=3), connectivities)
+@given(st.lists(lines(anywhere | center), min_size=2, max_size=3), connectivities)
 def test_grid_walks_treats_walks_independently(many, connectivity):
     together = grid_walks(walk_along(*many), Grid.unknown(SIZE, SIZE, connectivity=connectivity))
     split_by_person = [moves_along(line, connectivity) for line in many]
@@ -84,7 +84,7 @@ def test_grid_walks_treats_walks_independently(many, connectivity):
         )
 
 
-@given(lines(anywhere | centre), connectivities)
+@given(lines(anywhere | center), connectivities)
 def test_grid_walks_of_mirrored_walks_are_mirrored(line, connectivity):
     moves, mirrored = (moves_along(one, connectivity) for one in (line, [(SIZE - x, y) for x, y in line]))
     row, column = np.divmod(moves.states, SIZE)
@@ -92,7 +92,7 @@ def test_grid_walks_of_mirrored_walks_are_mirrored(line, connectivity):
     np.testing.assert_array_equal(mirrored.actions, MIRRORED_ACTION[moves.actions])
 
 
-@given(lines(anywhere | centre | lattice), st.lists(st.floats(0, 1), max_size=4), connectivities)
+@given(lines(anywhere | center | lattice), st.lists(st.floats(0, 1), max_size=4), connectivities)
 def test_grid_walks_ignores_more_positions_on_a_line(line, fractions, connectivity):
     refined = [line[0]]
     for start, end in pairwise(np.asarray(line)):
@@ -127,7 +127,7 @@ def test_grid_walks_agrees_with_dense_sampling(line):
     assert distance.max() <= spacing
 
 
-@given(lines(anywhere | centre))
+@given(lines(anywhere | center))
 def test_grid_walks_8_connected_only_leaves_out_cells(line):
     full, fewer = moves_along(line, 4), moves_along(line, 8)
     remaining = iter(np.append(full.states[0], full.next_states).tolist())

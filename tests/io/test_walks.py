@@ -229,9 +229,9 @@ def test_read_walks_of_a_truncated_parquet_file_raises(tmp_path):
 
 @pytest.mark.parametrize("name", ["walks.txt", "walks", "walks.csv.gz"])
 def test_walks_with_another_ending_raise(tmp_path, name):
-    with pytest.raises(InputError, match=r"expected a file whose name ends in \.csv or \.parquet"):
+    with pytest.raises(InputError, match=r"expected a file name that ends in \.csv or \.parquet"):
         read_text(tmp_path, GOOD, name)
-    with pytest.raises(InputError, match=r"expected a file whose name ends in \.csv or \.parquet"):
+    with pytest.raises(InputError, match=r"expected a file name that ends in \.csv or \.parquet"):
         write_walks(tmp_path / name, read_text(tmp_path, GOOD))
 
 

@@ -3,7 +3,7 @@
 The grid traversal of Amanatides and Woo (1987) follows one ray from one cell border to the next. This one differs:
 
 1. All crossings of all segments with the lines of the grid are computed at once and sorted along each segment.
-2. A visit needs a length: cells whose corner or side the path only touches are not visited.
+2. A visit needs a length: a cell is not visited if the path only touches its corner or side.
 3. A path along a border is in the cell that is not known to be occupied.
 
 Positions are in cell units, (columns from the left, rows from the bottom), as `Grid.to_cell_units` returns them.

@@ -4,8 +4,8 @@
 `CliffWalking-v1` and `Taxi`. A state in which an episode ends is terminal. The terminal reward is the reward of ending
 there beyond that of the other outcomes of the same action (divided by γ, because it is received one move later); the
 rest is R(s, a). If outcomes of one action have different rewards without ending, R(s, a) has their mean. If an episode
-may either end in a state or continue there (a taxi whose passenger waits at the destination), the end gets a separate
-state, after those of the environment.
+may either end in a state or continue there (a taxi with a passenger waiting at the destination), the end gets a
+separate state, after those of the environment.
 """
 
 from collections.abc import Callable, Mapping

@@ -139,7 +139,7 @@ def write_map(path: str | Path, blocked: Float[np.ndarray, "rows columns"], grid
     """Write P(blocked) as a ROS map in `scale` mode: `NAME.yaml` and `NAME.pgm`.
 
     A pixel is 255·(1 − p) rounded; resolution and origin are those of the grid, to the last digit. Both files appear
-    whole or not at all, the image first.
+    atomically, the image first.
 
     Args:
         path: a name that ends in .yaml or .yml.
@@ -157,7 +157,7 @@ def write_map(path: str | Path, blocked: Float[np.ndarray, "rows columns"], grid
 
     path = Path(path)
     if path.suffix.lower() not in (".yaml", ".yml"):
-        raise InputError("expected a file whose name ends in .yaml or .yml", source=path)
+        raise InputError("expected a file name that ends in .yaml or .yml", source=path)
     if blocked.shape != grid.shape:
         raise InputError(f"expected an array of shape {grid.shape}, found {blocked.shape}", field="blocked")
     if not ((blocked >= 0) & (blocked <= 1)).all():

@@ -43,7 +43,7 @@ def read_table(path: str | Path, labels: tuple[str, ...] = ()) -> "pa.Table":
 
 
 def write_table(path: str | Path, table: "pa.Table") -> None:
-    """Write a table as `.csv` or `.parquet`, whole or not at all.
+    """Write a table as `.csv` or `.parquet` atomically.
 
     Raises:
         InputError: for another ending, and for a column that CSV cannot represent.
@@ -119,7 +119,7 @@ def _by_ending(path: str | Path, for_csv: Callable, for_parquet: Callable) -> Ca
     functions = {".csv": for_csv, ".parquet": for_parquet}
     ending = Path(path).suffix.lower()
     if ending not in functions:
-        raise InputError("expected a file whose name ends in .csv or .parquet", source=path)
+        raise InputError("expected a file name that ends in .csv or .parquet", source=path)
     return functions[ending]
 
 

@@ -27,16 +27,16 @@ def walks_from_trajectories(trajectories: Sequence[Trajectory], goals: Sequence[
     # the action before each row; -1 for the first row of a walk
     actions = np.concatenate([np.append(-1, trajectory.actions) for trajectory in trajectories])
     failed = (actions >= 0) & (states == np.append(-1, states[:-1]))
-    centre, goal_centre = grid.centres(states), grid.centres(goal)
+    center, goal_center = grid.centres(states), grid.centres(goal)
     row_down, column = grid.steps[actions].T
-    intended = grid.to_metres(grid.to_cell_units(centre) + np.stack([column, -row_down], axis=-1))
+    intended = grid.to_metres(grid.to_cell_units(center) + np.stack([column, -row_down], axis=-1))
     columns = {
         "walk": np.repeat(np.arange(len(lengths)), lengths),
         "step": np.concatenate([np.arange(length) for length in lengths]),
-        "x": centre[:, 0],
-        "y": centre[:, 1],
-        "goal_x": goal_centre[:, 0],
-        "goal_y": goal_centre[:, 1],
+        "x": center[:, 0],
+        "y": center[:, 1],
+        "goal_x": goal_center[:, 0],
+        "goal_y": goal_center[:, 1],
     }
     if failed.any():
         columns["failed_x"], columns["failed_y"] = (pa.array(values, mask=~failed) for values in intended.T)

@@ -125,7 +125,7 @@ def read_walks(path: str | Path) -> Walks:
 
 
 def write_walks(path: str | Path, walks: Walks) -> None:
-    """Write walks as `.csv`, `.parquet` or `minari:ID`, whole or not at all, walk by walk, for `read_walks`.
+    """Write walks as `.csv`, `.parquet` or `minari:ID` atomically, walk by walk, for `read_walks`.
 
     Raises:
         InputError: as `write_table` or `write_positions` do.

@@ -74,7 +74,7 @@ def arrange(figure: Figure, widths: Sequence[float], height: float, bar: ColorBa
 
 
 def _margins(axes: Axes, width: float, height: float, renderer: RendererAgg) -> Float[np.ndarray, " 4"]:
-    """Return how far labels reach beyond axes of a given size: left, right, below and above, in inches."""
+    """Return the reach of labels beyond axes of this size: left, right, below and above, in inches."""
     whole_width, whole_height = axes.figure.get_figure(root=True).get_size_inches()
     axes.set_position((0, 0, width / whole_width, height / whole_height))
     box = axes.get_tightbbox(renderer, bbox_extra_artists=[]) or axes.bbox

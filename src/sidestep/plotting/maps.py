@@ -211,7 +211,7 @@ def figure_plan(grid: Grid, blocked: Float[np.ndarray, "rows columns"], path: In
 
 
 def save(figure: Figure, path: str | Path) -> None:
-    """Write a figure as a PNG, whole or not at all.
+    """Write a figure as a PNG atomically.
 
     Raises:
         InputError: where the file system refuses.
@@ -286,7 +286,7 @@ def _width(grid: Grid, least: float, most: float) -> float:
 
 
 def _size(grid: Grid, longer: float) -> tuple[float, float]:
-    """Return width and height in inches of a map whose longer side is `longer`."""
+    """Return width and height of a map with a longer side of `longer` inches."""
     span = np.ptp(_corners(grid), axis=0)
     width, height = np.maximum(span * longer / span.max(), 0.8)
     return float(width), float(height)

@@ -1,4 +1,4 @@
-"""Minari datasets on this machine: read episode by episode, and written whole or not at all.
+"""Minari datasets on this machine: read episode by episode, and written atomically.
 
 A dataset has an id, `NAME-vVERSION` or `NAMESPACE/NAME-vVERSION`, under which Minari keeps it in the folder that
 `MINARI_DATASETS_PATH` names (by default `~/.minari/datasets`). The name of a dataset elsewhere is its path: a `Path`,
@@ -117,7 +117,7 @@ def read_dataset(dataset: str | Path, check_spaces: Callable[[Any, Any], None]) 
 
 
 def write_dataset(dataset: str, content: Dataset) -> None:
-    """Write a dataset under an id, whole or not at all.
+    """Write a dataset under an id atomically.
 
     Raises:
         InputError: for an id that is malformed or exists already, and for data that Minari cannot store.

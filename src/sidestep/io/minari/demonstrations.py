@@ -29,7 +29,7 @@ def write_demonstrations(
     *,
     ends: Mapping[int, int] = _NO_ENDS,
 ) -> None:
-    """Write demonstrations and their tasks as a local Minari dataset, whole or not at all.
+    """Write demonstrations and their tasks as a local Minari dataset atomically.
 
     Args:
         dataset: a new id, such as `"office/walks-v0"`.
@@ -72,7 +72,7 @@ def read_demonstrations(
     step_cost: float | None = None,
     ends: Mapping[int, int] = _NO_ENDS,
 ) -> Demonstrations[Task]:
-    """Return the demonstrations in a local Minari dataset whose observations and actions are whole numbers.
+    """Return the demonstrations in a local Minari dataset with whole numbers as observations and actions.
 
     Args:
         dataset: its id, or its path.

@@ -1,9 +1,9 @@
 """Complete tasks in the metadata of a Minari dataset, so that it suffices for learning.
 
 The metadata of the dataset have `tasks`, one entry per task: `discount`, `terminal` (a list of states), and `reward`
-and `terminal_reward`, tables whose axes may have length 1 as in `Task`. The metadata of each episode have `goal` (the
-terminal state with the largest reward, or a list of several), `discount`, and `task`, the number of its entry. In a
-dataset without `tasks`, the task of each episode is to reach its `goal` at its `discount`, as in `reach`.
+and `terminal_reward`, tables with axes of length 1 where allowed in `Task`. The metadata of each episode have `goal`
+(the terminal state with the largest reward, or a list of several), `discount`, and `task`, the number of its entry. In
+a dataset without `tasks`, the task of each episode is to reach its `goal` at its `discount`, as in `reach`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -50,8 +50,8 @@ def tasks_of_episodes(
         dataset: the dataset.
         source: its name, for error messages.
         world: gives the numbers of states and actions.
-        discount: of tasks whose metadata have only a goal.
-        step_cost: of tasks whose metadata have only goal and discount.
+        discount: of tasks with only a goal in their metadata.
+        step_cost: of tasks with only goal and discount in their metadata.
 
     Raises:
         InputError: naming the episode and the field, if metadata have no task or one that does not fit the world.

@@ -48,7 +48,7 @@ def read_positions(dataset: str) -> "pa.Table":
 
 
 def write_positions(dataset: str, table: "pa.Table") -> None:
-    """Write a table of walks from `table_from_walks` as a local Minari dataset, whole or not at all.
+    """Write a table of walks from `table_from_walks` as a local Minari dataset atomically.
 
     Raises:
         InputError: for an id that is malformed or exists already, a table without rows, and a column that is neither
