@@ -1,21 +1,18 @@
-"""Rivals on small maps where it is known what they must find, and what they cannot."""
+"""Baselines on small maps where the correct result is known."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.baselines import behavior_cloning as cloning
+from sidestep.baselines import BASELINES, METHODS
+from sidestep.baselines.behavior_aware import behavior_aware, transitions_only
 from sidestep.baselines.behavior_cloning import behavior_cloning
 from sidestep.baselines.constraint_inference import constraint_inference
-from sidestep.baselines.interface import (
-    behavior_aware,
-    model_result,
-    transitions_only,
-    visit_counts,
-)
+from sidestep.baselines.interface import BaselineResult, model_result
 from sidestep.baselines.joint import joint_estimation
 from sidestep.baselines.maxent_irl import CostlyReward, maxent_irl
+from sidestep.baselines.visits import visit_counts
 from sidestep.evaluation.study import mean_log_likelihood
 from sidestep.maps.config import BehaviorConfig, MapConfig, PriorConfig
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
@@ -43,8 +40,7 @@ def walks():
 
 
 @pytest.mark.parametrize("method", [behavior_aware, constraint_inference, joint_estimation])
-def test_a_wall_that_stood_in_the_way_is_found(method, walks):
-    """All of it that anybody would have crossed, which is more than every cell that nobody visited."""
+def test_method_finds_a_wall_that_walks_avoid(method, walks):
     learned = method(BLANK, walks, MapConfig())
     assert learned.ranking[WALL == 1].min() > learned.ranking[WALL == 0].max()
     assert (np.asarray(learned.model.blocked)[WALL == 1] > 0.5).all()
@@ -53,7 +49,7 @@ def test_a_wall_that_stood_in_the_way_is_found(method, walks):
     assert not WALL.ravel()[path].any()
 
 
-def test_visits_are_counted():
+def test_visit_counts_equals_one_over_visits_plus_one():
     walk = Trajectory(np.array([0, 1, 2, 1, 2, 7]), np.array([3, 3, 2, 3, 1]), 0)
     demos = gather([walk], [reach(BLANK, 7)])
     learned = visit_counts(BLANK, demos, MapConfig())
@@ -63,15 +59,15 @@ def test_visits_are_counted():
     assert learned.ranking.ravel()[[0, 1, 3]].tolist() == [-1, -2, 0]
 
 
-def test_transitions_alone_say_nothing_of_what_nobody_touched(walks):
+def test_transitions_only_leaves_unvisited_cells_at_the_prior(walks):
     blocked = np.asarray(transitions_only(BLANK, walks, MapConfig(prior=PriorConfig(wall_prior=0.0))).model.blocked)
     prior = 1 / (1 + np.exp(-MapConfig().prior.mean))
     np.testing.assert_allclose(blocked[WALL == 1], prior, atol=1e-4)
     assert blocked[WALL == 0].max() < prior
 
 
-def test_costs_explain_detours_without_walls(walks):
-    """They are highest where people would have walked, no move fails, and plans go round what is dear."""
+def test_maxent_irl_explains_detours_by_costs(walks):
+    """Costs are highest on the direct path, no move fails, and plans avoid high costs."""
     learned = maxent_irl(BLANK, walks, MapConfig())
     assert np.asarray(learned.model.blocked).max() == 0
     assert learned.ranking[1:4, 2].min() > learned.ranking[WALL == 0].mean()
@@ -79,15 +75,15 @@ def test_costs_explain_detours_without_walls(walks):
     assert not WALL.ravel()[path].any()
 
 
-def test_costs_are_what_makes_actions_most_probable():
-    """A corridor and a way round it: of a hundred walkers forty go through, and the cost explains that share."""
+def test_maxent_irl_reproduces_the_fraction_of_detours():
+    """Two equal detours around an obstacle: of a hundred walks forty take the lower one."""
     known = np.array([[0, 0, 0], [0, 1, 0], [0, 0, 0]])
     grid = Grid(known)
     around = Trajectory(np.array([3, 0, 1, 2, 5]), np.array([0, 3, 3, 1]), 0)
     under = Trajectory(np.array([3, 6, 7, 8, 5]), np.array([1, 3, 3, 0]), 0)
-    settings = MapConfig(behavior=BehaviorConfig(beta=40.0))
+    config = MapConfig(behavior=BehaviorConfig(beta=40.0))
     demos = gather([around] * 60 + [under] * 40, [reach(grid, 5)])
-    learned = maxent_irl(grid, demos, settings)
+    learned = maxent_irl(grid, demos, config)
     task = learned.reward.reach(grid, 5)
     policy = plan(learned.model, task, learned.behavior).policy
     assert float(policy[3, 0] / (policy[3, 0] + policy[3, 1])) == pytest.approx(0.6, abs=0.05)
@@ -96,8 +92,7 @@ def test_costs_are_what_makes_actions_most_probable():
     np.testing.assert_allclose(paid[3, 0], -learned.ranking[0, 0], rtol=1e-9)
 
 
-def test_constraints_end_where_the_walls_end():
-    """People who walk on an empty map, straight to the goal from everywhere, are no reason to forbid anything."""
+def test_constraint_inference_on_an_empty_map_forbids_nothing():
     tasks = [reach(BLANK, goal) for goal in (0, 24)]
     starts = [np.setdiff1d(np.arange(25), [0, 24, 12])] * 2
     world = ObstacleGrid(BLANK, jnp.full(25, -20.0))
@@ -105,35 +100,36 @@ def test_constraints_end_where_the_walls_end():
     assert np.asarray(constraint_inference(BLANK, demos, MapConfig()).model.blocked).max() < 0.5
 
 
-def test_joint_tells_a_costly_floor_from_a_wall():
-    """People who dislike a carpet, and cross it where that pays: the cost is found, and nothing blocked."""
+@pytest.mark.slow
+def test_joint_estimation_distinguishes_a_costly_floor_from_a_wall():
+    """Agents that pay to cross a carpet do so where a detour costs more: it is costly and not blocked."""
     carpet = WALL.astype(float).ravel()
     goals = (*GOALS, 7, 12)
     plain = [reach(BLANK, goal) for goal in goals]
     room = true_model(BLANK.passable())
-    disliked = [with_state_costs(task, jnp.asarray(0.1 * carpet), room.graph.successors[..., 0]) for task in plain]
+    costly = [with_state_costs(task, jnp.asarray(0.1 * carpet), room.graph.successors[..., 0]) for task in plain]
     starts = [np.repeat(np.setdiff1d(np.arange(25), [goal]), 4) for goal in goals]
-    walks = simulate(jax.random.key(0), room, disliked, starts, Behavior(LogSumExp(), 40.0))
+    walks = simulate(jax.random.key(0), room, costly, starts, Behavior(LogSumExp(), 40.0))
     learned = joint_estimation(BLANK, gather(walks, plain), MapConfig(behavior=BehaviorConfig(beta=40.0)))
     assert isinstance(learned.reward, CostlyReward)
     assert learned.reward.costs is not None
     np.testing.assert_allclose(learned.reward.costs[carpet == 1], 0.1, atol=0.03)
     assert learned.reward.costs[carpet == 0].max() < 0.02
     assert learned.ranking.max() < 0.1
-    # people pay what was learned: 4 moves around the end of the carpet rather than 2 across it; robots go across
+    # agents take 4 moves around the carpet rather than 2 across it; robots go across
     path = plan(learned.model, learned.reward.reach(BLANK, 18)).path_from(16)
     assert path.tolist() == [16, 21, 22, 23, 18]
     assert learned.planner.plan_to(18).paths_from(np.array([16]))[0].tolist() == [16, 17, 18]
 
 
 def walk(*states):
-    """Along a row of cells or, in grids of 5 columns, through neighbouring cells."""
+    """Return a walk along a row of cells or, in grids of 5 columns, through neighboring cells."""
     action = {-5: 0, 5: 1, -1: 2, 1: 3}
     return Trajectory(np.array(states), np.array([action[move] for move in np.diff(states).tolist()]), 0)
 
 
-def test_cloning_does_what_was_demonstrated_in_a_corridor():
-    """To one end; what was done nowhere is thought possible, and a known obstacle is not walked into."""
+def test_behavior_cloning_in_a_corridor_repeats_the_demonstration():
+    """Other actions have probabilities above 0, and the robot does not enter a known obstacle."""
     corridor = Grid(np.array([[-1, -1, -1, -1, 1]]))
     learned = behavior_cloning(corridor, gather([walk(0, 1, 2, 3)], [reach(corridor, 3)]), MapConfig())
     policy = learned.policy(3)
@@ -146,35 +142,31 @@ def test_cloning_does_what_was_demonstrated_in_a_corridor():
     assert learned.planner.goal_mask().tolist() == [[True, True, True, True, False]]
 
 
-def test_cloning_generalises_to_goals_that_nobody_had():
-    """In a free room people walk straight to five goals; by the direction, so does who cloned them to any other."""
-    room = Grid.unknown(7, 7)
-    tasks = [reach(room, goal) for goal in (0, 6, 42, 48, 24)]
-    starts = [np.random.default_rng(goal).choice(np.delete(np.arange(49), 24), 12) for goal in range(5)]
-    starts = [own[own != goal] for own, goal in zip(starts, (0, 6, 42, 48, 24), strict=True)]
-    shown = gather(simulate(jax.random.key(2), true_model(room.passable()), tasks, starts), tasks)
-    learned = behavior_cloning(room, shown, MapConfig())
-    for goal in (10, 20, 33, 45):
-        others = np.delete(np.arange(49), goal)
-        shortest = [abs(start // 7 - goal // 7) + abs(start % 7 - goal % 7) for start in others]
+def test_behavior_cloning_in_a_free_room_generalizes_to_new_goals():
+    tasks = [reach(BLANK, goal) for goal in (0, 4, 20, 24, 12)]
+    starts = [np.setdiff1d(np.arange(25), [goal]) for goal in (0, 4, 20, 24, 12)]
+    shown = gather(simulate(jax.random.key(2), true_model(BLANK.passable()), tasks, starts), tasks)
+    learned = behavior_cloning(BLANK, shown, MapConfig())
+    for goal in (7, 10, 18, 22):
+        others = np.delete(np.arange(25), goal)
+        shortest = [abs(start // 5 - goal // 5) + abs(start % 5 - goal % 5) for start in others]
         paths = learned.planner.plan_to(goal).paths_from(others)
-        assert [path[-1] for path in paths] == [goal] * 48
+        assert [path[-1] for path in paths] == [goal] * 24
         assert [len(path) - 1 for path in paths] == shortest
 
 
-@pytest.mark.parametrize(("logit", "found"), [(8.0, True), (20.0, False)])
-def test_what_people_do_cannot_be_told_where_they_have_no_values(logit, found, walks):
-    """Once in a hundred million tries somebody gets through a wall, and each try costs: values are out of reach."""
-    paying = MapConfig(Reward(1.0, 1.0), BehaviorConfig(beta=0.5))
+@pytest.mark.parametrize(("logit", "converges"), [(8.0, True), (20.0, False)])
+def test_mean_log_likelihood_without_values_is_none(logit, converges, walks):
+    """At a logit of 20 a move through the wall succeeds once in 5·10⁸ tries, each at a cost: values do not converge."""
+    config = MapConfig(Reward(discount=1.0, step_cost=1.0), BehaviorConfig(beta=0.5))
     walled = ObstacleGrid(BLANK, jnp.where(jnp.arange(25) % 5 == 1, logit, -3.0))
-    nats = mean_log_likelihood(model_result(walled, walks, paying), walks)
-    assert (nats is not None) == found
-    if nats is not None:
-        assert nats == pytest.approx(float(model_result(walled, walks, paying).log_policies(walks).mean()))
+    result = model_result(walled, walks, config)
+    mean = mean_log_likelihood(result, walks)
+    assert mean == (pytest.approx(float(result.log_policies(walks).mean())) if converges else None)
 
 
-def test_cloning_is_particular_to_places():
-    """The goal is four cells to the right, and people go straight there in one row, and by another row in another."""
+def test_behavior_cloning_depends_on_the_state():
+    """Both goals are four cells to the right: one walk goes straight, the other by another row."""
     straight, around = walk(5, 6, 7, 8, 9), walk(15, 10, 11, 12, 13, 14, 19)._replace(task=1)
     shown = gather([straight, around] * 5, [reach(BLANK, goal) for goal in (9, 19)])
     learned = behavior_cloning(BLANK, shown, MapConfig())
@@ -182,9 +174,9 @@ def test_cloning_is_particular_to_places():
     assert learned.planner.plan_to(19).paths_from(np.array([15]))[0].tolist() == around.states.tolist()
 
 
-def test_cloning_takes_actions_to_be_as_probable_as_its_policy_says(walks):
+def test_behavior_cloning_log_policies_equal_its_policy(walks):
     learned = behavior_cloning(BLANK, walks, MapConfig())
-    assert learned.ranking is learned.shares is None
+    assert learned.ranking is learned.heatmap is None
     each = learned.log_policies(walks)
     for move in (0, 17, len(walks) - 1):
         policy = learned.policy(GOALS[int(walks.task[move])])
@@ -192,7 +184,12 @@ def test_cloning_takes_actions_to_be_as_probable_as_its_policy_says(walks):
     assert each.mean() > np.log(0.5)
 
 
-@pytest.mark.parametrize(("most", "converged"), [(1, False), (2000, True)])
-def test_cloning_says_whether_it_converged(walks, monkeypatch, most, converged):
-    monkeypatch.setattr(cloning, "_ITERATIONS", most)
-    assert behavior_cloning(BLANK, walks, MapConfig()).converged == converged
+@pytest.mark.parametrize(("max_iterations", "converged"), [(1, False), (2000, True)])
+def test_behavior_cloning_reports_convergence(walks, max_iterations, converged):
+    learned = behavior_cloning(BLANK, walks, MapConfig(), max_iterations)
+    assert learned.converged == converged
+    assert isinstance(learned, BaselineResult)
+
+
+def test_methods_begin_with_behavior_aware_modeling():
+    assert list(METHODS) == ["behavior", *BASELINES]

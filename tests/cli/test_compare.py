@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from helpers.office import call, summary, write_office
-from sidestep.baselines.comparison import BASELINES, compare_methods
+from sidestep.baselines import BASELINES
+from sidestep.baselines.comparison import compare_methods
 from sidestep.io.demonstrations import demonstrations_from_walks
 from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map, write_map

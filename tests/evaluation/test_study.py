@@ -41,7 +41,7 @@ def test_run_study_returns_a_record_for_each_problem_and_method():
     one, two = problem("one", goals=np.array([3])), problem("two", heldout=problem("").demonstrations)
     methods = {"right": lambda *_: AlwaysRight(-0.5), "nan": lambda *_: AlwaysRight(np.nan), "fail": fail}
     lines = []
-    records = run_study([one, two], methods, callback=lines.append)
+    records = run_study([one, two], methods, notify=lines.append)
     assert [(record.problem, record.method) for record in records] == [
         (name, method) for name in ("one", "two") for method in methods
     ]

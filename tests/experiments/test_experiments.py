@@ -1,4 +1,4 @@
-"""The experiments: the paper's ways of learning on one world, and the demonstration in a small office."""
+"""The paper's variants of learning on one world, and the demonstration in a small office."""
 
 import json
 
@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sidestep.experiments import demo, reproduce
-from sidestep.experiments.reproduce import VARIANTS
+from sidestep.experiments import demo
+from sidestep.experiments.reproduce import VARIANTS, ReproduceConfig, reproduce, simulate_walks
 from sidestep.inference.optimizers import LBFGS, Adam
 from sidestep.maps.config import SimulationConfig
 from sidestep.maps.learned_map import load_map
 from sidestep.tabular.graph import walkable_graph
-from sidestep.worlds.grids import WORLDS, block
+from sidestep.worlds.grids import block
 
 SCORES = {
     "auc", "average_precision", "auc_relevant", "mean_obstacle", "mean_free", "max_probability", "legal_fraction",
@@ -22,17 +22,14 @@ SCORES = {
 
 @pytest.fixture(scope="module")
 def reproduced(tmp_path_factory):
-    """The experiments on the block alone: the folder, and the scores of each variant."""
-    folder = tmp_path_factory.mktemp("figures")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reproduce, "WORLDS", {"block": WORLDS["block"]})
-        told = []
-        summary = reproduce.reproduce(folder, seed=0, report=told.append)
-    assert len(told) == 4
+    """The experiments on the block only: the folder and its summary."""
+    folder, lines = tmp_path_factory.mktemp("figures"), []
+    summary = reproduce(folder, seed=0, notify=lines.append, config=ReproduceConfig(worlds=("block",)))
+    assert len(lines) == 4
     return folder, summary
 
 
-def test_the_four_ways_of_learning():
+def test_variants_are_those_of_the_paper():
     assert {name: (variant.terms, variant.gradient) for name, variant in VARIANTS.items()} == {
         "bam": (("actions", "transitions"), "fixed_policy"),
         "bam_exact": (("actions", "transitions"), "exact"),
@@ -43,7 +40,8 @@ def test_the_four_ways_of_learning():
     assert all(isinstance(variant.optimizer, kinds[variant.gradient]) for variant in VARIANTS.values())
 
 
-def test_the_experiments_write_figures_and_numbers(reproduced):
+@pytest.mark.slow
+def test_reproduce_writes_figures_and_numbers(reproduced):
     folder, summary = reproduced
     assert {path.name for path in folder.iterdir()} == {
         "figure1.png", "figure2.png", "figure3.png", "figure4.png", "summary.json",
@@ -59,8 +57,8 @@ def test_the_experiments_write_figures_and_numbers(reproduced):
         assert scores["converged"]
 
 
-def test_the_block_is_found_by_those_who_watch_actions(reproduced):
-    """What issue and paper promise, on the first of the three maps."""
+@pytest.mark.slow
+def test_reproduce_finds_the_block_by_actions(reproduced):
     bam, exact, actions, transitions = (reproduced[1]["maps"]["block"][name] for name in VARIANTS)
     for scores in (bam, exact):
         assert scores["auc"] >= 0.95
@@ -72,31 +70,32 @@ def test_the_block_is_found_by_those_who_watch_actions(reproduced):
     assert actions["mean_free"] > bam["mean_free"]
 
 
-def test_ten_optimal_walks_for_each_pair_with_ties_at_random():
+def test_simulate_walks_returns_optimal_walks_with_random_ties():
     world = block()
-    paths = reproduce._walks(world, seed=0).paths()
+    paths = simulate_walks(world, ReproduceConfig(), seed=0).paths()
     assert len(paths) == 10 * len(world.starts) * len(world.goals)
     legal = walkable_graph(world.truth).toarray() > 0
     assert all(legal[path[:-1], path[1:]].all() for path in paths)
     from_start_to_corner = {tuple(path) for path in paths if (path[0], path[-1]) == (0, 80)}
     assert {len(path) for path in from_start_to_corner} == {17}
     assert len(from_start_to_corner) > 3
-    again = reproduce._walks(world, seed=0).paths()
+    again = simulate_walks(world, ReproduceConfig(), seed=0).paths()
     assert [path.tolist() for path in again] == [path.tolist() for path in paths]
 
 
-def test_the_demonstration_in_a_small_office(tmp_path):
+@pytest.mark.slow
+def test_demo_in_a_small_office_writes_map_and_numbers(tmp_path):
     config = demo.DemoConfig(rows=10, columns=10, agents=SimulationConfig(walks=60, goals=5))
-    told = []
-    summary = demo.demo(tmp_path, seed=1, notify=told.append, config=config)
-    assert len(told) == 3
+    lines = []
+    summary = demo.demo(tmp_path, seed=1, notify=lines.append, config=config)
+    assert len(lines) == 3
     assert json.loads((tmp_path / "summary.json").read_text()) == json.loads(json.dumps(summary))
     assert set(summary["scores"]) >= SCORES
     assert summary["scores"]["auc"] > 0.7
     assert {path.name for path in tmp_path.iterdir()} == {
         "demo.png", "learned", "summary.json", "truth.pgm", "truth.yaml", "walks.csv",
     }  # fmt: skip
-    found = load_map(tmp_path / "learned")
-    assert found.unknown.all()  # nothing of the office was known
-    assert found.blocked.shape == (10, 10)
-    assert np.isfinite(found.blocked).all()
+    learned = load_map(tmp_path / "learned")
+    assert learned.unknown.all()  # nothing of the office was known
+    assert learned.blocked.shape == (10, 10)
+    assert np.isfinite(learned.blocked).all()

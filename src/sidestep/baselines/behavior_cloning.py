@@ -1,17 +1,18 @@
-"""Behavior cloning: a policy fitted to the actions alone (Pomerleau 1991), with neither a map nor a reward.
+"""Behavior cloning: a policy by supervised learning of actions (Pomerleau 1991), without a map and a reward.
 
-What people do is taken to depend on where they are and which way their goal lies: multinomial logistic regression,
+The policy is a multinomial logistic regression on the state and the direction of the goal,
 
-    π(a | s, g) ∝ exp w_a · φ(s, g),        φ = (1[s], direction, 1[s] ⊗ compass),
+    π(a | s, g) ∝ exp w_a · φ(s, g),        φ = (direction, 1[s], 1[s] ⊗ compass),
 
-where `direction` is all that is said of the way to the goal: the unit vector, the inverse distance, and in which of
-the sectors it lies that the straight and diagonal lines through s part the map into, these lines being sectors of their
-own; the coarser `compass` knows the straight lines only. So the policy is particular to places where people have been,
-and elsewhere, and to goals that nobody had, it goes by the direction. How much the weights are held down (L2) is what
-makes the actions of other walks most probable.
+where `direction` is the unit vector to the goal, the inverse distance, and one of 27 sectors between the straight and
+diagonal lines through s (the lines are sectors too), and `compass` is one of 9 coarser sectors between the straight
+lines. So the policy depends on the state where walks went, and on the direction alone elsewhere. The L2 penalty
+maximizes the likelihood of held-out walks. Cells are not ranked, and a robot follows the policy greedily
+(`sidestep.robots.planners`). It differs from Pomerleau's network in its features and its model.
 
-Nothing is learned of cells, so they are not ranked. A robot follows the policy greedily, see
-`sidestep.robots.planners`.
+References:
+    D. A. Pomerleau (1991). Efficient training of artificial neural networks for autonomous navigation. Neural
+    Computation 3(1), 88-97.
 """
 
 import warnings
@@ -20,27 +21,32 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array, hstack, vstack
-from scipy.special import log_softmax
 
 from sidestep.maps.config import MapConfig
 from sidestep.robots.planners import PolicyPlanner
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Grid
 
-_FREEDOM = (0.1, 1.0, 10.0)
-"""The weights' variances that are tried; the middle one where there are too few walks to try them on."""
+MAX_ITERATIONS = 2000
+"""The most iterations of the regression."""
+_VARIANCES = (0.1, 1.0, 10.0)
+"""The candidate variances of the weights; the middle one if there are too few walks to choose."""
 _COMPASS, _SECTORS = 9, 27
 _DIRECTION = 3 + _SECTORS
-"""How many kinds of direction there are, coarsely and finely (some never occur), and how many features of it."""
 _FOLDS = 3
-_ITERATIONS = 2000
 
 
 @dataclass(frozen=True, eq=False)
-class Cloned:
+class ClonedPolicy:
     """A policy for every goal on a map.
 
-    - `weights`: w of every action, and `intercepts`. `converged`: as in `BaselineResult`.
+    Attributes:
+        grid: The known map.
+        weights: w of every action.
+        intercepts: The intercept of every action.
+        converged: Whether the regression converged.
+        ranking: None, since cells are not ranked.
+        heatmap: None, since cells are not ranked.
     """
 
     grid: Grid
@@ -48,79 +54,84 @@ class Cloned:
     intercepts: Float[np.ndarray, " actions"]
     converged: bool
     ranking: None = None
-    shares: None = None
+    heatmap: None = None
 
     def policy(self, goal: int) -> Float[np.ndarray, "states actions"]:
-        """The probability of each action, for who is to reach a state."""
+        """Return π(a | s) for a goal (a state)."""
         states = np.arange(self.grid.size)
         return np.exp(self._log_policy(states, np.full(self.grid.size, goal)))
 
     @property
     def planner(self) -> PolicyPlanner:
-        """The most probable action everywhere."""
+        """The planner that follows the policy greedily."""
         return PolicyPlanner(self.grid, self.policy)
 
     def log_policies(self, demonstrations: Demonstrations) -> Float[np.ndarray, " moves"]:
-        """How probable every action is, in nats."""
+        """Return log π(a | s) of every move in nats."""
         states, actions, goals = _moves(demonstrations)
         return self._log_policy(states, goals)[np.arange(len(states)), actions]
 
     def _log_policy(
         self, states: Int[np.ndarray, " visits"], goals: Int[np.ndarray, " visits"]
     ) -> Float[np.ndarray, "visits actions"]:
+        from scipy.special import log_softmax
+
         return log_softmax(_features(self.grid, states, goals) @ self.weights.T + self.intercepts, axis=-1)
 
 
-def behavior_cloning(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> Cloned:
-    """A policy from the actions, whatever the settings say of people."""
+def behavior_cloning(
+    grid: Grid, demonstrations: Demonstrations, config: MapConfig, max_iterations: int = MAX_ITERATIONS
+) -> ClonedPolicy:
+    """Learn a policy from the actions; `config` is not used, since it has neither a reward nor a behavior model."""
     del config
     walks = np.asarray(demonstrations.trajectory)
-    fold = walks % _FOLDS
-    if walks[-1] + 1 < _FOLDS:
-        return _fitted(grid, demonstrations, np.ones(len(walks), dtype=bool), _FREEDOM[1])
+    fold, everything = walks % _FOLDS, np.ones(len(walks), dtype=bool)
 
-    def elsewhere(freedom: float) -> float:
-        """The log-likelihood of the actions of each fold's walks by the policy from the others."""
+    def learn(used: Bool[np.ndarray, " moves"], variance: float) -> ClonedPolicy:
+        return _fit_policy(grid, demonstrations, used, variance, max_iterations)
+
+    def heldout_log_likelihood(variance: float) -> float:
         return sum(
-            float(_fitted(grid, demonstrations, fold != own, freedom).log_policies(demonstrations)[fold == own].sum())
-            for own in range(_FOLDS)
+            float(learn(fold != own, variance).log_policies(demonstrations)[fold == own].sum()) for own in range(_FOLDS)
         )
 
-    return _fitted(grid, demonstrations, np.ones(len(walks), dtype=bool), max(_FREEDOM, key=elsewhere))
+    enough = walks[-1] + 1 >= _FOLDS
+    return learn(everything, max(_VARIANCES, key=heldout_log_likelihood) if enough else _VARIANCES[1])
 
 
-def _fitted(grid: Grid, demonstrations: Demonstrations, counts: Bool[np.ndarray, " moves"], freedom: float) -> Cloned:
-    """The regression on the moves that count, and on one of each action, nowhere, lest one be thought impossible."""
-    # a second to load, and few need it
+def _fit_policy(
+    grid: Grid, demonstrations: Demonstrations, used: Bool[np.ndarray, " moves"], variance: float, max_iterations: int
+) -> ClonedPolicy:
+    """Fit the regression to some moves, and to one move of each action without features so that none is impossible."""
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.linear_model import LogisticRegression
 
-    states, actions, goals = (part[counts] for part in _moves(demonstrations))
-    features, every = _features(grid, states, goals), np.arange(grid.connectivity)
-    nowhere = csr_array((len(every), _DIRECTION + (1 + _COMPASS) * grid.size))
-    regression = LogisticRegression(C=freedom, max_iter=_ITERATIONS)
-    with warnings.catch_warnings(record=True, category=ConvergenceWarning) as complaints:
+    states, actions, goals = (part[used] for part in _moves(demonstrations))
+    features, all_actions = _features(grid, states, goals), np.arange(grid.connectivity)
+    no_features = csr_array((len(all_actions), _DIRECTION + (1 + _COMPASS) * grid.size))
+    regression = LogisticRegression(C=variance, max_iter=max_iterations)
+    with warnings.catch_warnings(record=True, category=ConvergenceWarning) as not_converged:
         warnings.simplefilter("always", ConvergenceWarning)
-        regression.fit(vstack([features, nowhere], format="csr"), np.append(actions, every))
-    return Cloned(grid, regression.coef_, np.asarray(regression.intercept_), converged=not complaints)
+        regression.fit(vstack([features, no_features], format="csr"), np.append(actions, all_actions))
+    return ClonedPolicy(grid, regression.coef_, np.asarray(regression.intercept_), converged=not not_converged)
 
 
 def _moves(demonstrations: Demonstrations) -> tuple[Int[np.ndarray, " moves"], ...]:
-    """The state, the action and the goal of every move."""
+    """Return the state, the action and the goal of every move."""
     goals = np.asarray(demonstrations.tasks.terminal).argmax(axis=-1)[np.asarray(demonstrations.task)]
     return np.asarray(demonstrations.states), np.asarray(demonstrations.actions), goals
 
 
 def _features(grid: Grid, states: Int[np.ndarray, " visits"], goals: Int[np.ndarray, " visits"]) -> csr_array:
-    """φ of the visits, one a row."""
+    """Return φ(s, g) of each visit, one in a row."""
     columns = grid.shape[1]
-    way = np.stack(np.divmod(goals, columns), axis=-1) - np.stack(np.divmod(states, columns), axis=-1)
-    distance = np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1)
-    down, right = np.sign(way).T
+    offset = np.stack(np.divmod(goals, columns), axis=-1) - np.stack(np.divmod(states, columns), axis=-1)
+    distance = np.maximum(np.linalg.norm(offset, axis=-1, keepdims=True), 1)
+    down, right = np.sign(offset).T
     compass = 3 * (down + 1) + right + 1
-    sector = 3 * compass + np.sign(np.abs(way[:, 0]) - np.abs(way[:, 1])) + 1
+    sector = 3 * compass + np.sign(np.abs(offset[:, 0]) - np.abs(offset[:, 1])) + 1
     parts = [
-        csr_array(np.concatenate([way / distance, 1 / distance], axis=-1)),
+        csr_array(np.concatenate([offset / distance, 1 / distance], axis=-1)),
         _one_hot(sector, _SECTORS),
         _one_hot(states, grid.size),
         _one_hot(_COMPASS * states + compass, _COMPASS * grid.size),
@@ -128,6 +139,6 @@ def _features(grid: Grid, states: Int[np.ndarray, " visits"], goals: Int[np.ndar
     return csr_array(hstack(parts))
 
 
-def _one_hot(which: Int[np.ndarray, " visits"], kinds: int) -> csr_array:
-    visits = np.arange(len(which))
-    return csr_array((np.ones(len(which)), (visits, which)), shape=(len(which), kinds))
+def _one_hot(index: Int[np.ndarray, " visits"], size: int) -> csr_array:
+    visits = np.arange(len(index))
+    return csr_array((np.ones(len(index)), (visits, index)), shape=(len(index), size))

@@ -3,16 +3,12 @@
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from sidestep.baselines.behavior_cloning import behavior_cloning
-from sidestep.baselines.constraint_inference import constraint_inference
-from sidestep.baselines.interface import Method, ModelResult, model_result, transitions_only, visit_counts
-from sidestep.baselines.joint import joint_estimation
-from sidestep.baselines.maxent_irl import maxent_irl
+from sidestep.baselines import BASELINES
+from sidestep.baselines.interface import Method, ModelResult, model_result
 from sidestep.errors import ImproperTask, InputError, NotConverged
 from sidestep.evaluation import study
 from sidestep.evaluation.study import Problem, Record, run_method
@@ -27,18 +23,6 @@ from sidestep.maps.learned_map import LearnedMap
 from sidestep.maps.sensors import SensorMap
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Grid
-
-BASELINES: Mapping[str, Method] = MappingProxyType(
-    {
-        "transitions": transitions_only,
-        "visits": visit_counts,
-        "constraints": constraint_inference,
-        "costs": maxent_irl,
-        "joint": joint_estimation,
-        "cloning": behavior_cloning,
-    }
-)
-"""The baselines by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,12 +133,12 @@ def compare_methods(
     problem = Problem("map", grid, truth, demonstrations, heldout)
     if learned and learning:
         result = _result_of(learned, demonstrations)
-        own = run_method(problem, "behavior", lambda *_: result, seed=config.seed, callback=notify)
+        own = run_method(problem, "behavior", lambda *_: result, seed=config.seed, notify=notify)
         records = [replace(own, seconds=learning.seconds)]
     else:
         records = [Record(problem.name, "behavior", failure=failure)]
     for name, baseline in baselines.items():
-        records.append(run_method(problem, name, _configured(baseline, config), seed=config.seed, callback=notify))
+        records.append(run_method(problem, name, _configured(baseline, config), seed=config.seed, notify=notify))
     return Comparison(problem, config, records, learned)
 
 

@@ -1,12 +1,16 @@
-"""Greedy constraint inference: which forbidden cells best explain what people did (Scobee & Sastry 2020).
+"""Maximum likelihood constraint inference (Scobee & Sastry 2020): the forbidden cells that best explain the walks.
 
-People are taken to know a map without hidden obstacles, but for some cells that they must not enter. One cell after
-another is forbidden, each time the one that people would now visit most without ever having been seen there: that
-takes the most probability off what was not done. It ends where the log-likelihood of what was done grows by less than
-it costs to name one of the cells that could be forbidden, the logarithm of their number.
+Agents know a map without hidden obstacles, but must not enter some cells. The algorithm is greedy: it forbids one cell
+after another, each time the unvisited cell that agents would visit most. That removes the most probability from paths
+that were not observed. It differs from the published algorithm in three ways:
+1. agents choose actions with probabilities ∝ exp βQ by the configuration, instead of maximum entropy over paths;
+2. the expected visits N are exact, from (I − P_π)ᵀ N = starts, instead of a forward recursion over time;
+3. it stops when the log-likelihood grows by less than the cost of naming a cell, the logarithm of the number of
+   candidates, instead of at a threshold of the divergence.
 
-Here people behave as they do everywhere in `sidestep`, at random with probabilities ∝ exp βQ. How often they would
-visit each cell, N, solves (I − P_π)ᵀ N = starts.
+References:
+    D. R. R. Scobee and S. S. Sastry (2020). Maximum likelihood constraint inference for inverse reinforcement
+    learning. International Conference on Learning Representations.
 """
 
 from dataclasses import replace
@@ -15,60 +19,59 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.sparse import coo_array, eye_array
-from scipy.sparse.linalg import spsolve
 
 from sidestep.baselines.interface import ModelResult, model_result
 from sidestep.maps.config import MapConfig
 from sidestep.maps.fit import behavior_of
+from sidestep.tabular.backups import Behavior
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, true_model
 from sidestep.tabular.planning import Plan, plan
 
-_SURE = 6.0
-"""The logit of the first cell that was forbidden."""
+_MAX_LOGIT = 6.0
+"""The logit of the first forbidden cell."""
 
 
-class _People(NamedTuple):
-    """What people would do on a map: how often they would visit each cell, and how probable what they did is."""
+class _Prediction(NamedTuple):
+    """The expected visits of each cell, and the log-likelihood of the observed actions."""
 
     visits: Float[np.ndarray, " cells"]
     log_likelihood: float
 
 
 def constraint_inference(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
-    """Cells forbidden one after another; the earlier, the surer."""
-    seen = np.zeros(grid.size, dtype=bool)
-    seen[np.concatenate(demonstrations.paths())] = True
-    possible = ~seen & (grid.known.ravel() == Cell.UNKNOWN)
-    forbidden: list[int] = []
-    found = _people(grid, forbidden, demonstrations, config)
-    while (possible.sum() - len(forbidden)) > 0:
-        visits = np.where(possible, found.visits, -np.inf)
+    """Forbid cells one after another; P(blocked) is higher for cells that were forbidden earlier."""
+    visited = np.zeros(grid.size, dtype=bool)
+    visited[np.concatenate(demonstrations.paths())] = True
+    candidates = ~visited & (grid.known.ravel() == Cell.UNKNOWN)
+    behavior, forbidden = behavior_of(config.behavior), []
+    current = _predict(grid, forbidden, demonstrations, behavior)
+    while len(forbidden) < candidates.sum():
+        visits = np.where(candidates, current.visits, -np.inf)
         visits[forbidden] = -np.inf
-        after = _people(grid, [*forbidden, int(visits.argmax())], demonstrations, config)
-        if after.log_likelihood - found.log_likelihood < np.log(possible.sum()):
+        cell = int(visits.argmax())
+        new = _predict(grid, [*forbidden, cell], demonstrations, behavior)
+        if new.log_likelihood - current.log_likelihood < np.log(candidates.sum()):
             break
-        forbidden.append(int(visits.argmax()))
-        found = after
-    logits = _logits(possible, forbidden, found.visits)
-    model = ObstacleGrid(grid, logits)
+        forbidden.append(cell)
+        current = new
+    model = ObstacleGrid(grid, _logits(candidates, forbidden, current.visits))
     return model_result(model, demonstrations, config)
 
 
 def _logits(
-    possible: Bool[np.ndarray, " cells"], forbidden: list[int], visits: Float[np.ndarray, " cells"]
+    candidates: Bool[np.ndarray, " cells"], forbidden: list[int], visits: Float[np.ndarray, " cells"]
 ) -> Float[np.ndarray, " cells"]:
-    """Above 0 where it is forbidden; below where it is not, the more people would go there the nearer to it."""
-    logits = np.full(len(visits), -_SURE)
-    share = visits / max(visits[possible].max(initial=0.0), 1e-300)
-    logits[possible] = -_SURE + (_SURE - 2) * np.clip(share[possible], 0, 1)
-    logits[forbidden] = np.linspace(_SURE, 2, len(forbidden))
+    """Return logits above 0 for forbidden cells, and below for others; expected visits bring these nearer to 0."""
+    logits = np.full(len(visits), -_MAX_LOGIT)
+    relative = visits / max(visits[candidates].max(initial=0.0), 1e-300)
+    logits[candidates] = -_MAX_LOGIT + (_MAX_LOGIT - 2) * np.clip(relative[candidates], 0, 1)
+    logits[forbidden] = np.linspace(_MAX_LOGIT, 2, len(forbidden))
     return logits
 
 
-def _people(grid: Grid, forbidden: list[int], demonstrations: Demonstrations, config: MapConfig) -> _People:
+def _predict(grid: Grid, forbidden: list[int], demonstrations: Demonstrations, behavior: Behavior) -> _Prediction:
     known = grid.passable().known
     known.flat[forbidden] = Cell.OCCUPIED
     model = true_model(replace(grid, known=known))
@@ -76,23 +79,25 @@ def _people(grid: Grid, forbidden: list[int], demonstrations: Demonstrations, co
     states, actions, task = (np.asarray(getattr(demonstrations, name)) for name in ("states", "actions", "task"))
     first = demonstrations.first_moves()
     for index in range(len(demonstrations.tasks.terminal)):
-        made = plan(
-            model,
-            jax.tree.map(lambda leaf, index=index: leaf[index], demonstrations.tasks),
-            behavior_of(config.behavior),
-        )
+        own_task = jax.tree.map(lambda leaf, index=index: leaf[index], demonstrations.tasks)
+        agents = plan(model, own_task, behavior)
         own = task == index
-        total += float(np.log(np.asarray(made.policy)[states[own], actions[own]]).sum())
+        total += float(np.log(np.asarray(agents.policy)[states[own], actions[own]]).sum())
         starts = np.bincount(states[first[task[first] == index]], minlength=grid.size).astype(np.float64)
-        visits += _visits(model, made, starts)
-    return _People(visits, total)
+        visits += _expected_visits(model, agents, starts)
+    return _Prediction(visits, total)
 
 
-def _visits(model: ObstacleGrid, made: Plan, starts: Float[np.ndarray, " cells"]) -> Float[np.ndarray, " cells"]:
-    """How often people who follow a plan would visit each cell."""
-    going = ~np.asarray(made.terminal)
-    chances = (np.asarray(made.policy)[..., None] * np.asarray(model.probabilities()))[going]
-    origin = np.broadcast_to(np.flatnonzero(going)[:, None, None], chances.shape)
-    target = np.asarray(model.graph.successors)[going]
-    moves = coo_array((chances.ravel(), (target.ravel(), origin.ravel())), shape=(len(going),) * 2)
-    return np.asarray(spsolve((eye_array(len(going)) - moves).tocsc(), starts))
+def _expected_visits(
+    model: ObstacleGrid, agents: Plan, starts: Float[np.ndarray, " cells"]
+) -> Float[np.ndarray, " cells"]:
+    """Return the expected visits of each cell when agents follow a plan."""
+    from scipy.sparse import coo_array, eye_array
+    from scipy.sparse.linalg import spsolve
+
+    active = ~np.asarray(agents.terminal)
+    probabilities = (np.asarray(agents.policy)[..., None] * np.asarray(model.probabilities()))[active]
+    origin = np.broadcast_to(np.flatnonzero(active)[:, None, None], probabilities.shape)
+    target = np.asarray(model.graph.successors)[active]
+    moves = coo_array((probabilities.ravel(), (target.ravel(), origin.ravel())), shape=(len(active),) * 2)
+    return np.asarray(spsolve((eye_array(len(active)) - moves).tocsc(), starts))

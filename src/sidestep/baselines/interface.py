@@ -1,20 +1,15 @@
-"""What every method makes of walks: what a robot does, how people are taken to act, and a ranking of cells.
-
-A method is a function of a map, demonstrations on it and settings (`Method`). Behavior-aware modeling is one of them;
-so are the simplest things that one could do instead: the transitions alone, and counting visits.
-"""
+"""The interface of methods: a function of a map, demonstrations and a configuration, and its result."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from sidestep.evaluation.metrics import visit_ranking
+from sidestep.evaluation.study import MethodResult
 from sidestep.maps.config import MapConfig
-from sidestep.maps.fit import behavior_of, fit_map
+from sidestep.maps.fit import behavior_of
 from sidestep.robots.planners import Planner
 from sidestep.robots.robot import risk_averse_robot
 from sidestep.tabular.backups import Behavior
@@ -25,49 +20,31 @@ from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.reward import Reward
 from sidestep.tabular.tasks import stack_tasks
 
-_SELDOM = 0.98
-"""P(blocked) of a cell that nobody visited, to who only counts visits."""
-
 
 @runtime_checkable
-class BaselineResult(Protocol):
-    """What a method has learned from walks, as far as it is scored."""
+class BaselineResult(MethodResult, Protocol):
+    """The result of a method: what a study evaluates, and a picture."""
 
     @property
-    def planner(self) -> Planner:
-        """What a robot does with it."""
+    def heatmap(self) -> Float[np.ndarray, "rows columns"] | None:
+        """The ranking of cells from 0 to 1: P(blocked), if the method has it; None without a ranking."""
         ...
 
-    @property
-    def ranking(self) -> Float[np.ndarray, "rows columns"] | None:
-        """Of cells, higher for those that are more surely obstacles; None where nothing is learned of cells."""
-        ...
 
-    @property
-    def shares(self) -> Float[np.ndarray, "rows columns"] | None:
-        """The same from 0 to 1, to be drawn: P(blocked), where there is such a thing."""
-        ...
-
-    @property
-    def converged(self) -> bool:
-        """Whether the search for it ended where it was meant to; so it does where nothing is searched for."""
-        ...
-
-    def log_policies(self, demonstrations: Demonstrations) -> Float[np.ndarray, " moves"]:
-        """How probable every action of some demonstrations is taken to be, in nats.
-
-        All are NaN if the values of a task are not found.
-        """
-        ...
+Method = Callable[[Grid, Demonstrations, MapConfig], BaselineResult]
+"""A method: it learns from demonstrations on a map."""
 
 
 class ModelResult(NamedTuple):
-    """What is learned by a method that has a model.
+    """The result of a method that learns a transition model, a reward, or both.
 
-    - `model`: what is known of the world. `reward`: what people pursue in it. `behavior`: how they act on it.
-    - `ranking`: of cells, higher for those that are more surely obstacles; P(blocked) where there is such a thing.
-    - `planner`: what a robot does that knows all this.
-    - `converged`: as in `BaselineResult`.
+    Attributes:
+        model: The transition model.
+        reward: The reward that agents pursue.
+        behavior: How agents choose their actions.
+        ranking: P(blocked) of each cell, or other numbers that are higher for obstacles.
+        planner: The robot's planner.
+        converged: Whether the method's optimization converged.
     """
 
     model: ObstacleGrid
@@ -78,27 +55,19 @@ class ModelResult(NamedTuple):
     converged: bool
 
     @property
-    def shares(self) -> Float[np.ndarray, "rows columns"]:
-        """P(blocked), or for those who know of none the ranking from 0 to 1."""
+    def heatmap(self) -> Float[np.ndarray, "rows columns"]:
+        """P(blocked), or the ranking from 0 to 1 if P(blocked) is constant or the ranking is no probability."""
         blocked = np.asarray(self.model.blocked, dtype=np.float64)
         if np.ptp(self.ranking) and (self.ranking.max() > 1 or not np.ptp(blocked)):
             return (self.ranking - self.ranking.min()) / np.ptp(self.ranking)
         return blocked
 
     def log_policies(self, demonstrations: Demonstrations) -> Float[np.ndarray, " moves"]:
-        """Of people who know the model and pursue the reward."""
+        """Return log π(a | s) of every move for agents that know the model and pursue the reward."""
         goals = np.asarray(demonstrations.tasks.terminal).argmax(axis=-1)
         tasks = stack_tasks([self.reward.reach(self.model.blank, int(goal)) for goal in goals])
-        pursued = eqx.tree_at(lambda demos: demos.tasks, demonstrations, tasks)
-        return np.asarray(log_policies(self.model, pursued, self.behavior))
-
-
-Method = Callable[[Grid, Demonstrations, MapConfig], BaselineResult]
-
-
-def reward_of(config: MapConfig) -> Reward:
-    """What people are taken to pursue."""
-    return config.reward
+        moves = eqx.tree_at(lambda moves: moves.tasks, demonstrations, tasks)
+        return np.asarray(log_policies(self.model, moves, self.behavior))
 
 
 def model_result(
@@ -107,27 +76,14 @@ def model_result(
     config: MapConfig,
     ranking: Float[np.ndarray, "rows columns"] | None = None,
 ) -> ModelResult:
-    """A map as what was learned: robots know it and where people walked. Without a ranking, cells have P(blocked)."""
+    """Return a learned map as a result, with a risk-averse robot that knows the visited cells.
+
+    Args:
+        model: The learned map.
+        demonstrations: What it was learned from.
+        config: The configuration, with the reward and the behavior of agents.
+        ranking: The ranking of cells; by default P(blocked).
+    """
     ranking = np.asarray(model.blocked, dtype=np.float64) if ranking is None else ranking
     planner = risk_averse_robot(model, np.concatenate(demonstrations.paths()))
-    return ModelResult(model, reward_of(config), behavior_of(config.behavior), ranking, planner, converged=True)
-
-
-def behavior_aware(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
-    """Behavior-aware modeling, as `sidestep learn` has it."""
-    found = fit_map(ObstacleGrid(grid, config.prior.mean), demonstrations, config)
-    learned = model_result(found.model, demonstrations, config)
-    return learned._replace(behavior=found.people.behavior_of(), converged=found.converged)
-
-
-def transitions_only(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
-    """What transitions and first cells alone make most probable, whatever people wanted."""
-    return behavior_aware(grid, demonstrations, replace(config, fit=replace(config.fit, terms="transitions")))
-
-
-def visit_counts(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
-    """Counting: a cell visited n times is blocked with probability 1/(n + 1), one that was never visited with .98."""
-    ranking = visit_ranking(np.concatenate(demonstrations.paths()), grid)
-    blocked = np.clip(1 / (1 - ranking), None, _SELDOM).ravel()
-    model = ObstacleGrid(grid, np.log(blocked) - np.log1p(-blocked))
-    return model_result(model, demonstrations, config, ranking)
+    return ModelResult(model, config.reward, behavior_of(config.behavior), ranking, planner, converged=True)

@@ -1,9 +1,16 @@
-"""Maximum-causal-entropy inverse reinforcement learning: a cost of every cell, on dynamics of free space.
+"""Maximum causal entropy inverse reinforcement learning (Ziebart et al. 2010): a cost of each cell.
 
-The paper's section "Motivation": people's detours are explained by what places cost, not by what happens there. Every
-cell has a cost ln(1 + exp k), paid by a move that aims at it, beside what people pursue anyway; no move is taken to
-fail. The costs maximise the likelihood of what people did, and are the same for all goals (see `tabular.people`).
-Maximum causal entropy is the log-sum-exp, whatever the settings say of how people value states; their β counts.
+This is the method that the paper's section "Motivation" argues against: costs of cells explain detours, and no
+transition model does. Agents choose actions by maximum causal entropy, π(a | s) ∝ exp βQ(s, a) with the log-sum-exp
+backup, whatever the configuration says of backups. It differs from the published algorithm in four ways:
+1. the reward that agents pursue anyway is known, and the costs add to it;
+2. there is one cost for each cell, ln(1 + exp k) ≥ 0, paid by moves that aim at the cell, instead of linear features;
+3. the costs are the same for all goals and have a prior (`sidestep.tabular.behavior_model`);
+4. the likelihood of actions is maximized by L-BFGS with the exact gradient.
+
+References:
+    B. D. Ziebart, J. A. Bagnell and A. K. Dey (2010). Modeling interaction via the principle of maximum causal
+    entropy. International Conference on Machine Learning.
 """
 
 from dataclasses import dataclass
@@ -29,39 +36,43 @@ from sidestep.tabular.reward import Reward
 from sidestep.tabular.tasks import Task, with_state_costs
 
 _ITERATIONS = 5000
-_FLAT = 1e-3
-"""The largest slope where costs count as found (nats per unit of k); on some maps no step gains anything at 3e-4."""
+_TOLERANCE = 1e-3
+"""The largest gradient at convergence in nats per unit of k; on some maps no step gains anything below 3e-4."""
 
 
 @dataclass(frozen=True, eq=False)
 class CostlyReward(Reward):
-    """What people pursue when cells cost something; `costs` are of every cell, in units of reward."""
+    """A reward with a cost of each cell.
+
+    Attributes:
+        costs: The cost of a move that aims at each cell, in units of reward; None for no costs.
+    """
 
     costs: Float[np.ndarray, " cells"] | None = None
 
     def reach(self, world: Grid | Graph, goal: int | tuple[float, float]) -> Task:
-        """The task of reaching a state, less what the cells cost that moves aim at."""
+        """Return the task of reaching a goal, with the costs of cells."""
         task = super().reach(world, goal)
-        if self.costs is None or isinstance(world, Graph):
+        if self.costs is None:
             return task
-        return with_state_costs(task, jnp.asarray(self.costs), grid_graph(world).successors[..., 0])
+        graph = world if isinstance(world, Graph) else grid_graph(world)
+        return with_state_costs(task, jnp.asarray(self.costs), graph.successors[..., 0])
 
 
 def maxent_irl(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
-    """A cost for every cell; the ranking is by costs. Robots pursue what people do, costs with it."""
-    model, walkers = true_model(grid.passable()), who_pay(grid, config)
-    optimizer = LBFGS(iterations=_ITERATIONS, tolerance=_FLAT)
-    found = fit(model, demonstrations, walkers, terms=("actions",), optimizer=optimizer)
-    if not found.converged:
-        raise NotConverged(f"the costs of cells were not found: {found.message}")
-    costs = np.asarray(found.people.costs)
+    """Learn a cost of each cell, by which cells are ranked; robots plan by the agents' reward and these costs."""
+    model, agents = true_model(grid.passable()), cost_behavior_model(grid, config)
+    optimizer = LBFGS(iterations=_ITERATIONS, tolerance=_TOLERANCE)
+    result = fit(model, demonstrations, agents, terms=("actions",), optimizer=optimizer)
+    if not result.converged:
+        raise NotConverged(f"the costs of cells did not converge: {result.message}")
+    costs = np.asarray(result.people.costs)
     reward = CostlyReward(config.reward.discount, config.reward.step_cost, costs)
     planner = ModelPlanner(model, partial(reward.reach, model.blank))
-    return ModelResult(model, reward, found.people.behavior_of(), costs.reshape(grid.shape), planner, found.converged)
+    return ModelResult(model, reward, result.people.behavior_of(), costs.reshape(grid.shape), planner, True)
 
 
-def who_pay(grid: Grid, config: MapConfig) -> BehaviorModel:
-    """People of maximum causal entropy whom it costs something to aim at cells."""
-    return behavior_model(
-        Behavior(LogSumExp(), config.behavior.beta), aimed_at=np.asarray(grid_graph(grid).successors[..., 0])
-    )
+def cost_behavior_model(grid: Grid, config: MapConfig) -> BehaviorModel:
+    """Return the behavior of maximum causal entropy with a cost of each cell, which is to be learned."""
+    behavior = Behavior(LogSumExp(), config.behavior.beta)
+    return behavior_model(behavior, aimed_at=np.asarray(grid_graph(grid).successors[..., 0]))

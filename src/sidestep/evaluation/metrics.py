@@ -46,7 +46,7 @@ class PathScores:
     """Scores of planned paths; None where a mean has no paths.
 
     Attributes:
-        legal_fraction: The fraction of paths that arrive by legal moves, of those whose goal can be reached.
+        legal_fraction: The fraction of paths that arrive by legal moves, of those with a reachable goal.
         excess_length: The mean length of legal paths less that of the shortest path, in cell sides.
     """
 

@@ -101,7 +101,7 @@ def run_study(
     *,
     seed: int = 0,
     paths: bool = True,
-    callback: Callable[[str], None] = lambda _: None,
+    notify: Callable[[str], None] = lambda _: None,
 ) -> list[Record]:
     """Learn from every problem by every method, and evaluate the results.
 
@@ -112,16 +112,16 @@ def run_study(
         methods: The methods by name.
         seed: The seed of `evaluate`.
         paths: Whether to evaluate planned paths; otherwise cells only, which takes much less time.
-        callback: Called with a line of text before each method learns and before it is evaluated.
+        notify: Called with a line of text before each method learns and before it is evaluated.
 
     Returns:
         A record for each problem and method, problem by problem.
 
     Raises:
-        InputError: For problems whose parts do not fit each other.
+        InputError: For problems with parts that do not fit each other.
     """
     return [
-        run_method(problem, name, learn, seed=seed, paths=paths, callback=callback)
+        run_method(problem, name, learn, seed=seed, paths=paths, notify=notify)
         for problem in problems
         for name, learn in methods.items()
     ]
@@ -134,16 +134,16 @@ def run_method(
     *,
     seed: int = 0,
     paths: bool = True,
-    callback: Callable[[str], None] = lambda _: None,
+    notify: Callable[[str], None] = lambda _: None,
 ) -> Record:
     """Learn from one problem by one method, and evaluate the result; `run_study` describes the arguments."""
     label, visited = f"{problem.name}: {name}", problem.demonstrations.visited_state_goals()
     try:
-        callback(f"{label} learns")
+        notify(f"{label} learns")
         started = time.monotonic()
         result = learn(problem.grid, problem.demonstrations)
         seconds = round(time.monotonic() - started, 3)
-        callback(f"{label} is evaluated")
+        notify(f"{label} is evaluated")
         scored = problem.grid.known == Cell.UNKNOWN
         planner = result.planner if paths else None
         scores = evaluate(planner, result.ranking, problem.truth, scored, visited, seed, goals=problem.goals)

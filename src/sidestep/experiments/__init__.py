@@ -1,1 +1,1 @@
-"""Experiments that run by name: the paper's figures, and a first look at what the library does."""
+"""Experiments by name: the paper's figures, and demonstrations of the library."""

@@ -1,17 +1,18 @@
-"""The paper's experiments: figures 1–4 and the numbers behind them.
+"""The paper's experiments: figures 1 to 4 and the numbers behind them.
 
-Walkers cross small grids optimally, ties broken at random, ten times for every pair of start and goal; then the map is
-forgotten and learned from their walks, in four ways:
+Agents walk optimally on small grids, ties broken at random, ten times between every start and every goal. The map is
+then learned from their walks alone by four variants:
 
-- `bam`: actions and transitions, fixed-policy gradient by first-order ascent, as in the paper (figure 2),
-- `bam_exact`: the same with the exact gradient by L-BFGS,
-- `actions_only`: without the transitions' term (figure 3),
-- `transitions_only`: ordinary maximum likelihood (figure 4).
+- `bam`: actions and transitions, fixed-policy gradient, Adam, as in the paper (figure 2),
+- `bam_exact`: the same with the exact gradient and L-BFGS,
+- `actions_only`: without the likelihood of transitions (figure 3),
+- `transitions_only`: maximum likelihood of transitions (figure 4).
 
-The paper's own two maps survive only as pictures that we do not have; see `sidestep.worlds.grids` for those used here.
+Two maps of the paper exist only as pictures that we do not have; `sidestep.worlds.grids` has the maps used here.
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,14 +36,9 @@ from sidestep.tabular.simulation import simulate
 from sidestep.tabular.solve import SolveOptions
 from sidestep.worlds.grids import WORLDS, World
 
-WALKS_PER_PAIR = 10
-BETA = 10.0
-REWARD = Reward(discount=0.95)
-PRIOR_MEAN, PRIOR_VARIANCE = -2.0, 4.0 / 2  # the paper's penalty is (θ − b)²/a, so a = 4 is twice the variance
-
 
 class Variant(NamedTuple):
-    """One way of learning: which terms of the likelihood, which gradient, which optimiser."""
+    """A variant of learning: the terms of the likelihood, the gradient, and the optimizer."""
 
     title: str
     terms: tuple[Term, ...]
@@ -63,90 +59,96 @@ FIGURES = {
 }
 
 
-def reproduce(folder: Path, seed: int = 0, report: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Runs the experiments, writes `figure1.png` to `figure4.png` and `summary.json` to a folder, returns the summary.
+@dataclass(frozen=True)
+class ReproduceConfig:
+    """The setting of the experiments; the defaults are the paper's.
 
-    `seed` draws the walkers' choices among optimal actions. `report` is told what is being done.
+    Attributes:
+        worlds: The maps, names in `sidestep.worlds.grids.WORLDS`.
+        walks_per_pair: The number of walks for each pair of a start and a goal.
+        beta: The inverse temperature β that learning assumes.
+        reward: The reward of agents, of learning, and of planned paths.
+        prior_mean: The mean b of each logit.
+        prior_variance: The variance of each logit. The paper's penalty is (θ − b)²/a, so a = 4 is twice the variance.
     """
-    worlds = [make() for make in WORLDS.values()]
+
+    worlds: tuple[str, ...] = tuple(WORLDS)
+    walks_per_pair: int = 10
+    beta: float = 10.0
+    reward: Reward = field(default_factory=Reward)
+    prior_mean: float = -2.0
+    prior_variance: float = 4.0 / 2
+
+
+def reproduce(
+    folder: Path, seed: int = 0, notify: Callable[[str], None] = lambda _: None, config: ReproduceConfig | None = None
+) -> dict[str, Any]:
+    """Run the experiments; write `figure1.png` to `figure4.png` and `summary.json`.
+
+    Args:
+        folder: The folder to write to.
+        seed: Draws the agents' choices among optimal actions.
+        notify: Called with a line of text at each stage.
+        config: The setting; by default the paper's.
+
+    Returns:
+        The content of `summary.json`.
+    """
+    config = config or ReproduceConfig()
+    worlds = [WORLDS[name]() for name in config.worlds]
     save(figure_environments(worlds), folder / "figure1.png")
-    summary: dict[str, Any] = {"settings": _settings(seed), "maps": {}}
+    scores: dict[str, dict[str, Any]] = {}
     panels: dict[str, list[Panel]] = {name: [] for name in VARIANTS}
     for world in worlds:
-        demonstrations = _walks(world, seed)
-        summary["maps"][world.name] = {}
+        demonstrations = simulate_walks(world, config, seed)
+        scores[world.name] = {}
         for name, variant in VARIANTS.items():
-            report(f"{world.name}: {variant.title}")
-            found = _learn(world, demonstrations, variant)
-            summary["maps"][world.name][name] = _scores(world, demonstrations, found)
-            panels[name].append(_panel(world, variant, found))
+            notify(f"{world.name}: {variant.title}")
+            result = _learn(world, demonstrations, variant, config)
+            planner = ModelPlanner(result.model, partial(config.reward.reach, result.model.blank))
+            scores[world.name][name] = _scores(world, demonstrations, result, planner)
+            panels[name].append(_panel(world, variant, result, planner))
     for file, names in FIGURES.items():
-        save(
-            figure_learned([panel for name in names for panel in panels[name]], columns=len(worlds)),
-            folder / file,
-        )
+        drawn = [panel for name in names for panel in panels[name]]
+        save(figure_learned(drawn, columns=len(worlds)), folder / file)
+    summary = {"settings": {**asdict(config), "worlds": list(config.worlds), "seed": seed}, "maps": scores}
     write_json(folder / "summary.json", summary)
     return summary
 
 
-def _walks(world: World, seed: int) -> Demonstrations:
-    """The walkers know the map; their demonstrations' tasks do not name it."""
-    pairs = [np.array([start for start in world.starts if start != goal]) for goal in world.goals]
-    tasks = [REWARD.reach(world.truth.forget(), goal) for goal in world.goals]
-    starts = [np.repeat(own, WALKS_PER_PAIR) for own in pairs]
+def simulate_walks(world: World, config: ReproduceConfig, seed: int) -> Demonstrations:
+    """Return walks of optimal agents that know the map; the tasks of the demonstrations do not contain it."""
+    tasks = [config.reward.reach(world.truth.forget(), goal) for goal in world.goals]
+    starts = [
+        np.repeat([start for start in world.starts if start != goal], config.walks_per_pair) for goal in world.goals
+    ]
     return gather(simulate(jax.random.key(seed), true_model(world.truth), tasks, starts), tasks)
 
 
-def _learn(world: World, demonstrations: Demonstrations, variant: Variant) -> Fit[ObstacleGrid]:
+def _learn(
+    world: World, demonstrations: Demonstrations, variant: Variant, config: ReproduceConfig
+) -> Fit[ObstacleGrid]:
     return fit(
-        ObstacleGrid(world.truth.forget(), PRIOR_MEAN),
+        ObstacleGrid(world.truth.forget(), config.prior_mean),
         demonstrations,
-        Behavior(BoltzmannAverage(), BETA),
-        prior=Normal(PRIOR_MEAN, PRIOR_VARIANCE),
+        Behavior(BoltzmannAverage(), config.beta),
+        prior=Normal(config.prior_mean, config.prior_variance),
         terms=variant.terms,
         options=SolveOptions(gradient=variant.gradient),
         optimizer=variant.optimizer,
     )
 
 
-def _scores(world: World, demonstrations: Demonstrations, found: Fit[ObstacleGrid]) -> dict[str, Any]:
-    scored = np.ones(world.truth.shape, dtype=bool)
-    scores = evaluate(
-        _planner(found), np.asarray(found.model.blocked), world.truth, scored, demonstrations.visited_state_goals()
-    )
-    return {
-        **scores.to_dict(),
-        "objective": found.final.objective,
-        "converged": found.converged,
-        "message": found.message,
-    }
+def _scores(
+    world: World, demonstrations: Demonstrations, result: Fit[ObstacleGrid], planner: ModelPlanner
+) -> dict[str, Any]:
+    everywhere, visited = np.ones(world.truth.shape, dtype=bool), demonstrations.visited_state_goals()
+    evaluation = evaluate(planner, np.asarray(result.model.blocked), world.truth, everywhere, visited)
+    fitted = {"objective": result.final.objective, "converged": result.converged, "message": result.message}
+    return {**evaluation.to_dict(), **fitted}
 
 
-def _planner(found: Fit[ObstacleGrid]) -> ModelPlanner:
-    """The paper's: what people pursue, in the learned dynamics."""
-    return ModelPlanner(found.model, partial(REWARD.reach, found.model.blank))
-
-
-def _panel(world: World, variant: Variant, found: Fit[ObstacleGrid]) -> Panel:
-    paths, _ = plan_paths(_planner(found), np.array(world.starts), np.array(world.goals))
-    return Panel(
-        f"{world.name}: {variant.title}",
-        world.truth,
-        np.asarray(found.model.blocked),
-        world.truth,
-        paths,
-        world.starts,
-        world.goals,
-    )
-
-
-def _settings(seed: int) -> dict[str, Any]:
-    return {
-        "walks_per_pair": WALKS_PER_PAIR,
-        "backup": "boltzmann",
-        "beta": BETA,
-        "discount": REWARD.discount,
-        "prior_mean": PRIOR_MEAN,
-        "prior_variance": PRIOR_VARIANCE,
-        "seed": seed,
-    }
+def _panel(world: World, variant: Variant, result: Fit[ObstacleGrid], planner: ModelPlanner) -> Panel:
+    paths, _ = plan_paths(planner, np.array(world.starts), np.array(world.goals))
+    title, blocked = f"{world.name}: {variant.title}", np.asarray(result.model.blocked)
+    return Panel(title, world.truth, blocked, world.truth, paths, world.starts, world.goals)

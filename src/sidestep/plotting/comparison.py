@@ -22,8 +22,8 @@ def figure_comparison(comparison: Comparison) -> Figure:
 def _panel(name: str, result: Any, problem: Problem) -> Panel:
     """Draw what was learned of cells, or where that is nothing, the paths planned from the starts of the walks."""
     demonstrations = problem.demonstrations
-    if result.shares is not None:
-        return Panel(name, problem.grid, result.shares, problem.truth)
+    if result.heatmap is not None:
+        return Panel(name, problem.grid, result.heatmap, problem.truth)
     goals = np.asarray(demonstrations.tasks.terminal).argmax(axis=-1)
     first = demonstrations.first_moves()
     starts, tasks = np.asarray(demonstrations.states)[first], np.asarray(demonstrations.task)[first]

@@ -1,9 +1,9 @@
 """Execution in the true world: a robot bumps into obstacles that it did not know, and replans after each bump.
 
-A bump tells the robot that one cell or a few are blocked. Only the values of states whose best actions led through
-these cells change, so the values are repaired by the dynamic shortest-path algorithm of Ramalingam and Reps: (1) from
-the blocked cell outwards, collect the states whose value no action supports any longer; (2) from their border inwards,
-assign new values, the best first, as in Dijkstra's algorithm. It differs from the published algorithm in two ways:
+A bump tells the robot that one cell or a few are blocked. Only states with best actions through these cells change
+their values. They are repaired by the dynamic shortest-path algorithm of Ramalingam and Reps: (1) from the blocked cell
+outwards, collect the states with values that no action supports any longer; (2) from their border inwards, assign new
+values, the best first, as in Dijkstra's algorithm. It differs from the published algorithm in two ways:
 1. moves are stochastic: a move may fail, and the robot then tries it again;
 2. values are discounted rewards, compared within a relative tolerance.
 The order is correct because the value of an action never exceeds that of the state it leads to.

@@ -1,10 +1,9 @@
-"""Offices made at random: rooms with doors on both sides of corridors, all free cells within reach."""
+"""Random offices: rooms with doors on both sides of corridors, all free cells connected."""
 
 from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Int
-from scipy.sparse.csgraph import connected_components, dijkstra
 
 from sidestep.errors import InputError
 from sidestep.tabular.graph import walkable_graph
@@ -12,21 +11,30 @@ from sidestep.tabular.grid import Cell, Connectivity, Grid
 
 _SMALLEST = (10, 8)
 _WING = 18
-"""Rows from one outer wall to the next: rooms, a corridor, rooms."""
+"""Rows from one outer wall to the next, with rooms, a corridor and rooms between them."""
 _BETWEEN_CROSSINGS = 40
 """Columns from one crossing corridor to the next."""
 _CANDIDATES = 16
 
 
 def office(rows: int, columns: int, seed: int, connectivity: Connectivity = 4) -> Grid:
-    """A random office of `rows` × `columns` cells of one metre, fully known.
+    """Return a random office with cells of one metre, fully known.
 
-    Corridors run from left to right with rooms above and below, each with a door to the corridor and some
-    with one to the room beside it; where there are several corridors, others cross them. Equal seeds give
-    equal offices. Raises `InputError` below 10 rows or 8 columns.
+    Corridors run from left to right with rooms above and below. Each room has a door to the corridor, and some have
+    one to the next room. Several corridors are crossed by others.
 
-    >>> office(20, 30, seed=0).shape
-    (20, 30)
+    Args:
+        rows: The number of rows, at least 10.
+        columns: The number of columns, at least 8.
+        seed: The seed; equal seeds give equal offices.
+        connectivity: The number of moves, 4 or 8.
+
+    Raises:
+        InputError: For too few rows or columns.
+
+    Example:
+        >>> office(20, 30, seed=0).shape
+        (20, 30)
     """
     if rows < _SMALLEST[0] or columns < _SMALLEST[1]:
         raise InputError(
@@ -44,16 +52,25 @@ def office(rows: int, columns: int, seed: int, connectivity: Connectivity = 4) -
 
 
 def places(grid: Grid, count: int, seed: int) -> Int[np.ndarray, " count"]:
-    """`count` different free cells (states) that lie well apart and can reach one another, drawn at random.
+    """Return random free cells (states) that are connected and far from each other.
 
-    Each is the one farthest on foot from those before it, out of 16 drawn at random from the largest
-    connected part of the map. Raises `InputError` if that has fewer than `count` cells, or for a count below
-    1.
+    Each cell is the one with the longest path to the cells before it, of 16 random cells of the largest connected
+    component.
+
+    Args:
+        grid: The map.
+        count: The number of cells, at least 1.
+        seed: The seed.
+
+    Raises:
+        InputError: For a count below 1 or above the size of the component.
     """
+    from scipy.sparse.csgraph import dijkstra
+
     graph = walkable_graph(grid)
     candidates = connected_cells(grid)
     if not 1 <= count <= len(candidates):
-        raise InputError(f"expected 1…{len(candidates)} (the free cells within reach), found {count}", field="count")
+        raise InputError(f"expected 1…{len(candidates)} (connected free cells), found {count}", field="count")
     random = np.random.default_rng(seed)
     chosen = [int(random.choice(candidates))]
     distance = dijkstra(graph, indices=chosen[0])
@@ -66,19 +83,21 @@ def places(grid: Grid, count: int, seed: int) -> Int[np.ndarray, " count"]:
 
 
 def connected_cells(grid: Grid) -> Int[np.ndarray, " cells"]:
-    """The free cells (states) of the largest part of a map in which every cell can be reached from every other."""
+    """Return the free cells (states) of the largest connected component of a map."""
+    from scipy.sparse.csgraph import connected_components
+
     label = connected_components(walkable_graph(grid), directed=False)[1]
     free = grid.known.reshape(-1) == Cell.FREE
     return np.flatnonzero(free & (label == np.argmax(np.bincount(label, weights=free))))
 
 
 def _crossings(wings: int, columns: int, random: np.random.Generator) -> list[int]:
-    """The left columns of the corridors that cross the wings; a single wing needs none."""
+    """Return the left columns of the corridors that cross the wings; a single wing has none."""
     if wings == 1:
         return []
     count = max(1, round(columns / _BETWEEN_CROSSINGS))
-    stretch = columns / count
-    drawn = stretch * (np.arange(count) + random.uniform(0.3, 0.7, size=count))
+    spacing = columns / count
+    drawn = spacing * (np.arange(count) + random.uniform(0.3, 0.7, size=count))
     # three columns from the outer walls, so that the outermost rooms have a floor
     return np.clip(drawn.astype(int), 3, columns - 5).tolist()
 
@@ -96,12 +115,12 @@ def _add_wing(cells: np.ndarray, top: int, bottom: int, crossings: list[int], ra
 def _add_rooms(
     cells: np.ndarray, rows: tuple[int, int], door_row: int, crossings: list[int], random: np.random.Generator
 ) -> None:
-    """Clear a line of rooms in `rows` (first and last), each with a door in the wall at `door_row`."""
+    """Clear a row of rooms in `rows` (first and last), each with a door in the wall at `door_row`."""
     first, last = rows
     columns = cells.shape[1]
     # a crossing corridor has a wall on either side, and the rooms end there
-    stretches = pairwise([0, *(column for left in crossings for column in (left - 1, left + 2)), columns - 1])
-    for index, (left, right) in enumerate(stretches):
+    sections = pairwise([0, *(column for left in crossings for column in (left - 1, left + 2)), columns - 1])
+    for index, (left, right) in enumerate(sections):
         if index % 2 == 1:
             continue
         walls = _room_walls(left, right, random)
@@ -114,7 +133,7 @@ def _add_rooms(
 
 
 def _room_walls(left: int, right: int, random: np.random.Generator) -> list[int]:
-    """The columns of the walls of a line of rooms, 3 to 8 columns of floor between them if there is room."""
+    """Return the columns of the walls of a row of rooms, 3 to 8 columns of floor between them if possible."""
     walls = [left]
     while right - walls[-1] > 9:
         walls.append(walls[-1] + int(random.integers(4, min(9, right - walls[-1] - 4) + 1)))
