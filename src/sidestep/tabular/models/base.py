@@ -1,7 +1,7 @@
 """Transition models: T_θ(s, a, s′) as probabilities of a graph's outcomes.
 
-A model is a graph and parameters θ; it turns θ into `probabilities[s, a, k]`. Nothing else in the library knows what
-θ means: solvers, likelihood and planner read the graph and the probabilities alone.
+A model is a graph and parameters θ; it turns θ into `probabilities[s, a, k]`. Only models know what θ means: solvers,
+likelihood and planner read the graph and the probabilities.
 """
 
 import abc
@@ -16,12 +16,17 @@ _Model = TypeVar("_Model", bound="TransitionModel")
 
 
 class TransitionModel(eqx.Module):
-    """Probabilities T_θ on a graph.
+    """Probabilities T_θ on a graph; a new family of models is a subclass with `probabilities`.
 
-    - `graph`: where each action can lead.
-    - `parameters`: θ, a pytree of floating-point arrays, all of which are learned.
+    Attributes:
+        graph: the states that each action can lead to.
+        parameters: θ, a pytree of floating-point arrays, all of which are learned.
 
-    A new family is a subclass with `probabilities`.
+    Example:
+        >>> from sidestep.tabular.grid import Grid
+        >>> from sidestep.tabular.models import ObstacleGrid
+        >>> isinstance(ObstacleGrid(Grid.unknown(2, 3)), TransitionModel)
+        True
     """
 
     graph: eqx.AbstractVar[Graph]
@@ -29,8 +34,12 @@ class TransitionModel(eqx.Module):
 
     @abc.abstractmethod
     def probabilities(self) -> Float[Array, "states actions outcomes"]:
-        """T_θ(s, a, s′) for each outcome s′ = `graph.successors[s, a, k]`; sums to one over k."""
+        """Return T_θ(s, a, s′) of each outcome s′ = `graph.successors[s, a, k]`; it sums to one over k."""
 
     def with_parameters(self: _Model, parameters: PyTree[Float[Array, "..."]]) -> _Model:
-        """The same family at another θ."""
+        """Return the same model with other parameters.
+
+        Args:
+            parameters: θ, of the same structure.
+        """
         return eqx.tree_at(lambda model: model.parameters, self, parameters)

@@ -1,15 +1,15 @@
-"""Models whose parameters are the logits of outcomes: each its own, or tied to others.
+"""Categorical models, with a logit for every outcome or logits that outcomes share.
 
 Every outcome k of action a in state s has a logit, and its probability is the softmax over the possible outcomes,
 
     T_θ(s, a, s′_k) = exp l(s, a, k) / Σ_j exp l(s, a, j).
 
 In a `TabularModel` each l is a parameter of its own. In a `TiedModel` l(s, a, k) = θ[index(s, a, k)]: outcomes with the
-same index share a parameter, so that what is seen in one place teaches everywhere. An outcome that is not learned has
-l = 0; beside it, the other one of two has probability σ(θ).
+same index share a parameter, so that observations in one place inform all others. An outcome that is not learned has
+l = 0; the other one of two then has probability σ(θ).
 
-What is shared is a matter of the index: the rule that a colour stands for, whether a machine enters a terrain, the slip
-of a whole lake, the wall between two cells, a closed link of a road network.
+The index decides what is shared: the rule that a color stands for, whether a machine enters a terrain, the slip of a
+whole lake, the wall between two cells, a closed link of a road network.
 """
 
 import jax
@@ -24,7 +24,7 @@ from sidestep.tabular.graph import Graph
 from sidestep.tabular.models.base import TransitionModel
 
 FIXED, IMPOSSIBLE = -1, -2
-"""In an index: an outcome whose logit is 0 and not learned, and one that cannot happen."""
+"""Entries of an index: an outcome with a logit of 0 that is not learned, and an impossible outcome."""
 
 
 def logit_array(logits: Float[Array | np.ndarray, "..."] | float, shape: tuple[int, ...]) -> Float[Array, "..."]:
@@ -38,10 +38,17 @@ def logit_array(logits: Float[Array | np.ndarray, "..."] | float, shape: tuple[i
 
 
 class TabularModel(TransitionModel):
-    """A categorical model with a logit of its own for every outcome of every state and action.
+    """A categorical model with a separate logit for every outcome of every state and action.
 
-    - `parameters`: logits; the probabilities are their softmax over outcomes.
-    - `possible`: outcomes that can happen at all; the others have probability 0 whatever their logit.
+    Attributes:
+        graph: the states that each action can lead to.
+        parameters: logits; the probabilities are their softmax over outcomes.
+        possible: whether each outcome can happen; the others have probability 0.
+
+    Example:
+        >>> from sidestep.tabular.graph import graph
+        >>> TabularModel(graph(np.array([[[0, 1]], [[1, 0]]])), jnp.zeros((2, 1, 2))).probabilities()[0, 0].tolist()
+        [0.5, 0.5]
     """
 
     graph: Graph
@@ -54,7 +61,7 @@ class TabularModel(TransitionModel):
         logits: Float[Array, "states actions outcomes"],
         possible: Bool[Array, "states actions outcomes"] | None = None,
     ):
-        """Raises `InputError` for shapes that differ from the graph's or an action without a possible outcome."""
+        """Raise `InputError` for shapes that differ from the graph's or an action without a possible outcome."""
         self.graph, self.parameters = graph, logits
         self.possible = to_jax(np.ones(logits.shape, dtype=bool)) if possible is None else possible
         if not logits.shape == self.possible.shape == graph.successors.shape:
@@ -63,20 +70,23 @@ class TabularModel(TransitionModel):
             raise InputError("expected a possible outcome for every state and action", field="possible")
 
     def probabilities(self) -> Float[Array, "states actions outcomes"]:
-        """The softmax of the logits over the possible outcomes."""
+        """Return the softmax of the logits over the possible outcomes."""
         return jax.nn.softmax(jnp.where(self.possible, self.parameters, -jnp.inf), axis=-1)
 
 
 class TiedModel(TransitionModel):
     """A categorical model in which outcomes share logits.
 
-    - `parameters`: θ, one logit for each index.
-    - `index`: which of them is the logit of each outcome; `FIXED` for 0, `IMPOSSIBLE` for an outcome that is none.
+    Attributes:
+        graph: the states that each action can lead to.
+        parameters: θ, one logit for each index.
+        index: the index of each outcome's logit; `FIXED` for a logit of 0, `IMPOSSIBLE` for an impossible outcome.
 
-    >>> from sidestep.tabular.graph import graph
-    >>> slippery = TiedModel(graph(np.array([[[0, 1]], [[1, 0]]])), np.array([[[FIXED, 0]], [[FIXED, 0]]]))
-    >>> slippery.probabilities()[:, 0, 1].tolist()  # both by the same logit, 0
-    [0.5, 0.5]
+    Example:
+        >>> from sidestep.tabular.graph import graph
+        >>> slippery = TiedModel(graph(np.array([[[0, 1]], [[1, 0]]])), np.array([[[FIXED, 0]], [[FIXED, 0]]]))
+        >>> slippery.probabilities()[:, 0, 1].tolist()  # both by the same logit, 0
+        [0.5, 0.5]
     """
 
     graph: Graph
@@ -89,10 +99,11 @@ class TiedModel(TransitionModel):
         index: Int[Array | np.ndarray, "states actions outcomes"],
         logits: Float[Array | np.ndarray, " logits"] | float = 0.0,
     ):
-        """A model at the given logits (one number for all, or one for each index).
+        """Make a model with logits: one number for all, or one for each index.
 
-        Raises `InputError` for an index of another shape than the graph's, below `IMPOSSIBLE` or beyond the logits, and
-        for an action without a possible outcome.
+        Raises:
+            InputError: for an index of another shape than the graph's, below `IMPOSSIBLE` or beyond the logits, and
+                for an action without a possible outcome.
         """
         if index.shape != graph.successors.shape:
             raise InputError(f"expected the graph's shape {graph.successors.shape}, found {index.shape}", field="index")
@@ -106,6 +117,6 @@ class TiedModel(TransitionModel):
         self.graph, self.parameters, self.index = graph, parameters, to_jax(index, np.int32)
 
     def probabilities(self) -> Float[Array, "states actions outcomes"]:
-        """The softmax of the shared logits over the possible outcomes."""
+        """Return the softmax of the shared logits over the possible outcomes."""
         learned = jnp.where(self.index >= 0, self.parameters[jnp.maximum(self.index, 0)], 0.0)
         return jax.nn.softmax(jnp.where(self.index == IMPOSSIBLE, -jnp.inf, learned), axis=-1)

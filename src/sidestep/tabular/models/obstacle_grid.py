@@ -1,12 +1,12 @@
 """Grids on which cells, or the borders between them, may be blocked.
 
-The **obstacle grid** has one logit θ(s) a cell, P(blocked at s) = σ(θ(s)). A move succeeds if every cell that it needs
-is free, and otherwise stays put (the paper's experiments):
+The **obstacle grid** has one logit θ(s) for each cell, P(blocked at s) = σ(θ(s)). A move succeeds if every cell that
+it needs is free, and otherwise stays (the paper's experiments):
 
     T_θ(s, a, s′) = Π_{c needed} (1 − σ(θ(c))),    T_θ(s, a, s) = 1 − T_θ(s, a, s′).
 
-In a **featured grid** the logits are a function of what is known of each cell, θ(s) = f_w(features(s)), and its weights
-w are learned. In a **walled grid** it is the border between two cells that may be closed, P(closed) = σ(θ(border)).
+In a **featured grid** the logits are a function of features of each cell, θ(s) = f_w(features(s)), and its weights w
+are learned. In a **walled grid** it is the border between two cells that may be closed, P(closed) = σ(θ(border)).
 """
 
 from collections.abc import Callable
@@ -26,13 +26,16 @@ from sidestep.tabular.models.categorical import FIXED, IMPOSSIBLE, TiedModel, lo
 
 
 class ObstacleGrid(TransitionModel):
-    """A grid whose cells may be blocked; moves into a blocked cell stay put.
+    """A grid whose cells may be blocked; moves into a blocked cell stay.
 
-    - `parameters`: one logit a cell, θ(s), P(blocked) = σ(θ(s)); those of known cells have no effect.
-    - `known`: what the map says of each cell (a `Cell` value); known cells are held at 0 or 1.
+    Attributes:
+        graph: outcomes are the cell moved into, and staying.
+        parameters: the logit θ(s) of each cell, P(blocked) = σ(θ(s)); those of known cells have no effect.
+        known: the `Cell` value of each cell on the map; known cells have P(blocked) 0 or 1.
 
-    >>> ObstacleGrid(Grid.unknown(2, 3)).blocked.shape
-    (2, 3)
+    Example:
+        >>> ObstacleGrid(Grid.unknown(2, 3)).blocked.shape
+        (2, 3)
     """
 
     graph: Graph
@@ -40,41 +43,45 @@ class ObstacleGrid(TransitionModel):
     known: Int[Array, "rows columns"]
 
     def __init__(self, grid: Grid, logits: Float[Array | np.ndarray, " cells"] | float = -2.0):
-        """A model of a grid at the given logits (one number for all, or one a cell)."""
+        """Make a model of a grid with logits: one number for all, or one for each cell."""
         self.graph = grid_graph(grid)
         self.known = to_jax(grid.known)
         self.parameters = logit_array(logits, (grid.size,))
 
     @property
     def blocked(self) -> Float[Array, "rows columns"]:
-        """P(blocked), one value a cell, row 0 at the top; exactly 0 or 1 where the map knows."""
+        """Return P(blocked) of each cell, row 0 at the top; exactly 0 or 1 for known cells."""
         return blocked_of(self.parameters, self.known)
 
     def probabilities(self) -> Float[Array, "states actions outcomes"]:
-        """(success, failure) of every move."""
+        """Return the probabilities that each move succeeds, and that it fails."""
         return chances_of_moves(self.parameters, self.known, self.graph.actions)
 
     @property
     def blank(self) -> Grid:
-        """The grid, with nothing known of its cells."""
+        """Return the grid, with nothing known of its cells."""
         rows, columns = self.known.shape
         return Grid.unknown(rows, columns, 4 if self.graph.actions == 4 else 8)
 
 
 class FeaturedGrid(TransitionModel):
-    """A grid whose cells are blocked as a function of what is known of each of them says.
+    """A grid whose cells are blocked with a probability that is a function of their features.
 
-    A floor type, a colour in an image of the site, what a sensor saw of it: what is learned of one cell so holds for
-    all that look alike.
+    Features may be a floor type, a color in an image of the site or a sensor's reading. What is learned of one cell
+    holds for all with the same features.
 
-    - `parameters`: w, the floating-point arrays of a network.
-    - `features`: what is known of each cell, cells in the order of states.
-    - `known`: as in `ObstacleGrid`.
+    Attributes:
+        graph: outcomes are the cell moved into, and staying.
+        parameters: w, the floating-point arrays of a network.
+        network: the rest of the network.
+        features: of each cell, in the order of states.
+        known: as in `ObstacleGrid`.
 
-    >>> import equinox as eqx
-    >>> network = eqx.nn.Linear(2, "scalar", key=jax.random.key(0))
-    >>> FeaturedGrid(Grid.unknown(2, 3), jnp.ones((6, 2)), network).blocked.shape
-    (2, 3)
+    Example:
+        >>> import equinox as eqx
+        >>> network = eqx.nn.Linear(2, "scalar", key=jax.random.key(0))
+        >>> FeaturedGrid(Grid.unknown(2, 3), jnp.ones((6, 2)), network).blocked.shape
+        (2, 3)
     """
 
     graph: Graph
@@ -89,10 +96,11 @@ class FeaturedGrid(TransitionModel):
         features: Float[Array | np.ndarray, "cells features"],
         network: Callable[[Float[Array, " features"]], Float[Array, ""]],
     ):
-        """A model from a network (an Equinox module) that makes one logit of the features of a cell.
+        """Make a model from a network (an Equinox module) that maps the features of a cell to its logit.
 
-        Raises `InputError` for features that are not finite or not those of every cell, and for a network without
-        parameters or with another output.
+        Raises:
+            InputError: for features that are not finite or not those of every cell, and for a network without
+                parameters or with another output.
         """
         features = to_jax(features)
         if features.shape[0] != grid.size or not np.isfinite(features).all():
@@ -107,7 +115,7 @@ class FeaturedGrid(TransitionModel):
 
     @property
     def logits(self) -> Float[Array, " cells"]:
-        """f_w of every cell."""
+        """Return f_w of every cell."""
         return jax.vmap(eqx.combine(self.parameters, self.network))(self.features)
 
     @property
@@ -116,22 +124,40 @@ class FeaturedGrid(TransitionModel):
         return blocked_of(self.logits, self.known)
 
     def probabilities(self) -> Float[Array, "states actions outcomes"]:
-        """(success, failure) of every move."""
+        """Return the probabilities that each move succeeds, and that it fails."""
         return chances_of_moves(self.logits, self.known, self.graph.actions)
 
 
 def borders(grid: Grid) -> Int[np.ndarray, "borders 2"]:
-    """The two cells on either side of every border inside a grid: first those between columns, then between rows."""
+    """Return the two cells beside every border inside a grid: borders between columns, then between rows.
+
+    Args:
+        grid: the cells.
+
+    Example:
+        >>> borders(Grid.unknown(1, 3)).tolist()
+        [[0, 1], [1, 2]]
+    """
     cells = np.arange(grid.size).reshape(grid.shape)
     sides = (cells[:, :-1], cells[:, 1:]), (cells[:-1], cells[1:])
     return np.concatenate([np.stack([one.ravel(), other.ravel()], axis=1) for one, other in sides])
 
 
 def walled_grid(grid: Grid, logits: Float[Array | np.ndarray, " borders"] | float = -2.0) -> TiedModel:
-    """A grid in which the borders between cells may be closed, P(closed) = σ(θ), in the order of `borders(grid)`.
+    """Return a model of a grid in which the borders between cells may be closed, P(closed) = σ(θ).
 
-    A border is the same from both sides. Cells that the map knows to be blocked stay so. Raises `InputError` for
-    8-connected grids: a diagonal crosses no border.
+    A border is the same from both sides. Known obstacles stay blocked.
+
+    Args:
+        grid: 4-connected.
+        logits: θ, one number for all, or one for each border in the order of `borders(grid)`.
+
+    Raises:
+        InputError: for 8-connected grids, because a diagonal crosses no border.
+
+    Example:
+        >>> walled_grid(Grid.unknown(1, 3)).parameters.shape
+        (2,)
     """
     if grid.connectivity != 4:
         raise InputError("expected 4: a diagonal crosses no border", field="connectivity")
@@ -149,7 +175,7 @@ def walled_grid(grid: Grid, logits: Float[Array | np.ndarray, " borders"] | floa
 
 @jax.jit
 def blocked_of(logits: Float[Array, " cells"], known: Int[Array, "rows columns"]) -> Float[Array, "rows columns"]:
-    """P(blocked), exactly 0 or 1 where the map knows."""
+    """Return P(blocked), exactly 0 or 1 for known cells."""
     learned = jax.nn.sigmoid(logits).reshape(known.shape)
     return jnp.where(known == Cell.UNKNOWN, learned, (known == Cell.OCCUPIED).astype(learned.dtype))
 
@@ -157,13 +183,13 @@ def blocked_of(logits: Float[Array, " cells"], known: Int[Array, "rows columns"]
 def chances_of_moves(
     logits: Float[Array, " cells"], known: Int[Array, "rows columns"], actions: int
 ) -> Float[Array, "states actions outcomes"]:
-    """(success, failure) of every move, from the logits of the cells."""
+    """Return the probabilities that each move succeeds, and that it fails, from the logits of the cells."""
     certain = jnp.where(known == Cell.OCCUPIED, jnp.inf, -jnp.inf)
     logits = jnp.where(known == Cell.UNKNOWN, logits.reshape(known.shape), certain)
     # off the map nothing is blocked
     free = jnp.pad(jax.nn.sigmoid(-logits), 1, constant_values=1)
     blocked = jnp.pad(jax.nn.sigmoid(logits), 1)
-    # without a barrier the compiler works these out anew for every move
+    # without a barrier the compiler computes these again for every move
     free, blocked = jax.lax.optimization_barrier((free, blocked))
     outcomes = [
         outcome for down, right in STEPS[:actions].tolist() for outcome in _outcomes(free, blocked, down, right)
@@ -177,7 +203,7 @@ def _outcomes(
     down: int,
     right: int,
 ) -> tuple[Float[Array, "rows columns"], Float[Array, "rows columns"]]:
-    """The probabilities that a move from each cell succeeds, and that it fails, from those of the padded map's cells.
+    """Return the probabilities that a move from each cell succeeds, and that it fails, from those of the padded map.
 
     Slices of the map rather than look-ups: their derivatives are slices too.
     """
@@ -195,6 +221,14 @@ def _outcomes(
 
 
 def true_model(grid: Grid) -> ObstacleGrid:
-    """The deterministic model of a map that is taken at its word; what it does not know counts as blocked."""
+    """Return the deterministic model of a map; unknown cells count as blocked.
+
+    Args:
+        grid: the map.
+
+    Example:
+        >>> true_model(Grid(np.array([[0, 1]]))).blocked.tolist()
+        [[0.0, 1.0]]
+    """
     known = np.where(grid.known == Cell.FREE, Cell.FREE, Cell.OCCUPIED)
     return ObstacleGrid(Grid(known, grid.resolution, grid.origin, grid.connectivity))

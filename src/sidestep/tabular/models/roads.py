@@ -1,8 +1,8 @@
-"""Road networks: states are links, an action is one of the turns out of a link, and some may be closed.
+"""Road networks: states are links, actions are the turns out of a link, and links or turns may be closed.
 
-A turn from link l onto link m succeeds unless m (or the turn itself) is closed, with P(closed) = σ(θ); who meets a
-closed one stays on l. Links differ in how many turns they have; what is not there stays put, and is as long as all
-links together, so that nobody tries it who pays by length.
+A turn from link l onto link m succeeds unless m (or the turn itself) is closed, with P(closed) = σ(θ); otherwise the
+agent stays on l. Links have different numbers of turns; a missing turn stays on the link and is as long as all links
+together, so that agents who pay by length do not take it.
 """
 
 import jax
@@ -22,14 +22,23 @@ def road_network(
     *,
     by_turn: bool = False,
 ) -> TiedModel:
-    """The model of a road network in which links may be closed, or turns.
+    """Return the model of a road network in which links or turns may be closed.
 
-    - `turns`: from which link to which, each once.
-    - `lengths`: of every link; a turn is as long as the link that it leads onto.
-    - `logits`: θ, one number for all, or one for each link (with `by_turn`, for each turn in the order of `turns`).
+    Args:
+        turns: the link before and the link after each turn, each once.
+        lengths: of every link, above 0; a turn is as long as the link that it leads onto.
+        logits: θ, one number for all, or one for each link (with `by_turn`, for each turn in the order of `turns`).
+        by_turn: whether turns may be closed rather than links.
 
-    Action k of a link is the k-th of its turns, in the order of `turns`. Raises `InputError` for turns that repeat, or
-    between links that are not there, and lengths that are not finite and above 0.
+    Returns:
+        The model; action k of a link is the k-th of its turns, in the order of `turns`.
+
+    Raises:
+        InputError: for turns that repeat or between links that do not exist, and for lengths out of range.
+
+    Example:
+        >>> road_network(np.array([[0, 1], [1, 0]]), np.ones(2)).graph.states
+        2
     """
     links = len(lengths)
     if not (np.isfinite(lengths).all() and (lengths > 0).all()):
@@ -54,5 +63,13 @@ def road_network(
 
 
 def closed(model: TiedModel) -> Float[Array, " logits"]:
-    """P(closed) of every link, turn or border: σ(θ)."""
+    """Return P(closed) of every link, turn or border: σ(θ).
+
+    Args:
+        model: made by `road_network` or `walled_grid`.
+
+    Example:
+        >>> closed(road_network(np.array([[0, 1], [1, 0]]), np.ones(2), logits=0.0)).tolist()
+        [0.5, 0.5]
+    """
     return jax.nn.sigmoid(model.parameters)

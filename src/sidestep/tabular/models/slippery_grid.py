@@ -1,14 +1,12 @@
-"""Grids on which moves slip sideways, beside cells that may be blocked.
+"""Slippery grids: moves slip sideways, and cells may be blocked.
 
-A walker in a cell of terrain t who moves one way goes that way with probability 1 − p_t and slips at a right angle with
-p_t = σ(φ_t), to either side as often. Whichever way it is, the move then succeeds or stays put as in the obstacle grid.
-With f(s, d) = Π_{c needed} (1 − σ(θ(c))), the probability that nothing is in the way in direction d, and l, r the sides
-of a,
+A move in a cell of terrain t goes ahead with probability 1 − p_t and slips at a right angle with p_t = σ(φ_t), to
+either side equally often. In each direction, the move then succeeds or stays as in the obstacle grid. With
+f(s, d) = Π_{c needed} (1 − σ(θ(c))), the probability that direction d is free, and l, r the directions beside a,
 
     T_θ(s, a, s + a) = (1 − p) f(s, a),    T_θ(s, a, s + l) = (p/2) f(s, l),    T_θ(s, a, s + r) = (p/2) f(s, r),
 
-and s itself takes the rest. The slip is one and the same wherever the terrain is, so what is seen of it in one place
-holds everywhere; and who slips against a wall learns of it.
+and s itself takes the rest. Cells of one terrain share the slip, so observations in one place inform all others.
 """
 
 import jax
@@ -24,19 +22,22 @@ from sidestep.tabular.models.base import TransitionModel
 from sidestep.tabular.models.categorical import logit_array
 from sidestep.tabular.models.obstacle_grid import blocked_of, chances_of_moves
 
-_WAYS = np.array([[STEPS.tolist().index(way) for way in ([i, j], [j, -i], [-j, i])] for i, j in STEPS.tolist()])
-"""Each direction, and the two at a right angle to it."""
+_DIRECTIONS = np.array([[STEPS.tolist().index(way) for way in ([i, j], [j, -i], [-j, i])] for i, j in STEPS.tolist()])
+"""Each direction, and the two at right angles to it."""
 
 
 class SlipperyGrid(TransitionModel):
-    """A grid whose cells may be blocked and on which moves slip sideways, as often wherever the terrain is the same.
+    """A grid whose cells may be blocked and on which moves slip sideways, by the terrain.
 
-    - `parameters`: the cells' logits θ, then the logits φ of the slips, one a terrain.
-    - `terrain`: of each cell, 0…n−1; −1 where nobody slips.
-    - `known`: as in `ObstacleGrid`.
+    Attributes:
+        graph: outcomes are going ahead, to one side, to the other side, and staying.
+        parameters: the logits θ of the cells, then the logits φ of the slips, one for each terrain.
+        terrain: of each cell, 0…n − 1; −1 where moves do not slip.
+        known: as in `ObstacleGrid`.
 
-    >>> SlipperyGrid(Grid.unknown(2, 3), slip=0.0).slip.tolist()
-    [0.5]
+    Example:
+        >>> SlipperyGrid(Grid.unknown(2, 3), slip=0.0).slip.tolist()
+        [0.5]
     """
 
     graph: Graph
@@ -51,19 +52,21 @@ class SlipperyGrid(TransitionModel):
         slip: Float[Array | np.ndarray, " terrains"] | float = -2.0,
         terrain: Int[np.ndarray, "rows columns"] | None = None,
     ):
-        """A model at the given logits of cells and of slips (one number for all, or one a cell or terrain).
+        """Make a model with logits of cells and of slips: one number for all, or one for each cell or terrain.
 
-        `terrain` is by default the same everywhere. Raises `InputError` for terrain of another shape than the grid,
-        below −1, or without a cell of some kind below the largest.
+        By default the terrain is the same everywhere.
+
+        Raises:
+            InputError: for terrain of another shape than the grid, below −1, or with a gap in its numbers.
         """
         terrain = np.zeros(grid.shape, dtype=np.int64) if terrain is None else terrain
         if terrain.shape != grid.shape:
             raise InputError(f"expected the grid's shape {grid.shape}, found {terrain.shape}", field="terrain")
         kinds = np.unique(terrain[terrain >= 0])
         if terrain.min() < -1 or len(kinds) == 0 or kinds[-1] != len(kinds) - 1:
-            raise InputError("expected the kinds 0…n−1 all to be there, and −1 where nobody slips", field="terrain")
+            raise InputError("expected all the kinds 0…n−1, and −1 where moves do not slip", field="terrain")
         entered, staying = np.split(grid_successors(grid), [1], axis=-1)
-        successors = np.concatenate([entered[:, _WAYS[: grid.connectivity], 0], staying], axis=-1)
+        successors = np.concatenate([entered[:, _DIRECTIONS[: grid.connectivity], 0], staying], axis=-1)
         self.graph = Graph(to_jax(successors, np.int32), to_jax(grid.lengths[None]))
         self.known, self.terrain = to_jax(grid.known), to_jax(terrain.ravel(), np.int32)
         cells, slips = logit_array(logits, (grid.size,)), logit_array(slip, (len(kinds),))
@@ -71,20 +74,20 @@ class SlipperyGrid(TransitionModel):
 
     @property
     def blocked(self) -> Float[Array, "rows columns"]:
-        """P(blocked), as in `ObstacleGrid`."""
+        """Return P(blocked), as in `ObstacleGrid`."""
         return blocked_of(self.parameters[: self.known.size], self.known)
 
     @property
     def slip(self) -> Float[Array, " terrains"]:
-        """P(slip) of each terrain, to either side together."""
+        """Return P(slip) of each terrain, to both sides together."""
         return jax.nn.sigmoid(self.parameters[self.known.size :])
 
     def probabilities(self) -> Float[Array, "states actions 4"]:
-        """Of going ahead, to one side, to the other, and of staying put."""
+        """Return the probabilities of going ahead, to one side, to the other, and of staying."""
         cells, slips = jnp.split(self.parameters, [self.known.size])
-        own = jnp.where(self.terrain < 0, -jnp.inf, slips[self.terrain])
-        ahead, aside = jax.nn.sigmoid(-own), jax.nn.sigmoid(own) / 2
-        shares = jnp.stack([ahead, aside, aside], axis=-1)[:, None, :, None]
-        chances = chances_of_moves(cells, self.known, self.graph.actions)
-        outcomes = shares * chances[:, _WAYS[: self.graph.actions]]
+        slip = jnp.where(self.terrain < 0, -jnp.inf, slips[self.terrain])
+        ahead, aside = jax.nn.sigmoid(-slip), jax.nn.sigmoid(slip) / 2
+        directions = jnp.stack([ahead, aside, aside], axis=-1)[:, None, :, None]
+        of_moves = chances_of_moves(cells, self.known, self.graph.actions)
+        outcomes = directions * of_moves[:, _DIRECTIONS[: self.graph.actions]]
         return jnp.concatenate([outcomes[..., 0], outcomes[..., 1].sum(axis=-1, keepdims=True)], axis=-1)
