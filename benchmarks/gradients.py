@@ -129,8 +129,8 @@ def one_backup(problem: Problem, parameters: Array, values: Array) -> Array:
     process, behavior = process_of(problem, parameters), problem.behavior
     q = process.action_values(values)
     if problem.solving.gradient == "exact":
-        return process.end(behavior.backup.value(q, behavior.beta))
-    return process.end(at_fixed_policy(behavior.backup, behavior.beta, q))
+        return process.with_terminal_rewards(behavior.backup.value(q, behavior.beta))
+    return process.with_terminal_rewards(at_fixed_policy(behavior.backup, behavior.beta, q))
 
 
 def log_likelihood(problem: Problem, parameters: Array, values: Array) -> Array:
@@ -144,7 +144,7 @@ def log_likelihood(problem: Problem, parameters: Array, values: Array) -> Array:
 
 def start_of(problem: Problem, parameters: Array) -> Array:
     """Return the values from which plain sweeps start: 0, but for the goal."""
-    return process_of(problem, parameters).end(jnp.zeros(problem.model.graph.states))
+    return process_of(problem, parameters).with_terminal_rewards(jnp.zeros(problem.model.graph.states))
 
 
 def solved(problem: Problem, parameters: Array) -> Result:

@@ -1,4 +1,4 @@
-"""Small maps, and tasks as the ordered sweeps read them: with their states numbered in an order."""
+"""Small maps, and tasks as the Gauss–Seidel sweeps read them: with their states numbered in an order."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,9 +6,8 @@ from jaxtyping import Int
 
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid, TransitionModel
-from sidestep.tabular.solvers.given import Given, positions, sizes
-from sidestep.tabular.solvers.numbering import Numbered, numbered, numbering_for
-from sidestep.tabular.solvers.ordering import order_by_distance
+from sidestep.tabular.solvers.native import HostProcess, inverse_permutation
+from sidestep.tabular.solvers.ordering import NumberedProcess, number_process, order_by_distance
 from sidestep.tabular.tasks import Task
 
 
@@ -18,18 +17,19 @@ def some_map(rows: int = 20, columns: int = 21, seed: int = 0) -> ObstacleGrid:
     return ObstacleGrid(grid, jnp.asarray(np.random.default_rng(seed).normal(-1.5, 1.5, grid.size)))
 
 
-def order_of(model: TransitionModel, wanted: Task) -> Int[np.ndarray, " states"]:
+def host_process(model: TransitionModel, task: Task) -> HostProcess:
+    """A task under a model, as NumPy arrays."""
+    arrays = (model.graph.successors, model.probabilities(), task.reward, task.terminal_reward, task.terminal)
+    return HostProcess(*map(np.asarray, arrays), discount=np.float64(task.discount))
+
+
+def order_of(model: TransitionModel, task: Task) -> Int[np.ndarray, " states"]:
     """The states by their distance from where a task ends."""
-    successors, probabilities = np.asarray(model.graph.successors), np.asarray(model.probabilities())
-    reward, terminal = np.asarray(wanted.reward), np.asarray(wanted.terminal)
-    return order_by_distance(successors, probabilities, reward, terminal, float(wanted.discount))
+    return order_by_distance(host_process(model, task))
 
 
-def numbered_world(model: TransitionModel, wanted: Task, order: Int[np.ndarray, " states"]) -> Numbered:
+def numbered_process(model: TransitionModel, task: Task, order: Int[np.ndarray, " states"]) -> NumberedProcess:
     """A task under a model as the sweeps read it, its states numbered in an order."""
-    successors, probabilities = np.asarray(model.graph.successors), np.asarray(model.probabilities())
-    task = (np.asarray(each) for each in (wanted.reward, wanted.terminal_reward, wanted.terminal))
-    given = Given(successors, probabilities, *task, discount=np.float64(wanted.discount))
-    position = positions(order)
+    position = inverse_permutation(order)
     assert position is not None
-    return numbered(numbering_for(*sizes(given)), given, order, position)
+    return number_process(host_process(model, task), order, position)[0]

@@ -4,7 +4,7 @@ from heapq import heappop, heappush
 
 import numpy as np
 
-from sidestep.tabular.solvers.compiled import compiled
+from sidestep.tabular.solvers.native import compiled
 
 
 @compiled()

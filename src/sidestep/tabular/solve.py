@@ -290,7 +290,7 @@ def _implicit(
     """
     del backup, gradient, adjoint
     solver, visited = constants[2], constants[-1]
-    return values, solver.rows(varying[0], visited)
+    return values, solver.gather_rows(varying[0], visited)
 
 
 def _implicit_forward(

@@ -1,52 +1,67 @@
-"""The adjoint in the order of distance, farthest states first, as machine code (numba).
+"""The sweeps that solve the adjoint equation λ = g + Wᵀλ by pushing residuals, as native code (numba).
 
-λ = g + Wᵀλ (see `process`) is solved by passing on what is missing: from the farthest state inwards, a state with
-residual r adds r to its λ (self-loops divided out) and r's shares to the residuals of the states it leads to. States
-that nobody who is looked at can influence are never touched. Small residuals wait, so that they add up before they are
-passed on: the threshold falls from sweep to sweep (see `inwards`).
+A *push* at a state with residual r adds r to its λ and r times the state's row of W to the residuals of its successors
+(the push operation of Andersen, Chung & Lang, *Local graph partitioning using PageRank vectors*, 2006; on the values'
+side, prioritized sweeping of Moore & Atkeson, 1993). It differs in three ways:
 
-A state's shares are worked out when it is first needed. With λ known, the gradient by everything that the values depend
+1. States come in a fixed order, the farthest first, so that what a state receives is mostly there before its push.
+2. Only residuals above a threshold are pushed, and it falls from sweep to sweep (see `adjoint`): small ones add up
+   first. States that cannot influence what is asked for are never touched.
+3. Self-loops are divided out, as for the values (see `base`).
+
+The row of a state is computed when it is first needed. With λ known, the gradient by everything that the values depend
 on is summed state by state.
 """
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from sidestep.tabular.solvers.compiled import compiled, inlined
-from sidestep.tabular.solvers.value_kernels import BOLTZMANN, HARD_MAX, MELLOWMAX, Scratch, Valuing, backed_up
+from sidestep.tabular.solvers.native import (
+    BOLTZMANN,
+    HARD_MAX,
+    MELLOWMAX,
+    NativeBackup,
+    NativeFunction,
+    compiled,
+    inlined,
+)
+from sidestep.tabular.solvers.value_kernels import Scratch, backed_up
 
 
-class Setting(NamedTuple):
-    """What the adjoint is of; the states have their own numbers.
+class AdjointProblem(NamedTuple):
+    """What the adjoint is of; states have their own numbers.
 
-    - `exact`: whether the gradient is the backup's own, or that of the policy held fixed.
-    - `values`: V; below `reached` they mean that no terminal state can be reached.
-    - `order`, `position`: which state comes when, and when a state comes.
+    Attributes:
+        backup: The backup.
+        exact: Whether the gradient is the backup's own, or that of the policy held fixed.
+        values: V.
+        reachable_above: The value below which no terminal state can be reached.
+        order: The states, nearest first; `position` is its inverse.
     """
 
-    valuing: Valuing
+    backup: NativeBackup
     exact: bool
     values: np.ndarray
-    reached: np.floating
+    reachable_above: np.floating
     order: np.ndarray
     position: np.ndarray
 
 
-class Shares(NamedTuple):
-    """How the values of states depend on those of others, and λ so far.
+class AdjointState(NamedTuple):
+    """λ so far, and the rows of W that were needed for it.
 
-    By position:
+    By position: `row`, the number of the state's row, −1 as long as it has none; `adjoint` and `residual`, λ and
+    g + Wᵀλ − λ. By row, close together in memory:
 
-    - `row`: which of the rows below is the state's; −1 as long as it has none.
-    - `adjoint`, `residual`: λ, and g + Wᵀλ − λ.
-
-    Rows, one for each state that turned out to be needed, so that they lie close together in memory:
-
-    - `weights`: w(a), the gradient of the value by the action values; `beta`: its gradient by β.
-    - `successors`, `shares`: the positions of the states that it leads to, and the entries of W for them.
-    - `leaving`, `divisor`: Σ w l, and what the state's own adjoint equation is divided by.
+    Attributes:
+        weights: w(a), the gradient of the value by the action values.
+        beta: The gradient of the value by β.
+        successors: The positions of the states that it leads to.
+        jacobian: The entries of W for them.
+        exit_weight: Σ w l.
+        divisor: What the state's own adjoint equation is divided by.
     """
 
     row: np.ndarray
@@ -55,15 +70,15 @@ class Shares(NamedTuple):
     weights: np.ndarray
     beta: np.ndarray
     successors: np.ndarray
-    shares: np.ndarray
-    leaving: np.ndarray
+    jacobian: np.ndarray
+    exit_weight: np.ndarray
     divisor: np.ndarray
 
 
-class Weighing(NamedTuple):
-    """Room for a state's action values, the weights of the gradient by them, and the policy.
+class WeightScratch(NamedTuple):
+    """Memory for a state's action values, the weights of the gradient, and the policy; a tuple, as `Scratch` is.
 
-    In a tuple, and filled by functions that return nowhere but at their end, for the reason that `Scratch` tells.
+    It is filled by functions that return only at their end, for the same reason.
     """
 
     action_values: np.ndarray
@@ -72,7 +87,7 @@ class Weighing(NamedTuple):
 
 
 class HostCotangents(NamedTuple):
-    """The gradients to write into; fields as in `Cotangents`."""
+    """The arrays that the gradient is written into; fields as in `Cotangents`."""
 
     probabilities: np.ndarray
     reward: np.ndarray
@@ -81,37 +96,37 @@ class HostCotangents(NamedTuple):
     beta: np.ndarray
 
 
-class Passing(NamedTuple):
-    """The machine code for one number of actions, of outcomes, and of outcomes that leave a state."""
+class AdjointKernels(NamedTuple):
+    """The native code for one number of actions, of outcomes, and of outcomes that leave a state."""
 
-    fill_in: Any
-    pass_on: Any
-    left_out: Any
-    vjp: Any
+    fill_rows: NativeFunction
+    push: NativeFunction
+    omission_cost: NativeFunction
+    pull_back: NativeFunction
 
 
 @inlined()
-def weigh(valuing, exact, weighing):  # pragma: no cover
-    """Fills in the weights of the gradient and the policy by action values; returns the gradient by β."""
-    kind, beta, tie, actions = valuing.kind, valuing.beta, valuing.tie, len(weighing.action_values)
-    best = weighing.action_values[0]
+def differentiate_backup(backup, exact, scratch):  # pragma: no cover
+    """Fill in the weights of the gradient and the policy by action values; return the gradient by β."""
+    kind, beta, tie, actions = backup.kind, backup.beta, backup.tie, len(scratch.action_values)
+    best = scratch.action_values[0]
     for a in range(1, actions):
-        best = max(best, weighing.action_values[a])
+        best = max(best, scratch.action_values[a])
     total = 0.0 * best
     for a in range(actions):
-        behind = weighing.action_values[a] - best
-        weighing.policy[a] = (behind >= -tie * abs(best)) * 1.0 if kind == HARD_MAX else np.exp(beta * behind)
-        total += weighing.policy[a]
+        difference = scratch.action_values[a] - best
+        scratch.policy[a] = (difference >= -tie * abs(best)) * 1.0 if kind == HARD_MAX else np.exp(beta * difference)
+        total += scratch.policy[a]
     average = 0.0 * best
     for a in range(actions):
-        weighing.policy[a] /= total
-        average += weighing.policy[a] * (weighing.action_values[a] - best)
+        scratch.policy[a] /= total
+        average += scratch.policy[a] * (scratch.action_values[a] - best)
     variance = 0.0 * best
     for a in range(actions):
-        behind, taken = weighing.action_values[a] - best - average, weighing.policy[a]
+        difference, probability = scratch.action_values[a] - best - average, scratch.policy[a]
         # in this order, because an action that is never taken may be worth all but −∞
-        variance += taken * behind * behind
-        weighing.weights[a] = taken * (1 + beta * behind) if kind == BOLTZMANN and exact else taken
+        variance += probability * difference * difference
+        scratch.weights[a] = probability * (1 + beta * difference) if kind == BOLTZMANN and exact else probability
     by_beta = 0.0 * best
     if exact and kind == BOLTZMANN:
         by_beta = variance
@@ -121,143 +136,144 @@ def weigh(valuing, exact, weighing):  # pragma: no cover
 
 
 @inlined()
-def _expected(given, values, state, a, outcomes):  # pragma: no cover
-    """The expected value after an action, summed as in `DecisionProcess.action_values`."""
+def _expected_value(process, values, state, a, outcomes):  # pragma: no cover
+    """Return the expected value after an action, summed as in `action_values`."""
     here = values[state]
     expected = here
     for k in range(outcomes):
-        after = given.successors[state, a, k]
+        after = process.successors[state, a, k]
         if after != state:
-            expected += given.probabilities[state, a, k] * (values[after] - here)
+            expected += process.probabilities[state, a, k] * (values[after] - here)
     return expected
 
 
 @inlined()
-def _action_value(given, values, state, a, outcomes):  # pragma: no cover
-    """Q(s, a)."""
-    reward = given.reward[state if given.reward.shape[0] > 1 else 0, a if given.reward.shape[1] > 1 else 0]
-    return reward + given.discount * _expected(given, values, state, a, outcomes)
+def _action_value(process, values, state, a, outcomes):  # pragma: no cover
+    """Return Q(s, a)."""
+    reward = process.reward[state if process.reward.shape[0] > 1 else 0, a if process.reward.shape[1] > 1 else 0]
+    return reward + process.discount * _expected_value(process, values, state, a, outcomes)
 
 
 @inlined()
-def _fill_in(i, row, actions, outcomes, width, given, setting, shares, weighing):  # pragma: no cover
-    """Fills in the row of the state at position i. Of a state without values to speak of, the shares are 0."""
-    state = setting.order[i]
-    passes_on = setting.values[state] > setting.reached and not given.terminal[state]
+def _fill_row(i, row, actions, outcomes, width, process, problem, work, scratch):  # pragma: no cover
+    """Fill in the row of the state at position i; zeros if it is terminal or cannot reach a terminal state."""
+    state = problem.order[i]
+    is_live = problem.values[state] > problem.reachable_above and not process.terminal[state]
     for a in range(actions):
-        worth = _action_value(given, setting.values, state, a, outcomes) if passes_on else 0.0
-        weighing.action_values[a] = worth
-    by_beta = weigh(setting.valuing, setting.exact, weighing)
-    leaving, policy_leaving = 0.0 * given.discount, 0.0 * given.discount
+        action_value = _action_value(process, problem.values, state, a, outcomes) if is_live else 0.0
+        scratch.action_values[a] = action_value
+    by_beta = differentiate_backup(problem.backup, problem.exact, scratch)
+    exit_weight, policy_exit = 0.0 * process.discount, 0.0 * process.discount
     for a in range(actions):
-        weight, left, m = weighing.weights[a] if passes_on else 0.0, 1 - given.discount, 0
-        shares.weights[row, a] = weight
+        weight, action_exit, m = scratch.weights[a] if is_live else 0.0, 1 - process.discount, 0
+        work.weights[row, a] = weight
         for k in range(outcomes):
-            after = given.successors[state, a, k]
+            after = process.successors[state, a, k]
             if after != state:
-                move = given.discount * given.probabilities[state, a, k]
-                shares.successors[row, a, m] = setting.position[after]
-                shares.shares[row, a, m] = weight * move
-                left += move
+                move = process.discount * process.probabilities[state, a, k]
+                work.successors[row, a, m] = problem.position[after]
+                work.jacobian[row, a, m] = weight * move
+                action_exit += move
                 m += 1
         for padding in range(m, width):
-            shares.successors[row, a, padding] = i
-            shares.shares[row, a, padding] = 0
-        leaving += weight * left
-        policy_leaving += weighing.policy[a] * left
-    divisor = max(leaving, policy_leaving)
-    shares.beta[row] = by_beta if passes_on else 0.0
-    shares.leaving[row] = leaving if passes_on else 1.0
-    shares.divisor[row] = divisor if passes_on and divisor > 0 else 1.0
-    shares.row[i] = row
+            work.successors[row, a, padding] = i
+            work.jacobian[row, a, padding] = 0
+        exit_weight += weight * action_exit
+        policy_exit += scratch.policy[a] * action_exit
+    divisor = max(exit_weight, policy_exit)
+    work.beta[row] = by_beta if is_live else 0.0
+    work.exit_weight[row] = exit_weight if is_live else 1.0
+    work.divisor[row] = divisor if is_live and divisor > 0 else 1.0
+    work.row[i] = row
 
 
 @cache
-def passing_for(actions: int, outcomes: int, width: int) -> Passing:
-    """The machine code for that many; as constants they make it twice as fast."""
+def kernels_for(actions: int, outcomes: int, width: int) -> AdjointKernels:
+    """Return the native code for these numbers; as constants they make it twice as fast."""
 
     @compiled()
-    def fill_in(begin, end, which, given, setting, shares):  # pragma: no cover
-        """Fills in a range of rows, for the states at the positions `which`."""
-        dtype = setting.values.dtype
-        weighing = Weighing(np.empty(actions, dtype), np.empty(actions, dtype), np.empty(actions, dtype))
+    def fill_rows(begin, end, positions, process, problem, work):  # pragma: no cover
+        """Fill in a range of rows, of the states at `positions`."""
+        dtype = problem.values.dtype
+        scratch = WeightScratch(np.empty(actions, dtype), np.empty(actions, dtype), np.empty(actions, dtype))
         for row in range(begin, end):
-            _fill_in(which[row], row, actions, outcomes, width, given, setting, shares, weighing)
+            _fill_row(positions[row], row, actions, outcomes, width, process, problem, work, scratch)
 
     @compiled()
-    def pass_on(threshold, warm, filled, given, setting, shares):  # pragma: no cover
-        """Passes on the residuals above a threshold, the farthest state first; or (`warm`) what a first λ amounts to.
+    def push(threshold, warm, filled, process, problem, work):  # pragma: no cover
+        """Push the residuals above a threshold, the farthest first; or (`warm`) the first λ.
 
-        Returns how many states had something to pass on, the sum of all residuals' sizes that were left alone, and how
-        many rows are `filled` by now.
+        Returns:
+            The number of pushes, the sum of the absolute residuals that remain, and the number of rows filled in.
         """
-        dtype = setting.values.dtype
-        weighing = Weighing(np.empty(actions, dtype), np.empty(actions, dtype), np.empty(actions, dtype))
-        at_work, left_alone = 0, 0.0 * threshold
-        for i in range(len(shares.residual) - 1, -1, -1):
-            missing = shares.adjoint[i] if warm else shares.residual[i]
+        dtype = problem.values.dtype
+        scratch = WeightScratch(np.empty(actions, dtype), np.empty(actions, dtype), np.empty(actions, dtype))
+        pushes, remaining = 0, 0.0 * threshold
+        for i in range(len(work.residual) - 1, -1, -1):
+            missing = work.adjoint[i] if warm else work.residual[i]
             if not abs(missing) > threshold:
                 if warm:
-                    shares.adjoint[i] = 0
-                left_alone += abs(missing)
+                    work.adjoint[i] = 0
+                remaining += abs(missing)
                 continue
-            at_work += 1
-            if shares.row[i] < 0:
-                _fill_in(i, filled, actions, outcomes, width, given, setting, shares, weighing)
+            pushes += 1
+            if work.row[i] < 0:
+                _fill_row(i, filled, actions, outcomes, width, process, problem, work, scratch)
                 filled += 1
-            row, amount = shares.row[i], missing
+            row, amount = work.row[i], missing
             if not warm:
-                amount = missing / shares.divisor[row]
-                shares.adjoint[i] += amount
-            shares.residual[i] -= amount * shares.leaving[row]
+                amount = missing / work.divisor[row]
+                work.adjoint[i] += amount
+            work.residual[i] -= amount * work.exit_weight[row]
             for a in range(actions):
                 for m in range(width):
-                    shares.residual[shares.successors[row, a, m]] += amount * shares.shares[row, a, m]
-        return at_work, left_alone, filled
+                    work.residual[work.successors[row, a, m]] += amount * work.jacobian[row, a, m]
+        return pushes, remaining, filled
 
     @compiled()
-    def left_out(given, setting, adjoint, region):  # pragma: no cover
-        """Σ |λ (B(Q) − V)| over the states outside the region."""
-        values = setting.values
-        advantage = np.empty(actions, values.dtype)
-        scratch = Scratch(advantage, np.ones(actions, values.dtype), advantage)
-        cost = 0.0 * given.discount
+    def omission_cost(process, problem, adjoint, region):  # pragma: no cover
+        """Return Σ |λ (B(Q) − V)| over the states outside the region."""
+        values = problem.values
+        advantages = np.empty(actions, values.dtype)
+        scratch = Scratch(advantages, np.ones(actions, values.dtype), advantages)
+        cost = 0.0 * process.discount
         for i in range(len(adjoint)):
-            state = setting.order[i]
-            if region[state] or adjoint[i] == 0 or given.terminal[state] or not values[state] > setting.reached:
+            state = problem.order[i]
+            is_live = not process.terminal[state] and values[state] > problem.reachable_above
+            if region[state] or adjoint[i] == 0 or not is_live:
                 continue
             for a in range(actions):
-                scratch.advantage[a] = _action_value(given, values, state, a, outcomes) - values[state]
-            gain, _ = backed_up(setting.valuing, scratch)
+                scratch.advantages[a] = _action_value(process, values, state, a, outcomes) - values[state]
+            gain, _ = backed_up(problem.backup, scratch)
             cost += abs(adjoint[i] * gain)
         return cost
 
     @compiled()
-    def vjp(begin, end, given, setting, found, row, weights, beta, adjoint, by):  # pragma: no cover
-        """Fills in the gradients `by` φ with λᵀ ∂F/∂φ, and λ with the states' own numbers, for a range of positions.
+    def pull_back(begin, end, process, problem, solution, row, weights, beta, adjoint, by):  # pragma: no cover
+        """Fill in λᵀ ∂F/∂φ for a range of positions, and λ with the states' own numbers.
 
-        λ is what was `found`; `row`, `weights` and `beta` are as in `Shares`. Gradients by numbers that states share
-        are added to.
+        `solution` is λ by position; `row`, `weights` and `beta` are as in `AdjointState`. Gradients by numbers that
+        several states have in common are added to.
         """
-        values = setting.values
+        values = problem.values
         for i in range(begin, end):
-            weight, own, state = found[i], row[i], setting.order[i]
+            weight, own, state = solution[i], row[i], problem.order[i]
             adjoint[state] = weight
             by.probabilities[state] = 0
             if weight == 0:
                 continue
-            if given.terminal[state]:
+            if process.terminal[state]:
                 by.terminal_reward[state if len(by.terminal_reward) > 1 else 0] += weight
                 continue
             by.beta[()] += weight * beta[own]
             for a in range(actions):
-                share = weight * weights[own, a]
-                by.reward[state if by.reward.shape[0] > 1 else 0, a if by.reward.shape[1] > 1 else 0] += share
-                by.discount[()] += share * _expected(given, values, state, a, outcomes)
+                by_action = weight * weights[own, a]
+                by.reward[state if by.reward.shape[0] > 1 else 0, a if by.reward.shape[1] > 1 else 0] += by_action
+                by.discount[()] += by_action * _expected_value(process, values, state, a, outcomes)
                 for k in range(outcomes):
-                    after = given.successors[state, a, k]
+                    after = process.successors[state, a, k]
                     if after != state:
-                        gained = values[after] - values[state]
-                        by.probabilities[state, a, k] += share * given.discount * gained
+                        difference = values[after] - values[state]
+                        by.probabilities[state, a, k] += by_action * process.discount * difference
 
-    return Passing(fill_in, pass_on, left_out, vjp)
+    return AdjointKernels(fill_rows, push, omission_cost, pull_back)

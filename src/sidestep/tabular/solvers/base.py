@@ -1,20 +1,22 @@
-"""What a solver solves: the Bellman equation and its adjoint, and how a state's own equation is solved.
+"""The equations that a solver solves: the Bellman equation, its adjoint, and each state's own equation.
 
 **Values.** With P the outcomes' probabilities and B a backup,
 
-    Q(s, a) = R(s, a) + γ Σ_k P(s, a, k) V(succ(s, a, k)),      V(s) = B(Q(s, ·)),      V(terminal) = final reward.
+    Q(s, a) = R(s, a) + γ Σ_k P(s, a, k) V(succ(s, a, k)),      V(s) = B(Q(s, ·)),      V(terminal) = terminal reward.
 
-A move that mostly fails leads mostly back to its own state, and plain sweeps then crawl. So every sweep solves each
-state's own equation with its neighbours' values held. With p(a) the probability of staying,
-c(a) = R + γ Σ_{elsewhere} P V and l(a) = 1 − γ p(a), the advantage of an action over the state's value v is A(a) =
-c(a) − l(a) v, and since every backup moves with a constant, V = B(Q) reads B(A) = 0. A Newton step on it is
+An action that mostly fails leads mostly back to its own state, and the backups of value iteration then converge slowly.
+So a sweep solves each state's own equation with its neighbors' values held. With p(a) the probability of staying,
+c(a) = R + γ Σ_{elsewhere} P V the *exit value* and l(a) = 1 − γ p(a) the *exit weight*, the advantage of an action over
+the state's value v is A(a) = c(a) − l(a) v, and since every backup moves with a constant, V = B(Q) reads B(A) = 0. A
+Newton step on it is
 
     v ← v + B(A) / Σ_a w(a) l(a),          w = the backup's weights at A.
 
-The *escape*, max_a c(a)/l(a), is the best that one action tried for ever can give. It bounds the root: from above for
-backups that never exceed the best action, from below for the log-sum-exp. Steps start and end on the root's side of it;
-otherwise a state whose value was too high would seem best off trying an action that never leaves. A state not reached
-yet starts from its escape. 1 − γp is summed as (1 − γ) + γ Σ_{elsewhere} P, so that nothing cancels in a trapped state.
+The *repeat-action value*, max_a c(a)/l(a), is the best that one action repeated for ever can give. It bounds the root:
+from above for backups that never exceed the best action, from below for the log-sum-exp. Steps start and end on the
+root's side of it; otherwise a state whose value is too high would seem best off with an action that never leaves. A
+state without a value yet starts from its repeat-action value. 1 − γp is summed as (1 − γ) + γ Σ_{elsewhere} P, so that
+nothing cancels in a trapped state.
 
 The Boltzmann average may have several fixed points. Dividing by no less than Σ π l keeps the steps short where B(A)
 grows with v, so that the sweeps end in a stable one.
@@ -22,17 +24,18 @@ grows with v, so that the sweeps end in a stable one.
 **Adjoint.** For a scalar function with gradient g with respect to V, λ solves λ = g + Wᵀλ, where
 W(s, s′) = γ Σ_a w(a) Σ_{k → s′} P(s, a, k) and w are the weights of the gradient that is asked for (exact or fixed
 policy). Self-loops are divided out as above. Both iterations have the same spectrum at the fixed point (for the exact
-gradient), so the adjoint converges where the values did.
+gradient), so the adjoint converges where the values did. This is implicit differentiation of a fixed point
+(Christianson, *Reverse accumulation and attractive fixed points*, 1994).
 
-**Region.** λ(s) is what a change of V(s) is worth. So a state s whose equation does not hold, because it has not been
-solved, costs λ(s) (B(Q(s, ·)) − V(s)) to first order: nothing where λ is 0. A solve may leave out states that did not
-matter under a model nearby; λ, which is solved over all states, tells afterwards what that has cost,
+**Region.** λ(s) is what a change of V(s) is worth. So a state s that has not been solved costs λ(s) (B(Q(s, ·)) − V(s))
+to first order: nothing where λ is 0. A solve may leave out states that did not matter under a model nearby; λ, which is
+solved over all states, shows afterwards what that has cost,
 
     Σ_{s left out} |λ(s) (B(Q(s, ·)) − V(s))|,
 
-and that has to be within the tolerance of Σ |λ(s) V(s)|. This is to first order, and for the exact gradient. A way that
-nobody took, because λ is 0 there, may have become the best one without any of it being seen: so leave states out only
-in guesses that are looked at again.
+and that has to be within the tolerance of Σ |λ(s) V(s)|. This is to first order, and for the exact gradient. A path
+that is not taken, because λ is 0 there, may have become the best one unseen: so leave states out only in trial points
+that are solved again.
 
 At discount 1 the values of states that cannot reach a terminal state are −∞; they are held at `neg_inf(dtype)`, so low
 that an action which may lead there is never taken.
@@ -54,7 +57,7 @@ Region = Bool[Array, " states"]
 
 
 class DecisionProcess(eqx.Module):
-    """A task under a model: all that a solver needs to know (fields as in `Graph`, `TransitionModel` and `Task`)."""
+    """A Markov decision process: a task under a model (fields as in `Graph`, `TransitionModel` and `Task`)."""
 
     successors: Int[Array, "states actions outcomes"]
     probabilities: Float[Array, "states actions outcomes"]
@@ -64,11 +67,11 @@ class DecisionProcess(eqx.Module):
     discount: Float[Array, ""]
 
     def action_values(self, values: Float[Array, " states"]) -> Float[Array, "states actions"]:
-        """Q(s, a) of all states; see `action_values`."""
+        """Return Q(s, a) of all states; see `action_values`."""
         return action_values(values, values[self.successors], self.probabilities, self.reward, self.discount)
 
-    def end(self, values: Float[Array, " states"]) -> Float[Array, " states"]:
-        """The values with those of terminal states put in."""
+    def with_terminal_rewards(self, values: Float[Array, " states"]) -> Float[Array, " states"]:
+        """Return the values with those of terminal states put in."""
         return jnp.where(self.terminal, self.terminal_reward, values)
 
 
@@ -79,10 +82,10 @@ def action_values(
     reward: Float[Array, "#some #actions"],
     discount: Float[Array, "*#some"],
 ) -> Float[Array, "some actions"]:
-    """Q(s, a) = R(s, a) + γ Σ T V (eq. 4) of some states, from their values and those of where they lead.
+    """Return Q(s, a) = R(s, a) + γ Σ T V (eq. 4) of some states, from their values and those of their successors.
 
     Summed as differences from V(s), so that the rounding of probabilities that are nearly 1 does not meet values that
-    are large: where moves mostly fail it would drown the gradient.
+    are large: where actions mostly fail it would exceed the gradient.
     """
     differences = values_after - values[:, None, None]
     return reward + discount * (values[:, None] + jnp.sum(probabilities * differences, axis=-1))
@@ -91,9 +94,10 @@ def action_values(
 class WarmStart(NamedTuple):
     """What a solve may start from: what an earlier one of the same task left, under a model nearby.
 
-    - `values`: V; `neg_inf(dtype)` where nothing is known.
-    - `adjoint`: λ; 0 where nothing is known. The gradient of a solution with respect to it is the new λ (see `solve`).
-    - `order`: the states by their distance from where the task ends, for solvers that use one; −1 for none yet.
+    Attributes:
+        values: V; `neg_inf(dtype)` where unknown.
+        adjoint: λ; 0 where unknown. The gradient of a solution with respect to it is the new λ (see `solve`).
+        order: The states by their distance from where the task ends, for solvers that use one; −1 for none yet.
     """
 
     values: Float[Array, "*tasks states"]
@@ -118,14 +122,18 @@ class Cotangents(NamedTuple):
 
 
 class SolveResult(NamedTuple):
-    """What a solver found, and how it went.
+    """The result of a solver, and how the solve went.
 
-    `sweeps` says how often a state was solved; on average, where states are not all solved equally often.
-    `residual` is the largest change in the last sweep relative to the value itself (or to what its actions are worth
-    without staying, where that is larger), so that small values far from a goal count as much as large ones;
-    `converged` says that it is within the tolerance. Both are of the states that had to be solved; of an adjoint,
-    `residual` may be the cost of those left out. The error is larger than the residual by up to 1/(1 − rate of
-    convergence).
+    The error is larger than the residual by up to 1/(1 − rate of convergence).
+
+    Attributes:
+        values: V, or λ.
+        order: As in `WarmStart`.
+        sweeps: The number of times that a state was solved, on average.
+        residual: The largest change in the last sweep relative to the value itself (or to what its actions are worth
+            without staying, where that is larger), so that small values far from a goal count as much as large ones.
+            Of the states that had to be solved; of an adjoint, it may be the cost of those left out.
+        converged: Whether the residual is within the tolerance.
     """
 
     values: Float[Array, " states"]
@@ -136,10 +144,11 @@ class SolveResult(NamedTuple):
 
 
 class Solver(eqx.Module):
-    """How values and adjoints are found: by sweeps over the states.
+    """A method that solves for values and adjoints by sweeps over the states.
 
-    - `tolerance`: relative change at which to stop; by default 1e-10 in 64-bit and 1e-5 in 32-bit numbers.
-    - `max_sweeps`: when to give up (and say so).
+    Attributes:
+        tolerance: The relative change at which to stop, above 0; by default 1e-10 in 64-bit and 1e-5 in 32-bit numbers.
+        max_sweeps: When to stop without convergence.
     """
 
     tolerance: eqx.AbstractVar[Tolerance]
@@ -147,13 +156,13 @@ class Solver(eqx.Module):
 
     @abc.abstractmethod
     def cold_start(self, states: int, dtype: jnp.dtype) -> WarmStart:
-        """The start when nothing is known."""
+        """Return the start when nothing is known."""
 
     @abc.abstractmethod
     def values(
         self, process: DecisionProcess, backup: Backup, beta: Beta, start: WarmStart, region: Region
     ) -> SolveResult:
-        """V of the fixed point; states outside the region may be near it only, if `start` is."""
+        """Return V of the fixed point; outside the region it may be approximate if `start` is near it."""
 
     @abc.abstractmethod
     def vjp(
@@ -167,19 +176,24 @@ class Solver(eqx.Module):
         start: WarmStart,
         region: Region,
     ) -> tuple[Cotangents, SolveResult]:
-        """λᵀ ∂F/∂φ for the adjoint λ of g = `cotangent` at the fixed point `values`; `values` of the sweeps is λ.
+        """Return λᵀ ∂F/∂φ for the adjoint λ of g = `cotangent` at the fixed point `values`, and λ as `values`.
 
-        Both are NaN if λ did not converge, or if states outside the region matter that were left out (see above).
+        Both are NaN if λ did not converge, or if states outside the region matter that were left out.
         """
 
-    def rows(
+    def gather_rows(
         self, probabilities: Float[Array, "states actions outcomes"], visited: Int[Array, " visited"]
     ) -> Float[Array, "visited actions outcomes"]:
-        """The probabilities of some states; negative numbers count from the end, beyond it the last one is meant."""
+        """Return the probabilities of some states.
+
+        Args:
+            probabilities: Those of all states.
+            visited: The states; negative numbers count from the end, and one beyond it means the last state.
+        """
         return probabilities[visited]
 
     def tolerance_for(self, dtype: jnp.dtype) -> float | Float[Array, ""]:
-        """The tolerance, or the default one for numbers of that kind."""
+        """Return the tolerance, or the default one for a dtype."""
         if self.tolerance is not None:
             return self.tolerance
         return 1e-10 if dtype == jnp.float64 else 1e-5
@@ -188,7 +202,7 @@ class Solver(eqx.Module):
 def finite_horizon(
     process: DecisionProcess, backup: Backup, beta: Beta, horizon: int, gradient: Gradient
 ) -> Float[Array, " states"]:
-    """V after `horizon` backups from nothing: what is worth having within that many actions.
+    """Return V after `horizon` backups from zero: the value of acting that many times.
 
     Differentiable by JAX itself; `gradient` chooses the exact one or that of the policies held fixed.
     """
@@ -196,35 +210,36 @@ def finite_horizon(
     def step(values: Float[Array, " states"], _: None) -> tuple[Float[Array, " states"], None]:
         q = process.action_values(values)
         if gradient == "exact":
-            return process.end(backup.value(q, beta)), None
-        return process.end(at_fixed_policy(backup, beta, q)), None
+            return process.with_terminal_rewards(backup.value(q, beta)), None
+        return process.with_terminal_rewards(at_fixed_policy(backup, beta, q)), None
 
-    start = process.end(jnp.zeros(process.terminal.shape, process.probabilities.dtype))
+    start = process.with_terminal_rewards(jnp.zeros(process.terminal.shape, process.probabilities.dtype))
     return jax.lax.scan(step, start, length=horizon)[0]
 
 
 def neg_inf(dtype: jnp.dtype) -> float:
-    """The stand-in for −∞: so low that a step cost more makes no difference to it."""
+    """Return the stand-in for −∞: so low that a step cost more makes no difference to it."""
     return -1e200 if dtype == jnp.float64 else -1e25
 
 
 def is_reachable(values: Float[Array, "*states"]) -> Bool[Array, "*states"]:
-    """Whether a terminal state can be reached, by values at discount 1: whether they are not a share of `neg_inf`."""
+    """Return whether a terminal state can be reached, by values at discount 1: whether they are far above `neg_inf`."""
     return values > -((-neg_inf(values.dtype)) ** 0.5)
 
 
 def at_fixed_policy(backup: Backup, beta: Beta, q: Float[Array, "states actions"]) -> Float[Array, " states"]:
-    """The backup's value with the gradient of the average under its policy, held fixed (eqs. 9 and 10)."""
+    """Return the backup's value with the gradient of the average under its policy, held fixed (eqs. 9 and 10)."""
     weights, value = jax.lax.stop_gradient((backup.fixed_policy_weights(q, beta), backup.value(q, beta)))
     return value + jnp.sum(weights * (q - jax.lax.stop_gradient(q)), axis=-1)
 
 
 def lower_bound(process: DecisionProcess) -> Float[Array, ""]:
-    """A lower bound of the values: below discount 1, the best action of the worst state for ever."""
+    """Return a lower bound of the values: below discount 1, the best action of the worst state for ever."""
     dtype = process.probabilities.dtype
     best = jnp.broadcast_to(process.reward.max(axis=-1), process.terminal.shape)
     worst = jnp.where(process.terminal, jnp.inf, best).min()
     worst = jnp.where(jnp.isfinite(worst), worst, 0)
-    remaining = 1 - process.discount
-    bound = jnp.where(remaining > 0, worst / jnp.where(remaining > 0, remaining, 1), neg_inf(dtype))
+    one_minus_discount = 1 - process.discount
+    is_discounted = one_minus_discount > 0
+    bound = jnp.where(is_discounted, worst / jnp.where(is_discounted, one_minus_discount, 1), neg_inf(dtype))
     return bound.astype(dtype)

@@ -1,19 +1,31 @@
-"""Sweeps in the order of distance, one state after another, as machine code on the CPU.
+"""Gauss–Seidel value iteration in order of distance, with a local Newton step, as native code on the CPU.
 
-Here is what JAX sees. On the host, `outwards` finds values, from the goal outwards, and `inwards` the adjoint, back
-again; `order` finds the order. A solve that starts from an earlier one takes over its order as long as that serves.
+The textbook method (Bertsekas & Tsitsiklis, *Parallel and Distributed Computation*, 1989, section 4.3) sweeps over the
+states and replaces one value after another by its backup. This one differs:
+
+1. States are swept in order of their distance from where the task ends (`ordering`), as in Dijkstra's algorithm. A warm
+   start brings its order along.
+2. Each state's own equation is solved by a Newton step instead of a backup, so that actions that mostly fail do not
+   slow the sweeps down (`base`).
+3. Values of farther states are shifted along with those they depend on, and states whose neighbors have not changed are
+   skipped (`value_kernels`).
+4. Sweeps go block by block, each until it has converged (`sweep_loop`).
+5. The gradient is that of the fixed point, by the adjoint equation; this is solved in the reverse order (`adjoint`).
+
+This module is what JAX sees. The rest runs on the host, and is imported when it first runs.
 """
 
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sidestep.errors import InputError
 from sidestep.tabular.backups import Backup, BoltzmannAverage, Gradient, HardMax, LogSumExp, Mellowmax
-from sidestep.tabular.solvers.adjoint import vjp
 from sidestep.tabular.solvers.base import (
     Beta,
     Cotangents,
@@ -26,10 +38,7 @@ from sidestep.tabular.solvers.base import (
     lower_bound,
     neg_inf,
 )
-from sidestep.tabular.solvers.given import look_up
-from sidestep.tabular.solvers.native import on_the_host, shapes_of
-from sidestep.tabular.solvers.value_kernels import BOLTZMANN, HARD_MAX, LOG_SUM_EXP, MELLOWMAX
-from sidestep.tabular.solvers.values import find_values
+from sidestep.tabular.solvers.native import BOLTZMANN, HARD_MAX, LOG_SUM_EXP, MELLOWMAX, call_host, shapes_of
 
 KERNELS: dict[type[Backup], int] = {
     HardMax: HARD_MAX,
@@ -37,37 +46,53 @@ KERNELS: dict[type[Backup], int] = {
     LogSumExp: LOG_SUM_EXP,
     Mellowmax: MELLOWMAX,
 }
-"""The backups that have machine code."""
+"""The backups that have native code, and their numbers."""
 
 
 class GaussSeidel(Solver):
-    """Sweeps in the order of distance from where a task ends, one state after another, on the CPU.
+    """Gauss–Seidel value iteration in order of distance, on the CPU, for the backups in `KERNELS`.
 
-    - `tolerance`: relative change at which to stop; by default 1e-10 in 64-bit and 1e-5 in 32-bit numbers.
-    - `max_sweeps`: when to give up (and say so): how often a state is solved on average, or after so many rounds over
-      all states (see `rounds`).
+    Attributes:
+        tolerance: The relative change at which to stop, above 0; by default 1e-10 in 64-bit and 1e-5 in 32-bit numbers.
+        max_sweeps: When to stop without convergence: the number of times that a state is solved on average, and of
+            rounds over all states.
+        max_region_sweeps: The same for an adjoint where states were left out of the values' solve: residuals may go
+            round in circles there for long.
 
-    For the backups in `KERNELS`; raises `InputError` for another.
+    Raises:
+        InputError: When it solves, for a backup without native code.
+
+    Example:
+        >>> import sidestep as ss
+        >>> grid = ss.Grid.unknown(30, 30)
+        >>> options = ss.SolveOptions(solver=ss.GaussSeidel(tolerance=1e-6))
+        >>> solution = ss.solve(ss.ObstacleGrid(grid), ss.reach(grid, 0), ss.Behavior(ss.HardMax()), options=options)
+        >>> bool(solution.converged)
+        True
+
+    References:
+        Bertsekas & Tsitsiklis, *Parallel and Distributed Computation: Numerical Methods* (1989), section 4.3.
     """
 
     tolerance: Tolerance = None
     max_sweeps: int = eqx.field(default=5_000, static=True)
+    max_region_sweeps: int = eqx.field(default=100, static=True)
 
     def cold_start(self, states: int, dtype: jnp.dtype) -> WarmStart:
-        """No values, no adjoint and no order."""
+        """Return a start without values, adjoint and order."""
         return WarmStart(jnp.full(states, neg_inf(dtype), dtype), jnp.zeros(states, dtype), _no_order(states))
 
     def values(
         self, process: DecisionProcess, backup: Backup, beta: Beta, start: WarmStart, region: Region
     ) -> SolveResult:
-        """V of the fixed point, of all states where the start's values turn out to be of no use."""
-        kind, tie = _machine_code(backup, start.values.dtype)
+        """Return V of the fixed point; of all states where the start's values turn out to be of no use."""
+        kind, tie = _native_backup(backup, start.values.dtype)
         # another solver may have left an order of no states
         order = start.order if start.order.shape == start.values.shape else _no_order(len(start.values))
         tolerance = self.tolerance_for(start.values.dtype)
-        given = (_fields(process), lower_bound(process), beta, start.values, order, region, tolerance)
-        solve = partial(find_values, kind, tie, self.max_sweeps)
-        return SolveResult(*on_the_host(solve, given, _shapes_of_sweeps(start.values, order)))
+        arguments = (_arrays_of(process), lower_bound(process), beta, start.values, order, region, tolerance)
+        solve = partial(_solve_values, kind, tie, self.max_sweeps)
+        return SolveResult(*call_host(solve, arguments, _result_shapes(start.values, order)))
 
     def vjp(
         self,
@@ -80,41 +105,49 @@ class GaussSeidel(Solver):
         start: WarmStart,
         region: Region,
     ) -> tuple[Cotangents, SolveResult]:
-        """The gradient by all that the values depend on, in a share of the time that they took."""
-        kind, tie = _machine_code(backup, values.dtype)
-        given = (
-            _fields(process),
-            beta,
-            values,
-            cotangent,
-            start.adjoint,
-            start.order,
-            region,
-            self.tolerance_for(values.dtype),
-        )
+        """Return the gradient by all that the values depend on; it takes a fraction of the time that they took."""
+        kind, tie = _native_backup(backup, values.dtype)
+        tolerance = self.tolerance_for(values.dtype)
+        arguments = (_arrays_of(process), beta, values, cotangent, start.adjoint, start.order, region, tolerance)
         by = (process.probabilities, process.reward, process.terminal_reward, process.discount, beta)
-        shapes = (shapes_of(by), _shapes_of_sweeps(start.adjoint, start.order))
-        solve = partial(vjp, kind, tie, gradient == "exact", self.max_sweeps)
-        gradients, found = on_the_host(solve, given, shapes)
-        return Cotangents(*gradients), SolveResult(*found)
+        shapes = (shapes_of(by), _result_shapes(start.adjoint, start.order))
+        limits = self.max_sweeps, self.max_region_sweeps
+        cotangents, result = call_host(partial(_pull_back, kind, tie, gradient == "exact", *limits), arguments, shapes)
+        return Cotangents(*cotangents), SolveResult(*result)
 
-    def rows(
+    def gather_rows(
         self, probabilities: Float[Array, "states actions outcomes"], visited: Int[Array, " visited"]
     ) -> Float[Array, "visited actions outcomes"]:
-        """The probabilities of some states, looked up in the array that the host is given anyway.
+        """Return the probabilities of some states, from the array that the host has anyway.
 
-        The compiler would make all of them a second time to look these up.
+        The compiler would compute all of them a second time.
         """
         visited = jnp.where(visited < 0, visited + len(probabilities), visited)
         shape = jax.ShapeDtypeStruct((*visited.shape, *probabilities.shape[1:]), probabilities.dtype)
-        return on_the_host(look_up, (probabilities, visited), shape)
+        return call_host(_take_rows, (probabilities, visited), shape)
 
 
-def _machine_code(backup: Backup, dtype: jnp.dtype) -> tuple[int, float]:
-    """The number of a backup, and within which share of the best its ties lie."""
+def _solve_values(*arguments: Any) -> None:
+    from sidestep.tabular.solvers.values import solve_values
+
+    solve_values(*arguments)
+
+
+def _pull_back(*arguments: Any) -> None:
+    from sidestep.tabular.solvers.adjoint import pull_back
+
+    pull_back(*arguments)
+
+
+def _take_rows(into: np.ndarray, probabilities: np.ndarray, states: np.ndarray) -> None:
+    np.take(probabilities, states, axis=0, out=into, mode="clip")
+
+
+def _native_backup(backup: Backup, dtype: jnp.dtype) -> tuple[int, float]:
+    """Return the number of a backup, and the part of the best value within which actions tie."""
     if type(backup) not in KERNELS:
         known = ", ".join(kind.__name__ for kind in KERNELS)
-        raise InputError(f"expected one that has machine code ({known}), or Jacobi() as the solver", field="backup")
+        raise InputError(f"expected one that has native code ({known}), or Jacobi() as the solver", field="backup")
     tie = max(backup.tie, 64 * float(jnp.finfo(dtype).eps)) if isinstance(backup, HardMax) else 0.0
     return KERNELS[type(backup)], tie
 
@@ -123,8 +156,8 @@ def _no_order(states: int) -> Array:
     return jnp.full(states, -1, jnp.int32)
 
 
-def _fields(process: DecisionProcess) -> tuple[Array, ...]:
-    """A process as the host takes it (see `given`)."""
+def _arrays_of(process: DecisionProcess) -> tuple[Array, ...]:
+    """Return the fields of `HostProcess`."""
     return (
         process.successors,
         process.probabilities,
@@ -135,8 +168,8 @@ def _fields(process: DecisionProcess) -> tuple[Array, ...]:
     )
 
 
-def _shapes_of_sweeps(values: Array, order: Array) -> tuple[jax.ShapeDtypeStruct, ...]:
-    """The shapes of what a solve returns, in the order of `SolveResult`."""
+def _result_shapes(values: Array, order: Array) -> tuple[jax.ShapeDtypeStruct, ...]:
+    """Return the shapes of the fields of `SolveResult`."""
     count = jax.ShapeDtypeStruct((), jax.dtypes.canonicalize_dtype(int))
     residual = jax.ShapeDtypeStruct((), values.dtype)
     return (*shapes_of((values, order)), count, residual, jax.ShapeDtypeStruct((), jnp.dtype(bool)))

@@ -1,79 +1,229 @@
-"""The bridge from JAX to the host: NumPy code called from compiled JAX code, the tasks of a batch side by side."""
+"""Native code on the CPU: NumPy functions called from compiled JAX code, and functions compiled by numba.
+
+- `call_host` calls a NumPy function from JAX, the tasks of a batch in parallel; `map_ranges` and `run_parallel` use the
+  cores where there is one task only.
+- `compiled` and `inlined` mark functions for numba. numba is imported when one is first called, and the machine code is
+  kept in `cache_folder()`.
+- `HostProcess`, `HostResult` and `NativeBackup` are a decision process, a result and a backup as the host sees them.
+"""
 
 import ctypes
+import hashlib
 import os
+import pickle
+import platform
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import suppress
 from functools import cache, partial
+from inspect import unwrap
 from itertools import pairwise
-from typing import Any, TypeVar
+from pathlib import Path
+from types import FunctionType
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
+from jaxtyping import Bool, Float, Int
+
+from sidestep._cache import cache_folder
+from sidestep._files import write_whole
+from sidestep.errors import InputError
 
 _Result = TypeVar("_Result")
 
+HARD_MAX, BOLTZMANN, LOG_SUM_EXP, MELLOWMAX = range(4)
+"""The backups that have native code, by number."""
 
-def on_the_host(solve: Callable[..., None], given: tuple, shapes: Any) -> Any:
-    """What `solve` writes into NumPy arrays of the structure and shapes of `shapes`.
+_MIN_STATES_PER_CORE = 2**14
+"""The number of states above which a further core pays."""
+_MIN_BYTES_TO_TRIM = 2**22
+"""The size of the results from which on free memory is given back to the system."""
 
-    It is called with these arrays and then with what is `given`, as arrays that it must not write into; under `vmap`
-    once for every task, on all cores. Nothing is copied on the way. What it raises reaches the user only as an error of
-    JAX's, so it should raise nothing that users can do something about.
+
+# What crosses the bridge
+
+
+class HostProcess(NamedTuple):
+    """A task under a model; fields as in `DecisionProcess`, in its order but for the discount, which is a number."""
+
+    successors: Int[np.ndarray, "states actions outcomes"]
+    probabilities: Float[np.ndarray, "states actions outcomes"]
+    reward: Float[np.ndarray, "#states #actions"]
+    terminal_reward: Float[np.ndarray, "#states"]
+    terminal: Bool[np.ndarray, " states"]
+    discount: np.floating
+
+    @classmethod
+    def from_arrays(cls, arrays: tuple[np.ndarray, ...]) -> "HostProcess":
+        """Return the process of its fields as arrays."""
+        *others, discount = arrays
+        return cls(*others, discount=discount.dtype.type(discount))
+
+    def kernel_sizes(self) -> tuple[int, int, int]:
+        """Return the numbers of actions and outcomes, and the most outcomes of an action that leave its state."""
+        states, actions, outcomes = self.successors.shape
+        most = map_ranges(lambda begin, end: _most_leaving_outcomes(self.successors[begin:end]), states)
+        return actions, outcomes, max(most)
+
+
+class NativeBackup(NamedTuple):
+    """A backup as native code knows it.
+
+    Attributes:
+        kind: Its number.
+        beta: The inverse temperature β.
+        tie: The part of the best value within which actions tie (hard max only).
     """
-    given_leaves, given_structure = jax.tree.flatten(given)
+
+    kind: int
+    beta: np.floating
+    tie: np.floating
+
+
+class SolveInfo(NamedTuple):
+    """How a solve went; fields as in `SolveResult`."""
+
+    sweeps: int
+    residual: float
+    converged: bool
+
+
+class HostResult(NamedTuple):
+    """The arrays that a solve writes its result into; fields as in `SolveResult`."""
+
+    values: Float[np.ndarray, " states"]
+    order: Int[np.ndarray, " states"]
+    sweeps: Int[np.ndarray, ""]
+    residual: Float[np.ndarray, ""]
+    converged: Bool[np.ndarray, ""]
+
+    def write(self, order: Int[np.ndarray, " states"], info: SolveInfo) -> None:
+        """Write all but the values."""
+        self.order[:] = order
+        self.sweeps[...], self.residual[...], self.converged[...] = info
+
+
+def inverse_permutation(order: Int[np.ndarray, " states"]) -> Int[np.ndarray, " states"] | None:
+    """Return the position of each state in an order; None if it is not a permutation of all states."""
+    if order.min() < 0 or order.max() >= len(order):
+        return None
+    position = np.full(len(order), -1, np.int32)
+    position[order] = np.arange(len(order), dtype=np.int32)
+    return None if position.min() < 0 else position
+
+
+# Calls from JAX
+
+
+def call_host(function: Callable[..., None], arguments: tuple, shapes: Any) -> Any:
+    """Return the arrays that a NumPy function fills in, called from JAX without a copy.
+
+    Args:
+        function: Called with writable arrays of the structure and shapes of `shapes`, then with `arguments` as
+            read-only arrays; under `vmap` once for each task, on all cores. What it raises reaches the user only as an
+            error of JAX's.
+        arguments: A tree of arrays.
+        shapes: A tree of `jax.ShapeDtypeStruct`.
+    """
+    argument_leaves, argument_structure = jax.tree.flatten(arguments)
     result_leaves, result_structure = jax.tree.flatten(shapes)
-    given_axes = [jnp.ndim(leaf) for leaf in given_leaves]
+    argument_axes = [jnp.ndim(leaf) for leaf in argument_leaves]
     result_axes = [len(leaf.shape) for leaf in result_leaves]
 
-    def solve_all(_: Any, results: Sequence[Any], *given: Any) -> None:
+    def call_all(_: Any, results: Sequence[Any], *arguments: Any) -> None:
         into = [np.asarray(result) for result in results]
         batch = into[0].shape[: into[0].ndim - result_axes[0]]
-        arrays = [_for_every_task(np.asarray(leaf), batch, own) for leaf, own in zip(given, given_axes, strict=True)]
+        # read-only views with all of the batch's axes: numba compiles once for each kind of array
+        arrays = [
+            np.broadcast_to(array, batch + array.shape[array.ndim - axes :])
+            for array, axes in zip(map(np.asarray, arguments), argument_axes, strict=True)
+        ]
 
-        def solve_one(task: tuple[int, ...]) -> None:
+        def call_one(task: tuple[int, ...]) -> None:
             # the ellipsis keeps numbers arrays that can be written into
             result = jax.tree.unflatten(result_structure, [array[*task, ...] for array in into])
-            solve(result, *jax.tree.unflatten(given_structure, [array[*task, ...] for array in arrays]))
+            function(result, *jax.tree.unflatten(argument_structure, [array[*task, ...] for array in arrays]))
 
-        _side_by_side(solve_one, list(np.ndindex(batch)))
-        if sum(result.nbytes for result in into) >= _WORTH_GIVING_BACK:
-            _give_back()
+        _run_batch(call_one, list(np.ndindex(batch)))
+        if sum(result.nbytes for result in into) >= _MIN_BYTES_TO_TRIM:
+            _trim_memory()
 
-    found = buffer_callback(solve_all, result_leaves, vmap_method="expand_dims")(*given_leaves)
-    return jax.tree.unflatten(result_structure, found)
+    results = buffer_callback(call_all, result_leaves, vmap_method="expand_dims")(*argument_leaves)
+    return jax.tree.unflatten(result_structure, results)
 
 
 def shapes_of(arrays: Any) -> Any:
-    """Arrays as their shapes."""
+    """Return the shapes and dtypes of a tree of arrays."""
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(jnp.shape(leaf), leaf.dtype), arrays)
 
 
-def _for_every_task(array: np.ndarray, batch: tuple[int, ...], own: int) -> np.ndarray:
-    """A view with all of the batch's axes before the array's own, read-only: numba compiles once for each kind."""
-    return np.broadcast_to(array, batch + array.shape[array.ndim - own :])
-
-
-def _side_by_side(solve_one: Callable[[tuple[int, ...]], None], tasks: Sequence[tuple[int, ...]]) -> None:
-    """Solves all tasks, or raises what one of them raised; then none is still at work in memory that JAX takes back."""
+def _run_batch(call_one: Callable[[tuple[int, ...]], None], tasks: Sequence[tuple[int, ...]]) -> None:
     if len(tasks) == 1:
-        solve_one(tasks[0])
+        call_one(tasks[0])
         return
     stop = threading.Event()
 
     def work(task: tuple[int, ...]) -> None:
-        _here.stop = stop
-        solve_one(task)
+        _thread_state.stop = stop
+        call_one(task)
 
-    _results_of([partial(work, task) for task in tasks], stop.set)
+    _run_in_pool([partial(work, task) for task in tasks], stop.set)
 
 
-def _results_of(works: Sequence[Callable[[], _Result]], stop: Callable[[], None] = lambda: None) -> list[_Result]:
-    """What pieces of work return, on all cores, or what one of them raised; then `stop` is called, and none goes on."""
-    running = [_threads().submit(work) for work in works]
+def _trim_memory() -> None:
+    """Give free memory back to the system, where the C library is glibc.
+
+    glibc keeps it for each thread, and JAX calls from any thread, so that each would keep what the largest solve took.
+    """
+    trim = getattr(_c_library(), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+
+
+@cache
+def _c_library() -> ctypes.CDLL | None:
+    return ctypes.CDLL(None) if os.name == "posix" else None
+
+
+# Cores
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def map_ranges(work: Callable[[int, int], _Result], count: int) -> list[_Result]:
+    """Return `work(begin, end)` of ranges that cover 0…count; in parallel if this is the only task."""
+    parts = max(1, min(cores(), count // _MIN_STATES_PER_CORE)) if _is_only_task() else 1
+    ends = [count * part // parts for part in range(parts + 1)]
+    return run_parallel([partial(work, begin, end) for begin, end in pairwise(ends)])
+
+
+def run_parallel(works: Sequence[Callable[[], _Result]]) -> list[_Result]:
+    """Return the results of several functions; in parallel if this is the only task."""
+    if len(works) == 1 or not _is_only_task():
+        return [work() for work in works]
+    return _run_in_pool(works)
+
+
+def check_interrupt() -> None:
+    """Raise `KeyboardInterrupt` if another task of the batch has failed or been interrupted; call it often."""
+    stop = getattr(_thread_state, "stop", None)
+    if stop is not None and stop.is_set():
+        raise KeyboardInterrupt
+
+
+def _run_in_pool(works: Sequence[Callable[[], _Result]], stop: Callable[[], None] = lambda: None) -> list[_Result]:
+    """Return the results, or raise the first error once `stop` was called and no work is left running.
+
+    A work left running would write into memory that JAX takes back.
+    """
+    running = [_pool().submit(work) for work in works]
     try:
         return [each.result() for each in running]
     except BaseException:
@@ -84,66 +234,133 @@ def _results_of(works: Sequence[Callable[[], _Result]], stop: Callable[[], None]
         raise
 
 
-_here = threading.local()
-"""What the tasks of a batch have in common, as each of their threads sees it."""
+def _is_only_task() -> bool:
+    return getattr(_thread_state, "stop", None) is None
 
 
-def heed_interrupts() -> None:
-    """Raises `KeyboardInterrupt` if another task of the same batch has failed or been interrupted; call it often."""
-    stop = getattr(_here, "stop", None)
-    if stop is not None and stop.is_set():
-        raise KeyboardInterrupt
-
-
-_WORTH_SHARING = 2**14
-"""How many states a core should have to do with, for sharing them out to pay."""
-
-
-def shared_out(work: Callable[[int, int], _Result], count: int) -> list[_Result]:
-    """What `work(begin, end)` returns for ranges that cover 0…count; side by side if this is the only task."""
-    parts = max(1, min(cores(), count // _WORTH_SHARING)) if _only_task() else 1
-    ends = [count * part // parts for part in range(parts + 1)]
-    return at_once([partial(work, begin, end) for begin, end in pairwise(ends)])
-
-
-def at_once(works: Sequence[Callable[[], _Result]]) -> list[_Result]:
-    """What some pieces of work return; side by side if this is the only task."""
-    if len(works) == 1 or not _only_task():
-        return [work() for work in works]
-    return _results_of(works)
-
-
-def _only_task() -> bool:
-    return getattr(_here, "stop", None) is None
-
-
-_WORTH_GIVING_BACK = 2**22
-"""How many bytes of results a call should have for what it held besides to be given back."""
-
-
-def _give_back() -> None:
-    """Gives free memory back to the system, where the C library keeps it until it is told otherwise (glibc's does).
-
-    It keeps it for each thread apart, and JAX calls from whichever thread it likes, so that every one of them would
-    come to keep what the largest solve needed.
-    """
-    trim = getattr(_c_library(), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
+_thread_state = threading.local()
+"""Of a thread that solves one task of a batch: `stop`, the event by which the batch ends early."""
 
 
 @cache
-def _c_library() -> ctypes.CDLL | None:
-    """The C library that this process runs with; None where there is no asking for it."""
-    return ctypes.CDLL(None) if os.name == "posix" else None
-
-
-def cores() -> int:
-    """How many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-@cache
-def _threads() -> ThreadPoolExecutor:
-    """One thread a core; machine code does not hold Python's lock."""
+def _pool() -> ThreadPoolExecutor:
+    """Return a pool of one thread a core; native code does not hold Python's lock."""
     return ThreadPoolExecutor(cores(), thread_name_prefix="sidestep-sweeps")
+
+
+# numba
+
+
+class NativeFunction:
+    """A function that numba compiles when it is first called, from Python or from another one."""
+
+    def __init__(self, function: Callable, options: dict[str, Any]):
+        # type checks may have been wrapped around the function, which numba cannot see through
+        self._function, self._options = unwrap(function), options
+        self._dispatcher: Any = None
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the machine code, compiled or read from the cache if it is not there yet."""
+        return (self._dispatcher or self.dispatcher())(*arguments)
+
+    def dispatcher(self) -> Any:
+        """Return numba's dispatcher of the function."""
+        with _making_dispatchers:
+            if self._dispatcher is None:
+                from numba import njit
+
+                function = _with_dispatchers(self._function)
+                self._dispatcher = njit(nogil=True, error_model="numpy", **self._options)(function)
+                folder = _code_folder() if self._options.get("inline") is None else None
+                if folder is not None:
+                    self._dispatcher._cache = _CodeCache(function, folder)
+            return self._dispatcher
+
+
+def compiled(**options: Any) -> Callable[[Callable], NativeFunction]:
+    """Return a decorator: numba's `njit` with `options`, without Python's lock, kept from process to process."""
+    return lambda function: NativeFunction(function, options)
+
+
+def inlined(**options: Any) -> Callable[[Callable], NativeFunction]:
+    """Return a decorator: numba's `njit` for a function that becomes part of those that call it."""
+    return lambda function: NativeFunction(function, {"inline": "always"} | options)
+
+
+_making_dispatchers = threading.RLock()
+
+
+def _with_dispatchers(function: FunctionType) -> FunctionType:
+    """Return a function with the dispatchers of the native functions that it calls, as numba has to see them."""
+    used = {name: function.__globals__.get(name) for name in function.__code__.co_names}
+    called = {name: each.dispatcher() for name, each in used.items() if isinstance(each, NativeFunction)}
+    names = function.__globals__ | called
+    copy = FunctionType(function.__code__, names, function.__name__, function.__defaults__, function.__closure__)
+    copy.__qualname__ = function.__qualname__
+    return copy
+
+
+def _code_folder() -> Path | None:
+    folder, chosen = cache_folder(), os.environ.get("NUMBA_CACHE_DIR")
+    return Path(chosen) if folder and chosen else folder and folder / "numba"
+
+
+class _CodeCache:
+    """Machine code kept in files, one for each function, signature and machine (numba's `_Cache` interface).
+
+    Differs from numba's own, which keeps an index for each function: (1) several processes may write at once, (2) each
+    file has a checksum, and a damaged one is compiled anew, (3) code is stale when any module beside the function's
+    has changed, for that may be where an inlined function comes from, (4) where nothing can be written, nothing is.
+    """
+
+    def __init__(self, function: FunctionType, folder: Path):
+        self.cache_path, self._function = str(folder), function
+
+    def load_overload(self, signature: Any, target: Any) -> Any:
+        """Return the machine code for a signature, None if it is not kept."""
+        target.refresh()
+        with suppress(OSError):
+            content = self._path(signature, target.codegen()).read_bytes()
+            if hashlib.sha256(content[32:]).digest() == content[:32]:
+                from numba.core.compiler import CompileResult
+
+                return CompileResult._rebuild(target, *pickle.loads(content[32:]))
+        return None
+
+    def save_overload(self, signature: Any, result: Any) -> None:
+        """Keep the machine code for a signature, if the folder can be written."""
+        from numba.core.serialize import dumps
+
+        with suppress(OSError, InputError):
+            content = dumps(result._reduce())
+            path = self._path(signature, result.codegen)
+            write_whole(path, lambda file: file.write(hashlib.sha256(content).digest() + content))
+
+    def _path(self, signature: Any, code_generator: Any) -> Path:
+        import numba
+
+        function = self._function
+        cells = [cell.cell_contents for cell in function.__closure__ or ()]
+        versions = (numba.__version__, np.__version__, platform.python_version(), code_generator.magic_tuple())
+        key = (_sources(Path(function.__code__.co_filename).parent), function.__code__.co_code, cells, signature)
+        digest = hashlib.sha256(repr((key, versions)).encode()).hexdigest()
+        return Path(self.cache_path) / f"{function.__qualname__.split('.')[-1]}-{digest[:32]}.code"
+
+
+@cache
+def _sources(folder: Path) -> str:
+    """Return a digest of the modules of a folder; `OSError` where they are not files."""
+    contents = b"".join(path.read_bytes() for path in sorted(folder.iterdir()) if path.suffix == ".py")
+    return hashlib.sha256(contents).hexdigest()
+
+
+@compiled()
+def _most_leaving_outcomes(successors):  # pragma: no cover
+    most = 1
+    for state in range(len(successors)):
+        for a in range(successors.shape[1]):
+            count = 0
+            for k in range(successors.shape[2]):
+                count += successors[state, a, k] != state
+            most = max(most, count)
+    return most

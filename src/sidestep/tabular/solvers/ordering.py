@@ -1,58 +1,59 @@
-"""Orders: the states by their distance from where a task ends.
+"""Orders of the states by distance from where a task ends, and the task with its states numbered in an order.
 
-The distance of a state is the least expected cost of getting from there to a terminal state by moves that are each
-tried until they succeed. A move with probability p costs, with discount γ and reward R,
+The distance of a state is the least expected cost of a path to a terminal state, each move repeated until it succeeds
+(Dijkstra, 1959, by SciPy). A move with probability p costs, with discount γ and reward R,
 
-    max(0, −R) / p  +  log((1 − γ + γp) / γp),
+    max(0, −R) / p  +  log((1 − γ + γp) / γp):
 
-what the tries cost, and by how much the discount shrinks what comes after them. Any order gives the same values; a good
-one gives them sooner.
+the expected cost of its repetitions, and by how much the discount shrinks what comes after them. Any order gives the
+same values; a good one gives them in fewer sweeps (prioritized sweeping with a fixed order). With the states numbered
+in the order of the sweep, what a sweep reads lies close together in memory.
 """
 
+from functools import cache
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
+from jaxtyping import Float, Int
 
-from sidestep.tabular.solvers.compiled import compiled
+from sidestep.tabular.solvers.native import HostProcess, NativeFunction, compiled, map_ranges
 
 
-def order_by_distance(
-    successors: Int[np.ndarray, "states actions outcomes"],
-    probabilities: Float[np.ndarray, "states actions outcomes"],
-    reward: Float[np.ndarray, "#states #actions"],
-    terminal: Bool[np.ndarray, " states"],
-    discount: float,
-) -> Int[np.ndarray, " states"]:
-    """The states, nearest first; those from which no terminal state can be reached come last.
+def order_by_distance(process: HostProcess) -> Int[np.ndarray, " states"]:
+    """Return the states, nearest first; those from which no terminal state can be reached come last.
 
-    Where nothing is terminal the states keep their numbers. One shortest-path search.
+    Without a terminal state they keep their numbers.
     """
-    if not terminal.any():
-        return np.arange(len(successors), dtype=np.int32)
-    first, begins, costs = _moves_backwards(successors, probabilities, reward, discount)
-    moves = csr_array((costs, begins, first), shape=(len(successors), len(successors)))
-    ends = np.flatnonzero(terminal)
-    distance = dijkstra(moves, indices=ends[0]) if len(ends) == 1 else dijkstra(moves, indices=ends, min_only=True)
-    return _ascending(distance)
+    if not process.terminal.any():
+        return np.arange(len(process.successors), dtype=np.int32)
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import dijkstra
+
+    row_starts, sources, costs = _edges_into_states(
+        process.successors, process.probabilities, process.reward, float(process.discount)
+    )
+    edges = csr_array((costs, sources, row_starts), shape=(len(process.successors), len(process.successors)))
+    ends = np.flatnonzero(process.terminal)
+    distance = dijkstra(edges, indices=ends[0]) if len(ends) == 1 else dijkstra(edges, indices=ends, min_only=True)
+    return stable_argsort(distance)
 
 
-def _ascending(distances: Float[np.ndarray, " states"]) -> Int[np.ndarray, " states"]:
-    """The states by their distance; those that are as far as others in the order of their numbers.
+def stable_argsort(distances: Float[np.ndarray, " states"]) -> Int[np.ndarray, " states"]:
+    """Return the stable argsort of numbers that are not negative, by radix sort.
 
-    The bits of numbers that are not negative ascend with them, and NumPy sorts 16 bits many times as fast as 64.
+    Their bits ascend with them, and NumPy sorts 16 bits many times as fast as 64.
     """
     bits = np.ascontiguousarray(distances, np.float64).view(np.uint64)
-    neg_inf, *others = ((bits >> np.uint64(shift)).astype(np.uint16) for shift in range(0, 64, 16))
-    order = np.argsort(neg_inf, kind="stable").astype(np.int32)
+    last_digits, *others = ((bits >> np.uint64(shift)).astype(np.uint16) for shift in range(0, 64, 16))
+    order = np.argsort(last_digits, kind="stable").astype(np.int32)
     for digits in others:
         order = order[np.argsort(digits[order], kind="stable")]
     return order
 
 
 @compiled()
-def _moves_backwards(successors, probabilities, reward, discount):  # pragma: no cover
-    """The moves into each state, as rows of a sparse matrix: where a row starts, where moves begin, their costs."""
+def _edges_into_states(successors, probabilities, reward, discount):  # pragma: no cover
+    """Return the moves into each state as a sparse matrix: where a row starts, the moves' sources, their costs."""
     states, actions, outcomes = successors.shape
     first = np.zeros(states + 2, np.int32)
     for state in range(states):
@@ -62,16 +63,120 @@ def _moves_backwards(successors, probabilities, reward, discount):  # pragma: no
                     first[successors[state, a, k] + 2] += 1
     for state in range(states):
         first[state + 2] += first[state + 1]
-    begins, costs = np.empty(first[-1], np.int32), np.empty(first[-1], np.float64)
+    sources, costs = np.empty(first[-1], np.int32), np.empty(first[-1], np.float64)
     for state in range(states):
         for a in range(actions):
             price = max(-reward[state if reward.shape[0] > 1 else 0, a if reward.shape[1] > 1 else 0], 0.0)
             for k in range(outcomes):
                 after, chance = successors[state, a, k], probabilities[state, a, k]
                 if after != state and chance > 0:
-                    begins[first[after + 1]] = state
+                    sources[first[after + 1]] = state
                     cost = price / chance + np.log1p((1 - discount) / (discount * chance))
                     # an edge without cost would not be one
                     costs[first[after + 1]] = max(cost, 1e-300)
                     first[after + 1] += 1
-    return first[:-1], begins, costs
+    return first[:-1], sources, costs
+
+
+class NumberedProcess(NamedTuple):
+    """A task under a model with its states numbered in an order, without self-loops.
+
+    Attributes:
+        successors: The states that outcomes lead to which leave their state; padded with the state itself.
+        discounted_probs: γP of these outcomes, 0 for the padding.
+        self_loop_factor: 1/(1 − γp), p the probability of staying: the discounted number of times that an action is
+            taken which is repeated until it succeeds; 0 where that is for ever.
+        reward: R(s, a), with one row if it is the same in all states.
+        terminal: Whether a state is terminal.
+        one_minus_discount: 1 − γ.
+        bandwidth: The largest difference between the positions of a state and of one of its successors.
+    """
+
+    successors: np.ndarray
+    discounted_probs: np.ndarray
+    self_loop_factor: np.ndarray
+    reward: np.ndarray
+    terminal: np.ndarray
+    one_minus_discount: np.floating
+    bandwidth: int
+
+
+class NumberingKernels(NamedTuple):
+    """The native code for one number of actions, of outcomes, and of outcomes that leave a state (`width`)."""
+
+    width: int
+    number_states: NativeFunction
+    greedy_successors: NativeFunction
+
+
+def number_process(
+    process: HostProcess, order: Int[np.ndarray, " states"], position: Int[np.ndarray, " states"]
+) -> tuple[NumberedProcess, NumberingKernels]:
+    """Return the process numbered in an order, and the native code for it; `position` is the order's inverse."""
+    kernels = numbering_kernels(*process.kernel_sizes())
+    states, actions, _ = process.successors.shape
+    dtype = process.probabilities.dtype
+    reward = np.broadcast_to(process.reward, (len(process.reward), actions))
+    numbered = NumberedProcess(
+        successors=np.empty((states, actions, kernels.width), np.int32),
+        discounted_probs=np.empty((states, actions, kernels.width), dtype),
+        self_loop_factor=np.empty((states, actions), dtype),
+        reward=np.ascontiguousarray(reward[order] if len(reward) > 1 else reward),
+        terminal=np.empty(states, bool),
+        one_minus_discount=1 - process.discount,
+        bandwidth=0,
+    )
+    arrays = (order, position, process.successors, process.probabilities, process.terminal, process.discount, numbered)
+    bandwidth = max(map_ranges(lambda begin, end: kernels.number_states(begin, end, *arrays), states))
+    return numbered._replace(bandwidth=bandwidth), kernels
+
+
+@cache
+def numbering_kernels(actions: int, outcomes: int, width: int) -> NumberingKernels:
+    """Return the native code for these numbers; as constants they make it twice as fast."""
+
+    @compiled()
+    def number_states(
+        begin, end, order, position, successors, probabilities, terminal, discount, numbered
+    ):  # pragma: no cover
+        """Fill in `numbered` for a range of positions; return their bandwidth."""
+        bandwidth = 0
+        for i in range(begin, end):
+            state = order[i]
+            numbered.terminal[i] = terminal[state]
+            for a in range(actions):
+                exit_weight = numbered.one_minus_discount
+                m = 0
+                for k in range(outcomes):
+                    after = successors[state, a, k]
+                    if after != state:
+                        move = discount * probabilities[state, a, k]
+                        numbered.successors[i, a, m] = position[after]
+                        bandwidth = max(bandwidth, abs(position[after] - i))
+                        numbered.discounted_probs[i, a, m] = move
+                        exit_weight += move
+                        m += 1
+                for padding in range(m, width):
+                    numbered.successors[i, a, padding] = i
+                    numbered.discounted_probs[i, a, padding] = 0
+                numbered.self_loop_factor[i, a] = 1 / exit_weight if exit_weight > 0 else 0.0
+        return bandwidth
+
+    @compiled()
+    def greedy_successors(begin, end, numbered, values, neg_inf, greedy_successor):  # pragma: no cover
+        """Fill in the best successor of states by known values; return how many are farther than their state."""
+        count = 0
+        for i in range(begin, end):
+            best, leads_to = neg_inf, i
+            for a in range(actions):
+                for m in range(width):
+                    j = numbered.successors[i, a, m]
+                    move = numbered.discounted_probs[i, a, m]
+                    worth = values[j] + numbered.reward[i if len(numbered.reward) > 1 else 0, a] / move
+                    if move > 0 and worth > best:
+                        best, leads_to = worth, j
+            greedy_successor[i] = leads_to
+            count += leads_to > i and not numbered.terminal[i]
+        return count
+
+    return NumberingKernels(width, number_states, greedy_successors)

@@ -1,294 +1,303 @@
-"""A sweep: the own equations of states solved one after another by ascending distance, as machine code (numba).
+"""The sweeps of Gauss–Seidel value iteration over states numbered by distance, as native code (numba).
 
-The equations are those of `process`; what is different here is in which order they are used, and how often. `outwards`
-says which states are swept when.
+The equations are those of `base`. The classical sweep (Bertsekas, *Dynamic Programming and Optimal Control*, vol. II,
+2012) replaces one value after another by its backup. This one differs:
 
-**Order.** States are numbered by their distance from where the task ends, so that a state's own equation is solved
-after those of the states that it wants to go to. Where nobody ever turned back, one sweep would do.
-
-**Shift.** People do turn back, a little: a state's value depends on its farther neighbours too, whose values are still
-old. What changed near the goal is passed outwards, and changes all values that hang on it by about the same amount. So
-as soon as a state is solved, the farther states whose favourite it is (where their best action leads) are moved by as
-much as it has moved since the round over all states began; by the same share of the value where values fall with the
-distance. At the fixed point nothing moves, and the equations are the old ones. A state that was worth more than the one
-it would be moved with does not hang on it, whatever the order says: two that were moved by one another would lift
-each other for ever.
-
-**Work that is not done.** A state is left alone as long as neither it nor any of its neighbours has changed by more
-than `still` since it was last solved. That is less than the tolerance, but it may add up; so it alone does not decide
-when to stop.
+1. States come by their distance from where the task ends, so that a state comes after those that its best actions lead
+   to. If no action led farther, one sweep would do.
+2. A state's own equation is solved, by a Newton step, with its neighbors' values held (see `base`).
+3. Values of farther states are **shifted**. A state's value depends on its farther neighbors too, and these are still
+   old. What changed near the goal changes all values that depend on it by about the same amount. So as soon as a state
+   is solved, the farther states of which it is the greedy successor move by as much as it has moved since the round
+   over all states began; in proportion to the value where values fall with the distance. At the fixed point nothing
+   moves, so the equations are the old ones. A state that was worth more than its greedy successor is not moved: two
+   that are moved by each other would rise for ever.
+4. A state is **skipped** as long as neither it nor a neighbor has changed by more than a threshold since it was last
+   solved. The threshold is less than the tolerance, but what is skipped may add up. So a last sweep without skips
+   decides when to stop (see `sweep_loop`).
 """
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from sidestep.tabular.solvers.compiled import compiled, inlined
-
-HARD_MAX, BOLTZMANN, LOG_SUM_EXP, MELLOWMAX = range(4)
-"""The backups that have machine code, by number."""
+from sidestep.tabular.solvers.native import BOLTZMANN, HARD_MAX, LOG_SUM_EXP, NativeFunction, compiled, inlined
 
 _SMALLEST_EXPONENT = -80.0
-"""Odds of less than exp of this are lost in rounding."""
+"""Weights below exp of this are lost in rounding."""
 
-_NEWTON_STEPS, _FAR = 4, 0.1
-"""How often a state's value is improved at most, and how large a step down (times β) asks for another."""
+_NEWTON_STEPS, _LONG_STEP = 4, 0.1
+"""The most Newton steps on a state's value, and the step down (times β) beyond which another follows."""
 
 _FAST = {"contract", "reassoc", "nsz", "arcp"}
-"""What the compiler may do with sums and products; not to take NaN or infinity for impossible."""
+"""What the compiler may do with sums and products; it may not assume that NaN and infinity are impossible."""
 
 
-class Valuing(NamedTuple):
-    """A backup as the machine code knows it: its number, β, and the share of the best within which actions tie."""
-
-    kind: int
-    beta: np.floating
-    tie: np.floating
-
-
-class Marks(NamedTuple):
+class SweepHistory(NamedTuple):
     """What the sweeps have done so far, by position.
 
-    - `before`: the values when the present round over all states began.
-    - `favourite`: where the best of the actions leads whose likeliest outcome is nearer; the state itself if none is.
-    - `changed`: the sweep in which the value last changed by more than `still`.
-    - `solved`: the sweep in which the state was last solved, or found to need no solving.
+    Attributes:
+        round_start: The values when the present round over all states began.
+        greedy_successor: The successor of the best of the actions that most likely lead nearer; the state itself if
+            there is none.
+        last_changed: The sweep in which the value last changed by more than the threshold.
+        last_solved: The sweep in which the state was last solved, or skipped.
     """
 
-    before: np.ndarray
-    favourite: np.ndarray
-    changed: np.ndarray
-    solved: np.ndarray
+    round_start: np.ndarray
+    greedy_successor: np.ndarray
+    last_changed: np.ndarray
+    last_solved: np.ndarray
 
 
 class Scratch(NamedTuple):
-    """Room for what a state's actions are worth, for the chances that they leave it, and for their advantages.
+    """Memory for a state's c(a), l(a) and advantages A(a) (see `base`).
 
-    numba does not count references to arrays that come in a tuple, and looks after those that come alone at every
-    state, with instructions that cores cannot share.
+    numba does not count references to arrays in a tuple. Arrays by themselves it counts at every state, with atomic
+    instructions that keep cores waiting.
     """
 
-    worths: np.ndarray
-    leaving: np.ndarray
-    advantage: np.ndarray
+    exit_values: np.ndarray
+    exit_weights: np.ndarray
+    advantages: np.ndarray
 
 
 @inlined(fastmath=_FAST)
-def backed_up(valuing, scratch):  # pragma: no cover
-    """B(A), and what the own equation is divided by: the larger of Σ w l and Σ π l (see `process`)."""
-    kind, beta, tie = valuing.kind, valuing.beta, valuing.tie
-    best = scratch.advantage[0]
-    for a in range(1, len(scratch.advantage)):
-        best = max(best, scratch.advantage[a])
+def backed_up(backup, scratch):  # pragma: no cover
+    """Return B(A) and the divisor of the Newton step, the larger of Σ w l and Σ π l (see `base`)."""
+    kind, beta, tie = backup.kind, backup.beta, backup.tie
+    best = scratch.advantages[0]
+    for a in range(1, len(scratch.advantages)):
+        best = max(best, scratch.advantages[a])
     total = 0.0 * best
-    below, left, both = total, total, total
-    for a in range(len(scratch.advantage)):
-        behind = scratch.advantage[a] - best
+    below, exits, product = total, total, total
+    for a in range(len(scratch.advantages)):
+        difference = scratch.advantages[a] - best
         if kind == HARD_MAX:
-            odds = 1.0 if behind >= -tie * abs(best) else 0.0
+            weight = 1.0 if difference >= -tie * abs(best) else 0.0
         else:
-            exponent = beta * behind
-            odds = np.exp(exponent) if exponent > _SMALLEST_EXPONENT else 0.0
-        total += odds
-        below += odds * behind
-        left += odds * scratch.leaving[a]
-        both += odds * behind * scratch.leaving[a]
-    share = 1 / total
-    policy_left = left * share
+            exponent = beta * difference
+            weight = np.exp(exponent) if exponent > _SMALLEST_EXPONENT else 0.0
+        total += weight
+        below += weight * difference
+        exits += weight * scratch.exit_weights[a]
+        product += weight * difference * scratch.exit_weights[a]
+    scale = 1 / total
+    policy_exit = exits * scale
     if kind == HARD_MAX:
-        return best, policy_left
+        return best, policy_exit
     if kind == BOLTZMANN:
-        below *= share
-        own_left = policy_left + beta * (both * share - below * policy_left)
-        return best + below, max(own_left, policy_left)
+        below *= scale
+        exact_exit = policy_exit + beta * (product * scale - below * policy_exit)
+        return best + below, max(exact_exit, policy_exit)
     if kind == LOG_SUM_EXP:
-        return best + np.log(total) / beta, policy_left
+        return best + np.log(total) / beta, policy_exit
     # log mean exp, without adding 1 to what may be far smaller
-    gained = 0.0 * best
-    for a in range(len(scratch.advantage)):
-        gained += np.expm1(beta * (scratch.advantage[a] - best))
-    return best + np.log1p(gained / len(scratch.advantage)) / beta, policy_left
+    excess = 0.0 * best
+    for a in range(len(scratch.advantages)):
+        excess += np.expm1(beta * (scratch.advantages[a] - best))
+    return best + np.log1p(excess / len(scratch.advantages)) / beta, policy_exit
 
 
 @inlined()
-def _nothing_to_do(i, actions, width, successors, marks):  # pragma: no cover
-    """Whether neither the state nor a neighbour has changed since the state was last solved."""
-    at = marks.solved[i]
-    nothing = marks.changed[i] != at
+def _is_up_to_date(i, actions, width, successors, history):  # pragma: no cover
+    """Return whether neither the state nor a neighbor has changed since the state was last solved."""
+    at = history.last_solved[i]
+    unchanged = history.last_changed[i] != at
     for a in range(actions):
         for m in range(width):
             j = successors[i, a, m]
-            nothing &= marks.changed[j] < at or (marks.changed[j] == at and j < i)
-    return nothing
+            unchanged &= history.last_changed[j] < at or (history.last_changed[j] == at and j < i)
+    return unchanged
 
 
 @inlined(fastmath=_FAST)
-def _shifted(j, before, moved, size):  # pragma: no cover
-    """The value of a farther state if it has moved by as much as one whose value was of this size."""
-    old = before[j]
+def _shifted_value(j, round_start, moved, size):  # pragma: no cover
+    """Return the value of a farther state moved along with one that has `moved` and was of this size."""
+    old = round_start[j]
     return old + moved * min(abs(old) / size, 1.0) if size > 0 else old + moved
 
 
 @inlined(fastmath=_FAST)
-def _look_around(i, actions, width, world, values, marks, shifted, bottom, reached, scratch):  # pragma: no cover
-    """Fills in what actions are worth; returns the escape, the largest worth's size, and the state's favourite."""
-    row = i if len(world.reward) > 1 else 0
-    before = marks.before
-    moved, size_here = values[i] - before[i], abs(before[i])
-    moves_along = values[i] > reached and before[i] > reached and moved != 0
-    escape, best, size, favourite = bottom, bottom, 0.0 * bottom, i
+def _fill_exit_values(
+    i, actions, width, process, values, history, shift_from, neg_inf, reachable_above, scratch
+):  # pragma: no cover
+    """Fill in c(a); return the repeat-action value, the largest |c(a)|, and the greedy successor."""
+    row = i if len(process.reward) > 1 else 0
+    start = history.round_start
+    moved, size_here = values[i] - start[i], abs(start[i])
+    shifts = values[i] > reachable_above and start[i] > reachable_above and moved != 0
+    repeat_value, best, size, greedy_successor = neg_inf, neg_inf, 0.0 * neg_inf, i
     for a in range(actions):
-        worth = world.reward[row, a]
-        likeliest, toward = 0.0 * worth, i
+        exit_value = process.reward[row, a]
+        likeliest, toward = 0.0 * exit_value, i
         for m in range(width):
-            j, move = world.successors[i, a, m], world.moves[i, a, m]
+            j, move = process.successors[i, a, m], process.discounted_probs[i, a, m]
             value = values[j]
-            if moves_along and j > i and j >= shifted and marks.favourite[j] >= i and reached < before[j] < before[i]:
-                value = _shifted(j, before, moved, size_here)
-            worth += move * value
+            farther = shifts and j > i and j >= shift_from
+            if farther and history.greedy_successor[j] >= i and reachable_above < start[j] < start[i]:
+                value = _shifted_value(j, start, moved, size_here)
+            exit_value += move * value
             if move > likeliest:
                 likeliest, toward = move, j
-        scratch.worths[a] = worth
-        size = max(size, abs(worth))
-        tried = worth * world.patience[i, a] if world.patience[i, a] > 0 else bottom
-        escape = max(escape, tried)
-        nearer = tried if toward < i else bottom
-        favourite = toward if nearer > best else favourite
+        scratch.exit_values[a] = exit_value
+        size = max(size, abs(exit_value))
+        repeated = exit_value * process.self_loop_factor[i, a] if process.self_loop_factor[i, a] > 0 else neg_inf
+        repeat_value = max(repeat_value, repeated)
+        nearer = repeated if toward < i else neg_inf
+        greedy_successor = toward if nearer > best else greedy_successor
         best = max(best, nearer)
-    return escape, size, favourite
+    return repeat_value, size, greedy_successor
 
 
 @inlined(fastmath=_FAST)
-def _shift(i, actions, width, world, values, marks, shifted, reached):  # pragma: no cover
-    """Moves the farther states whose favourite state i is by as much as it has moved in this round."""
-    before = marks.before
-    if values[i] > reached and before[i] > reached:
+def _shift_farther(i, actions, width, process, values, history, shift_from, reachable_above):  # pragma: no cover
+    """Move the farther states of which state i is the greedy successor along with it."""
+    start = history.round_start
+    if values[i] > reachable_above and start[i] > reachable_above:
         for a in range(actions):
             for m in range(width):
-                j = world.successors[i, a, m]
-                if j > i and j >= shifted and marks.favourite[j] == i and reached < before[j] < before[i]:
-                    values[j] = _shifted(j, before, values[i] - before[i], abs(before[i]))
+                j = process.successors[i, a, m]
+                farther = j > i and j >= shift_from
+                if farther and history.greedy_successor[j] == i and reachable_above < start[j] < start[i]:
+                    values[j] = _shifted_value(j, start, values[i] - start[i], abs(start[i]))
 
 
 @inlined(fastmath=_FAST)
-def _solved(i, actions, width, world, valuing, guess, escape, reached, bottom, scratch):  # pragma: no cover
-    """The value by the state's own equation: one Newton step from a guess (see `process`).
+def _solve_state(
+    i, actions, width, process, backup, guess, repeat_value, reachable_above, neg_inf, scratch
+):  # pragma: no cover
+    """Return the root of the state's own equation, by one Newton step from a guess (see `base`).
 
-    A guess far above the root of the log-sum-exp ends below it, perhaps far below, where actions that never leave
-    seemed to matter most; so from there it takes another step.
+    For the log-sum-exp, a step from far above the root ends below it, perhaps far below, where actions that never leave
+    seemed to matter most; so another step follows.
     """
-    above = valuing.kind == LOG_SUM_EXP
-    value = escape
-    if guess > reached:
-        value = max(guess, escape) if above else min(guess, escape)
+    above = backup.kind == LOG_SUM_EXP
+    value = repeat_value
+    if guess > reachable_above:
+        value = max(guess, repeat_value) if above else min(guess, repeat_value)
     for a in range(actions):
-        scratch.leaving[a] = world.ending
+        scratch.exit_weights[a] = process.one_minus_discount
         for m in range(width):
-            scratch.leaving[a] += world.moves[i, a, m]
-    # without a break, out of which numba would count references again (see `Scratch`)
+            scratch.exit_weights[a] += process.discounted_probs[i, a, m]
+    # a break would make numba count references again (see `Scratch`)
     again = True
     for _ in range(_NEWTON_STEPS):
         if again:
             for a in range(actions):
-                scratch.advantage[a] = scratch.worths[a] - scratch.leaving[a] * value
-            gain, divisor = backed_up(valuing, scratch)
+                scratch.advantages[a] = scratch.exit_values[a] - scratch.exit_weights[a] * value
+            gain, divisor = backed_up(backup, scratch)
             step = gain / (divisor if divisor > 0 else 1.0)
-            value = max(value + step, escape) if above else max(min(value + step, escape), bottom)
-            again = above and valuing.beta * step < -_FAR
+            value = max(value + step, repeat_value) if above else max(min(value + step, repeat_value), neg_inf)
+            again = above and backup.beta * step < -_LONG_STEP
     return value
 
 
 @cache
-def sweep_for(actions: int, width: int) -> Any:
-    """The machine code of a sweep for that many actions and outcomes; as constants they make it twice as fast."""
+def sweep_kernel(actions: int, width: int) -> NativeFunction:
+    """Return the native code of a sweep for these numbers; as constants they make it twice as fast."""
 
     @compiled(fastmath=_FAST)
     def sweep(
-        which, valuing, world, values, into, marks, number, first, shifted, everyone, still, bottom
+        positions, backup, process, values, into, history, number, round_first, shift_from, solve_all, skip, neg_inf
     ):  # pragma: no cover
-        """Solves the own equations of the states at the positions `which` (ascending), in sweep `number`.
+        """Solve the own equations of the states at ascending positions.
 
-        The new values go `into` an array: that of the values themselves if states are to see those solved before them.
-        States with nothing to do are left out, unless `everyone` takes part. Values from the position `shifted` on are
-        shifted; `first` is the first sweep of the present round over all states. Returns the largest relative change,
-        NaN if any is, and how many states were solved.
+        Args:
+            positions: The states.
+            backup: `NativeBackup`.
+            process: `NumberedProcess`.
+            values: The values by position.
+            into: The array of the new values: `values` itself for states to see those solved before them.
+            history: `SweepHistory`.
+            number: The sweep's number.
+            round_first: The number of the first sweep of the present round over all states.
+            shift_from: Values from this position on are shifted.
+            solve_all: Whether no state is skipped.
+            skip: The relative change that counts as none.
+            neg_inf: The stand-in for −∞.
+
+        Returns:
+            The largest relative change, NaN if any is, and the number of states that were solved.
         """
         scratch = Scratch(
             np.empty(actions, values.dtype), np.empty(actions, values.dtype), np.empty(actions, values.dtype)
         )
-        changed, solved = marks.changed, marks.solved
+        last_changed, last_solved = history.last_changed, history.last_solved
         # below this lie values at discount 1 of states that cannot reach a terminal state
-        reached = -np.sqrt(-bottom)
-        smallest = np.finfo(values.dtype).tiny / still
-        largest = 0.0 * bottom
-        at_work = 0
-        for index in range(len(which)):
-            i = which[index]
-            if world.fixed[i]:
+        reachable_above = -np.sqrt(-neg_inf)
+        smallest = np.finfo(values.dtype).tiny / skip
+        largest = 0.0 * neg_inf
+        solved = 0
+        for index in range(len(positions)):
+            i = positions[index]
+            if process.terminal[i]:
                 continue
-            if not everyone and _nothing_to_do(i, actions, width, world.successors, marks):
-                solved[i] = number
+            if not solve_all and _is_up_to_date(i, actions, width, process.successors, history):
+                last_solved[i] = number
                 continue
-            at_work += 1
-            escape, size, marks.favourite[i] = _look_around(
-                i, actions, width, world, values, marks, shifted, bottom, reached, scratch
+            solved += 1
+            repeat_value, size, history.greedy_successor[i] = _fill_exit_values(
+                i, actions, width, process, values, history, shift_from, neg_inf, reachable_above, scratch
             )
-            old, value = marks.before[i] if solved[i] < first else values[i], bottom
-            if escape > reached:
-                value = _solved(i, actions, width, world, valuing, values[i], escape, reached, bottom, scratch)
+            old, value = history.round_start[i] if last_solved[i] < round_first else values[i], neg_inf
+            if repeat_value > reachable_above:
+                value = _solve_state(
+                    i, actions, width, process, backup, values[i], repeat_value, reachable_above, neg_inf, scratch
+                )
             change, scale = abs(value - old), max(abs(value), size, smallest)
-            if not (old > reached or value > reached):
-                change = 0.0 * bottom
+            if not (old > reachable_above or value > reachable_above):
+                change = 0.0 * neg_inf
             into[i] = value
-            solved[i] = number
-            if not change <= still * scale:
-                changed[i] = number
-                if shifted < len(values):
-                    _shift(i, actions, width, world, values, marks, shifted, reached)
+            last_solved[i] = number
+            if not change <= skip * scale:
+                last_changed[i] = number
+                if shift_from < len(values):
+                    _shift_farther(i, actions, width, process, values, history, shift_from, reachable_above)
             if change > largest * scale or np.isnan(change):
                 largest = change / scale
-        return largest, at_work
+        return largest, solved
 
     return sweep
 
 
 @cache
-def first_values_for(actions: int, width: int) -> Any:
-    """The machine code of values to begin with, for that many actions and outcomes."""
+def first_values_kernel(actions: int, width: int) -> NativeFunction:
+    """Return the native code of first values for these numbers."""
 
     @compiled()
-    def first_values(valuing, world, values, bottom, bound):  # pragma: no cover
-        """Fills in values that are not known (`bottom`), by order: what the moves to nearer states make of a state.
+    def first_values(backup, process, values, neg_inf, bound):  # pragma: no cover
+        """Fill in unknown values (`neg_inf`), nearest first, by the moves to nearer states.
 
-        An action that does not lead to any counts as one that costs its price twice, there and back. Where nothing
-        nearer is known the value is `bound`.
+        An action that leads to none counts as one that costs its price twice, there and back. Where no nearer state is
+        known the value is `bound`.
         """
         scratch = Scratch(
             np.empty(actions, values.dtype), np.empty(actions, values.dtype), np.empty(actions, values.dtype)
         )
         for i in range(len(values)):
-            if world.fixed[i] or values[i] > bottom:
+            if process.terminal[i] or values[i] > neg_inf:
                 continue
-            value, reached = bound, False
+            value, is_known = bound, False
             for a in range(actions):
-                scratch.worths[a] = world.reward[i if len(world.reward) > 1 else 0, a]
-                scratch.leaving[a] = world.ending
+                scratch.exit_values[a] = process.reward[i if len(process.reward) > 1 else 0, a]
+                scratch.exit_weights[a] = process.one_minus_discount
                 for m in range(width):
-                    j = world.successors[i, a, m]
-                    if j < i and values[j] > bottom:
-                        scratch.worths[a] += world.moves[i, a, m] * values[j]
-                        scratch.leaving[a] += world.moves[i, a, m]
-                if scratch.leaving[a] > world.ending:
-                    escape = scratch.worths[a] / scratch.leaving[a]
-                    value = max(value, escape) if reached else escape
-                    reached = True
-            if reached:
+                    j = process.successors[i, a, m]
+                    if j < i and values[j] > neg_inf:
+                        scratch.exit_values[a] += process.discounted_probs[i, a, m] * values[j]
+                        scratch.exit_weights[a] += process.discounted_probs[i, a, m]
+                if scratch.exit_weights[a] > process.one_minus_discount:
+                    repeat_value = scratch.exit_values[a] / scratch.exit_weights[a]
+                    value = max(value, repeat_value) if is_known else repeat_value
+                    is_known = True
+            if is_known:
                 for a in range(actions):
-                    scratch.advantage[a] = scratch.worths[a] - scratch.leaving[a] * value
-                    if not scratch.leaving[a] > world.ending:
-                        scratch.advantage[a] += min(scratch.worths[a], 0.0)
-                gain, divisor = backed_up(valuing, scratch)
+                    scratch.advantages[a] = scratch.exit_values[a] - scratch.exit_weights[a] * value
+                    if not scratch.exit_weights[a] > process.one_minus_discount:
+                        scratch.advantages[a] += min(scratch.exit_values[a], 0.0)
+                gain, divisor = backed_up(backup, scratch)
                 value += gain / (divisor if divisor > 0 else 1.0)
             values[i] = value
 

@@ -1,9 +1,9 @@
-"""Values, from where a task ends outwards, on the host: what to start from, in which order, and which states.
+"""Values by Gauss–Seidel value iteration on the host: where a solve starts, in which order, and over which states.
 
-An earlier solve's values are taken on trust for some sweeps; if they have not converged by then, the solve starts from
-no values and in a new order. An order is kept as long as few states want to go to a farther one. States outside the
-region are swept once and then only moved along, as long as an earlier solve's values serve; from no values, and if the
-region is empty, all are solved.
+A start's values are trusted for some sweeps. If they have not converged by then, the solve starts anew without values
+and with a new order. An order is kept as long as few states have a greedy successor that is farther than they are.
+States outside the region are swept once and then only shifted, as long as the start's values serve; without values,
+and if the region is empty, all states are solved.
 """
 
 from typing import NamedTuple
@@ -12,34 +12,44 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sidestep.tabular.solvers.base import neg_inf
-from sidestep.tabular.solvers.given import Found, Given, Outcome, given_from, positions, sizes, write
-from sidestep.tabular.solvers.native import shared_out
-from sidestep.tabular.solvers.numbering import Numbered, numbered, numbering_for
-from sidestep.tabular.solvers.ordering import order_by_distance
-from sidestep.tabular.solvers.rounds import Rounds
-from sidestep.tabular.solvers.value_kernels import Valuing, first_values_for
+from sidestep.tabular.solvers.native import (
+    HostProcess,
+    HostResult,
+    NativeBackup,
+    SolveInfo,
+    inverse_permutation,
+    map_ranges,
+)
+from sidestep.tabular.solvers.ordering import NumberedProcess, number_process, order_by_distance
+from sidestep.tabular.solvers.sweep_loop import SweepLoop
+from sidestep.tabular.solvers.value_kernels import first_values_kernel
 
 _OUT_OF_ORDER = 0.05
-"""The share of states that may want to go to a farther one, before states are put in order anew."""
+"""The fraction of states with a farther greedy successor beyond which a new order is made."""
 _TRUST = 1.2
-"""How many sweeps a solve that starts from an earlier one's values may take for each digit of the tolerance.
+"""The number of sweeps for each digit of the tolerance that a start's values are trusted for.
 
-A start that leads astray makes changes run along a front that the old order cannot follow, a stretch a round.
+After a bad start changes run along a front that the old order cannot follow, a block a round.
 """
 _TRUSTED_ROUNDS = 4
-"""How many rounds it may take for each of these sweeps; most rounds solve few states, and are cheap."""
+"""The number of rounds for each of these sweeps; most rounds solve few states, and are cheap."""
 
 
-class _Asked(NamedTuple):
-    """What is to be solved, and how well; `bound` is no more than any value."""
+class _Problem(NamedTuple):
+    """What is to be solved, and how well; `bound` is a lower bound of the values."""
 
-    given: Given
-    valuing: Valuing
+    process: HostProcess
+    backup: NativeBackup
     bound: np.floating
     tolerance: np.floating
 
+    def has_nan(self) -> bool:
+        process = self.process
+        numbers = (process.probabilities, process.reward, process.terminal_reward, process.discount)
+        return any(np.isnan(np.min(part)) for part in (*numbers, self.backup.beta, self.tolerance))
 
-def find_values(
+
+def solve_values(
     kind: int,
     tie: float,
     max_sweeps: int,
@@ -52,109 +62,106 @@ def find_values(
     region: Bool[np.ndarray, " states"],
     tolerance: Float[np.ndarray, ""],
 ) -> None:
-    """Writes values and how they were found `into` the arrays of `Found`.
+    """Solve for the values and write them into the arrays of `HostResult`.
 
-    `kind` and `tie` as in `Valuing`, `process` as in `given_from`, `bound` as in `_Asked`, `start` and `order` as in
-    `WarmStart`, `region` as for `Solver.values`.
+    Args:
+        kind, tie, beta: The backup (see `NativeBackup`).
+        max_sweeps: When to stop (see `GaussSeidel`).
+        into: The arrays of `HostResult`.
+        process: The arrays of `HostProcess`.
+        bound: A lower bound of the values.
+        start, order: As in `WarmStart`.
+        region: The states that have to be solved.
+        tolerance: The relative change at which to stop.
     """
     number = start.dtype.type
-    valuing = Valuing(kind, number(beta), number(tie))
-    asked = _Asked(given_from(process), valuing, number(bound), number(tolerance))
-    found = Found(*into)
-    if _anything_missing(asked):
-        found.values[:] = np.nan
-        write(found, order, Outcome(0, np.nan, False))
+    backup = NativeBackup(kind, number(beta), number(tie))
+    problem = _Problem(HostProcess.from_arrays(process), backup, number(bound), number(tolerance))
+    result = HostResult(*into)
+    if problem.has_nan():
+        result.values[:] = np.nan
+        result.write(order, SolveInfo(0, np.nan, False))
         return
-    nothing = number(neg_inf(start.dtype))
-    outcome = Outcome(0, np.inf, False)
+    unknown = number(neg_inf(start.dtype))
+    info = SolveInfo(0, np.inf, False)
     region = region if region.any() else np.ones_like(region)
-    if (start > nothing).any():
-        digits = -np.log10(max(asked.tolerance, np.finfo(start.dtype).eps))
-        trusted = int(np.ceil(_TRUST * max(1.0, digits)))
-        trusted = min(trusted, max_sweeps)
-        outcome = _start_from(start, order, region, asked, trusted, _TRUSTED_ROUNDS * trusted, found)
-    if not outcome.converged and outcome.sweeps < max_sweeps:
-        # where values led astray, their order is no better
-        cold, known_order = np.full_like(start, nothing), np.full_like(order, -1) if outcome.sweeps else order
-        left = max_sweeps - outcome.sweeps
-        again = _start_from(cold, known_order, np.ones_like(region), asked, left, left, found)
-        outcome = again._replace(sweeps=outcome.sweeps + again.sweeps)
-    write(found, found.order, outcome)
+    if (start > unknown).any():
+        digits = -np.log10(max(problem.tolerance, np.finfo(start.dtype).eps))
+        trusted = min(int(np.ceil(_TRUST * max(1.0, digits))), max_sweeps)
+        info = _solve_from(start, order, region, problem, trusted, _TRUSTED_ROUNDS * trusted, result)
+    if not info.converged and info.sweeps < max_sweeps:
+        # where the start's values did not serve, its order is no better
+        cold, known_order = np.full_like(start, unknown), np.full_like(order, -1) if info.sweeps else order
+        left = max_sweeps - info.sweeps
+        again = _solve_from(cold, known_order, np.ones_like(region), problem, left, left, result)
+        info = again._replace(sweeps=info.sweeps + again.sweeps)
+    result.write(result.order, info)
 
 
-def _anything_missing(asked: _Asked) -> bool:
-    """Whether anything is not a number."""
-    given = asked.given
-    parts = (
-        given.probabilities,
-        given.reward,
-        given.terminal_reward,
-        given.discount,
-        asked.valuing.beta,
-        asked.tolerance,
-    )
-    return any(np.isnan(np.min(part)) for part in parts)
-
-
-def _start_from(
+def _solve_from(
     start: Float[np.ndarray, " states"],
     order: Int[np.ndarray, " states"],
     region: Bool[np.ndarray, " states"],
-    asked: _Asked,
+    problem: _Problem,
     max_sweeps: int,
     max_rounds: int,
-    found: Found,
-) -> Outcome:
-    """Solves from values and an order that may serve; writes down the values and the order that did."""
-    position = positions(order)
-    begun = _begin(start, order, position, asked) if position is not None else None
-    if begun is None or begun.astray > _OUT_OF_ORDER * len(order):
-        given = asked.given
-        best = order_by_distance(
-            given.successors, given.probabilities, given.reward, given.terminal, float(given.discount)
-        )
-        position = positions(best)
+    result: HostResult,
+) -> SolveInfo:
+    """Solve from values and an order, or a new one if that does not serve; write the values and the order."""
+    position = inverse_permutation(order)
+    begun = None if position is None else _begin(start, order, position, problem)
+    if begun is None or begun.out_of_order > _OUT_OF_ORDER * len(order):
+        best = order_by_distance(problem.process)
+        position = inverse_permutation(best)
         assert position is not None
-        begun = _begin(start, best, position, asked)
-    everyone = np.arange(len(order), dtype=np.int32)
-    which = everyone if region.all() else everyone[region[begun.order]]
-    rounds = Rounds(
-        begun.world, begun.values, begun.favourite, which, asked.valuing, asked.tolerance, max_sweeps, max_rounds
+        begun = _begin(start, best, position, problem)
+    positions = np.arange(len(order), dtype=np.int32)
+    if not region.all():
+        positions = positions[region[begun.order]]
+    loop = SweepLoop(
+        begun.process,
+        begun.values,
+        begun.greedy_successor,
+        positions,
+        problem.backup,
+        problem.tolerance,
+        max_sweeps,
+        max_rounds,
     )
-    outcome = rounds.until_still()
-    found.values[begun.order] = begun.values
-    found.order[:] = begun.order
-    return outcome
+    info = loop.run()
+    result.values[begun.order] = begun.values
+    result.order[:] = begun.order
+    return info
 
 
 class _Begun(NamedTuple):
-    """A task with its states numbered by an order, and first values for all of them.
+    """A task numbered in an order, with first values for all states.
 
-    `favourite` is where each state wants to go by the values that it started from, the state itself where these are not
-    known; `astray` says how many want to go to a farther one.
+    Attributes:
+        greedy_successor: By the values of the start; the state itself where these are unknown.
+        out_of_order: The number of states with a farther greedy successor.
     """
 
     order: Int[np.ndarray, " states"]
-    world: Numbered
+    process: NumberedProcess
     values: Float[np.ndarray, " states"]
-    favourite: Int[np.ndarray, " states"]
-    astray: int
+    greedy_successor: Int[np.ndarray, " states"]
+    out_of_order: int
 
 
 def _begin(
     start: Float[np.ndarray, " states"],
     order: Int[np.ndarray, " states"],
     position: Int[np.ndarray, " states"],
-    asked: _Asked,
+    problem: _Problem,
 ) -> _Begun:
-    given, bottom = asked.given, start.dtype.type(neg_inf(start.dtype))
-    run = numbering_for(*sizes(given))
-    world = numbered(run, given, order, position)
-    values, fixed = start[order], np.flatnonzero(world.fixed)
-    values[fixed] = np.broadcast_to(given.terminal_reward, start.shape)[order[fixed]]
-    favourite = np.empty_like(order)
-    astray = sum(
-        shared_out(lambda begin, end: run.favourites(begin, end, world, values, bottom, favourite), len(order))
+    unknown = start.dtype.type(neg_inf(start.dtype))
+    process, kernels = number_process(problem.process, order, position)
+    values, ends = start[order], np.flatnonzero(process.terminal)
+    values[ends] = np.broadcast_to(problem.process.terminal_reward, start.shape)[order[ends]]
+    greedy = np.empty_like(order)
+    counts = map_ranges(
+        lambda begin, end: kernels.greedy_successors(begin, end, process, values, unknown, greedy), len(order)
     )
-    first_values_for(*world.moves.shape[1:])(asked.valuing, world, values, bottom, asked.bound)
-    return _Begun(order, world, values, favourite, astray)
+    first_values_kernel(*process.discounted_probs.shape[1:])(problem.backup, process, values, unknown, problem.bound)
+    return _Begun(order, process, values, greedy, sum(counts))
