@@ -15,7 +15,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import field, fields, replace
+from dataclasses import field, fields, is_dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -51,40 +51,60 @@ def option(
     return field(default_factory=lambda: copy.copy(default), metadata=metadata)
 
 
-def changed(settings: Any, overrides: Sequence[str], fixed: Sequence[str] = ()) -> Any:
+def flat(settings: Any, prefix: str = "") -> dict[str, Any]:
+    """Return the fields of a dataclass and of the dataclasses in it, by names with dots."""
+    values = {}
+    for each in fields(settings):
+        value = getattr(settings, each.name)
+        values |= flat(value, f"{prefix}{each.name}.") if is_dataclass(value) else {prefix + each.name: value}
+    return values
+
+
+def changed(settings: Any, overrides: Sequence[str]) -> Any:
     """Return a dataclass with some fields changed, each written as `field=value`; `null` is None.
 
+    The name of a field in another dataclass may be shortened to its last part.
+
     Raises:
-        InputError: for a field that does not exist or is `fixed`, and for a value of another type.
+        InputError: for a field that does not exist, and for a value of another type.
     """
-    hints, values = get_type_hints(type(settings)), {}
-    known = [each.name for each in fields(settings) if each.name not in fixed]
     for override in overrides:
         name, _, text = override.partition("=")
-        if name not in known:
-            raise InputError(f"expected one of {', '.join(known)} and a value, found {override!r}", source="--set")
-        values[name] = yaml.safe_load(text)
-        if not _fits(values[name], hints[name]):
-            raise InputError(f"cannot be {text!r}", source="--set", field=name)
-    return replace(settings, **values)
+        names = [known for known in flat(settings) if f".{known}".endswith(f".{name}")]
+        if not names:
+            expected = ", ".join(flat(settings))
+            raise InputError(f"expected one of {expected} and a value, found {override!r}", source="--set")
+        settings = _replaced(settings, names[0].split("."), yaml.safe_load(text))
+    return settings
+
+
+def _replaced(settings: Any, path: Sequence[str], value: Any) -> Any:
+    name, *rest = path
+    hint = get_type_hints(type(settings))[name]
+    if rest:
+        value = _replaced(getattr(settings, name), rest, value)
+    elif type(value) is int and float in (hint, *get_args(hint)):
+        value = float(value)
+    elif not _fits(value, hint):
+        raise InputError(f"cannot be {value!r}", source="--set", field=name)
+    return replace(settings, **{name: value})
 
 
 def described(settings: Any) -> str:
     """Return the fields of a dataclass that differ from its defaults, as text."""
-    default = type(settings)()
-    pairs = [(each.name, getattr(settings, each.name), getattr(default, each.name)) for each in fields(settings)]
-    return ", ".join(f"{name}={value}" for name, value, shipped in pairs if value != shipped) or "the defaults"
+    default = flat(type(settings)())
+    return (
+        ", ".join(f"{name}={value}" for name, value in flat(settings).items() if value != default[name]) or "defaults"
+    )
 
 
 def _fits(value: object, hint: Any) -> bool:
-    """Return whether a value is of a field's type; whole numbers are numbers."""
+    """Return whether a value is of a field's type."""
     if get_origin(hint) is Literal:
         return value in get_args(hint)
     if get_args(hint):
         return any(_fits(value, one) for one in get_args(hint))
-    if hint is bool:
-        return isinstance(value, bool)
-    return isinstance(value, (int, float) if hint is float else hint) and not isinstance(value, bool)
+    return type(value) is hint
 
 
 # ---------------------------------------------------------------------------------------------------- time

@@ -20,7 +20,11 @@ BENCHMARKS = {
     "scaling": "the cost of a gradient against the size of the map",
     "gradients": "a gradient by the adjoint, beside other ways to it",
     "planning": "plans and soft values, beside other planners",
+    "fits": "large maps end to end: hide walls, simulate walks, learn, score",
     "rollouts": "roll-outs of continuous worlds: speed, and the noise of gradient estimators",
+    "people": "walls learned from real walks in the twelve Tartarus mazes",
+    "baselines": "all methods of `sidestep compare`: walls, held-out actions, robots with new goals",
+    "towns": "one-way streets from taxi trips in Shanghai, buildings from drives in MAGELLAN's towns",
 }
 
 
@@ -39,9 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for key, how in _arguments(module):
         parser.add_argument(key, **how)
     if parser.parse_args(chosen.options).quick:
-        parser.set_defaults(
-            **{each.name: quick for each in fields(module.Options) if (quick := each.metadata["quick"])}
-        )
+        quick = {each.name: each.metadata["quick"] for each in fields(module.Options)}
+        parser.set_defaults(**{name: value for name, value in quick.items() if value is not None})
     try:
         return run(module, parser.parse_args(chosen.options), parser)
     except SidestepError as error:

@@ -1,159 +1,85 @@
-"""Large fits end to end: hide part of a map's walls, simulate walks of people who know them, learn, score.
+"""Large fits end to end: hide a part of a map's walls, simulate walks of agents that know them, learn, score.
 
-    python benchmarks/fits.py
-    python benchmarks/fits.py --maps ../shared/data/maps/depot.yaml --goals 32 --walks 320
-    python benchmarks/fits.py --quick
+    python -m benchmarks fits --set wall_prior=0
+    python -m benchmarks fits --maps ../shared/data/maps/warehouse.yaml --goals 32 --walks 320
 
-A share of the wall cells, drawn at random, is hidden from the learner, and as many times `--free` free cells with them:
-all of these are unknown to it, the rest of the map is known. Walkers take shortest ways (ties at random) at a step cost
-of 1 and no discount. Scored are the unknown cells: how well P(blocked) ranks the hidden walls that matter (those whose
-opening alone would have shortened somebody's way) above the free cells, beside the ranking by how rarely they were
-visited. `--lines` is what it is worth to a blocked cell, in nats, to lie between two others: walls are lines.
+A fraction of the wall cells, drawn at random, is hidden from the learner, and `--free` times as many free cells: all of
+these are unknown to it, and it knows the rest of the map. Walks are shortest ones (ties at random) at a step cost of 1
+and no discount. Scored are the unknown cells: how well P(blocked) ranks the relevant hidden walls (those that would
+have shortened a walk if they alone were open) above the free cells, beside the ranking by how rarely they were visited.
+
+Records: those of `people.py`, with `cells`, `goals`, `walks`, `hidden_walls`, `relevant_walls`, `peak_bytes` (of the
+whole process up to then).
 """
 
-import argparse
-import sys
-import time
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from measuring import argument_parser, main, note, number, peak_bytes, print_table, write_records
-from sidestep.cli.simulate import Walkers, walk
-from sidestep.evaluation.metrics import score_map, visit_ranking
+from benchmarks import SHARED_DATA, Record, changed, described, flat, option, peak_bytes, print_table
+from benchmarks.people import Maze, learn_by
 from sidestep.evaluation.relevance import relevant_obstacles
-from sidestep.inference.maximize import Progress
+from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map
-from sidestep.maps.config import Settings, fit_map
-from sidestep.tabular.demonstrations import Demonstrations, gather
+from sidestep.io.trajectories import walks_from_trajectories
+from sidestep.maps.config import BehaviorConfig, MapConfig, PriorConfig, SimulationConfig
+from sidestep.maps.learn import demonstrations_of
 from sidestep.tabular.grid import Cell, Grid
-from sidestep.tabular.models import ObstacleGrid
-from sidestep.tabular.tasks import reach
+from sidestep.tabular.reward import Reward
 from sidestep.worlds.offices import office
+from sidestep.worlds.walks import simulate_walks
 
-MAPS = Path(__file__).parents[2] / "shared" / "data" / "maps"
+SHORTEST = Reward(discount=1.0, step_cost=1.0)
+CONFIG = MapConfig(SHORTEST, BehaviorConfig("logsumexp", beta=5.0), PriorConfig(mean=0.0, variance=4.0, wall_prior=1.0))
 
 
-def hidden(truth: Grid, share: float, free: float, seed: int) -> Grid:
-    """The map that a learner is given; what the truth itself does not know is blocked to walkers, and told to be."""
-    random = np.random.default_rng(seed)
+@dataclass
+class Options:
+    """The options of this benchmark."""
+
+    maps: list[Path] = option([SHARED_DATA / "maps" / "depot.yaml"], "maps; none for a small office", quick=[])
+    goals: int = option(32, "different goals", quick=4)
+    walks: int = option(320, "walks", quick=40)
+    hidden: float = option(0.25, "the fraction of wall cells that is hidden")
+    free: float = option(3.0, "hidden free cells for each hidden wall cell")
+    seed: int = option(0, "draws what is hidden, goals and walks", least=0)
+    set: list[str] = option([], f"FIELD=VALUE, of {', '.join(flat(CONFIG))}")
+
+
+def hide(truth: Grid, options: Options) -> Grid:
+    """Return what a learner knows; cells that the true map does not know are blocked to walkers, and known to be."""
+    random = np.random.default_rng(options.seed)
     known = np.where(truth.known == Cell.FREE, Cell.FREE, Cell.OCCUPIED).astype(np.int64)
     walls = np.flatnonzero(truth.known == Cell.OCCUPIED)
-    walls = random.choice(walls, int(share * len(walls)), replace=False)
-    others = random.choice(np.flatnonzero(truth.known == Cell.FREE), int(free * len(walls)), replace=False)
+    walls = random.choice(walls, int(options.hidden * len(walls)), replace=False)
+    others = random.choice(np.flatnonzero(truth.known == Cell.FREE), int(options.free * len(walls)), replace=False)
     known.flat[walls] = known.flat[others] = Cell.UNKNOWN
     return replace(truth, known=known)
 
 
-def walks_in(truth: Grid, given: Grid, arguments: argparse.Namespace) -> Demonstrations:
-    """Shortest walks of people who know the truth, as the learner sees them."""
-    walkers = Walkers(arguments.walks, arguments.goals, discount=1.0, step_cost=1.0, seed=arguments.seed)
-    trajectories, goals = walk(truth, walkers)
-    return gather(trajectories, [reach(given, goal, discount=1.0, step_cost=1.0) for goal in goals])
+def measure(options: Options) -> Iterator[Record]:
+    """Yield a record for each map and method."""
+    maps = {path.stem: read_map(path) for path in options.maps} or {"office": office(40, 60, seed=0)}
+    config = changed(CONFIG, options.set)
+    for name, truth in maps.items():
+        blank = hide(truth, options)
+        walking = SimulationConfig(options.walks, options.goals, reward=SHORTEST, seed=options.seed)
+        walks = walks_from_trajectories(*simulate_walks(truth, walking), truth)
+        visited = demonstrations_of(grid_walks(walks, blank), blank, config).visited_state_goals()
+        unknown = blank.known == Cell.UNKNOWN
+        relevant = unknown & relevant_obstacles(truth, visited[:, 0], visited[:, 1])
+        sizes = {"cells": truth.size, "goals": options.goals, "walks": options.walks, "relevant_walls": relevant.sum()}
+        sizes["hidden_walls"] = (unknown & (truth.known == Cell.OCCUPIED)).sum()
+        for record, *_ in learn_by(("behavior", "visits"), Maze(name, blank, truth, walks), config):
+            yield {**record, **sizes, "peak_bytes": peak_bytes()}
 
 
-def measure(name: str, truth: Grid, arguments: argparse.Namespace) -> dict[str, Any]:
-    """The record of one map."""
-    given = hidden(truth, arguments.share, arguments.free, arguments.seed)
-    demonstrations = walks_in(truth, given, arguments)
-    settings = Settings(
-        backup=arguments.backup,
-        beta=arguments.beta,
-        discount=1.0,
-        step_cost=1.0,
-        prior_mean=arguments.prior_mean,
-        prior_variance=arguments.prior_variance,
-        lines=arguments.lines,
-        iterations=arguments.iterations,
-        memory=arguments.memory,
-    )
-
-    def report(progress: Progress) -> None:
-        seconds = time.perf_counter() - started
-        note(f"{name}: {progress.iteration} after {seconds:.0f} s, objective {progress.objective:.2f}")
-
-    started = time.perf_counter()
-    found = fit_map(ObstacleGrid(given, settings.prior_mean), demonstrations, settings, report)
-    seconds = time.perf_counter() - started
-    visited = demonstrations.visited_state_goals()
-    unknown, relevant = given.known == Cell.UNKNOWN, relevant_obstacles(truth, visited[:, 0], visited[:, 1])
-    scores = score_map(np.asarray(found.model.blocked), truth, unknown, relevant)
-    visit_counts = score_map(visit_ranking(visited[:, 0], truth), truth, unknown, relevant)
-    return {
-        "name": name,
-        "backup": arguments.backup,
-        "cells": truth.size,
-        "tasks": arguments.goals,
-        "cold_seconds": seconds,
-        "warm_seconds": None,
-        "dijkstra_seconds": None,
-        "peak_bytes": peak_bytes(),
-        "walks": arguments.walks,
-        "moves": len(demonstrations),
-        "hidden_walls": int((unknown & (truth.known == Cell.OCCUPIED)).sum()),
-        "hidden_walls_that_matter": int((unknown & relevant).sum()),
-        "iterations": found.final.iteration,
-        "converged": found.converged,
-        "largest_gradient": found.final.gradient,
-        "objective": found.final.objective,
-        "average_precision_relevant": scores.average_precision_relevant,
-        "by_visits": visit_counts.average_precision_relevant,
-    }
-
-
-def run(arguments: argparse.Namespace) -> None:
-    """Measures, prints and writes what the arguments ask for."""
-    maps = {path.stem: read_map(path) for path in arguments.maps}
-    if arguments.quick:
-        maps = {"office": office(40, 60, seed=0)}
-        arguments.goals, arguments.walks = 4, 40
-    records = [measure(name, truth, arguments) for name, truth in maps.items()]
-    print_table(
-        f"{arguments.backup}, β={arguments.beta:g}, prior N({arguments.prior_mean:g}, {arguments.prior_variance:g}), "
-        f"lines {arguments.lines:g}; "
-        f"{arguments.share:.0%} of the wall cells hidden",
-        ("map", "cells", "goals", "walks", "that matter", "AP", "by visits", "iterations", "converged", "s", "GiB"),
-        [
-            (
-                record["name"],
-                str(record["cells"]),
-                str(record["tasks"]),
-                str(record["walks"]),
-                str(record["hidden_walls_that_matter"]),
-                number(record["average_precision_relevant"], ".3f"),
-                number(record["by_visits"], ".3f"),
-                str(record["iterations"]),
-                str(record["converged"]),
-                number(record["cold_seconds"], ".0f"),
-                number(record["peak_bytes"] / 2**30, ".2f"),
-            )
-            for record in records
-        ],
-        left=("map",),
-    )
-    write_records(arguments, records)
-
-
-def _arguments() -> argparse.Namespace:
-    parser = argument_parser("Large fits end to end.", "a small office only")
-    add = parser.add_argument
-    add("--maps", type=Path, nargs="+", default=[MAPS / "depot.yaml"], metavar="MAP.yaml")
-    add("--goals", type=int, default=32)
-    add("--walks", type=int, default=320)
-    add("--share", type=float, default=0.25, help="of the wall cells that is hidden")
-    add("--free", type=float, default=3.0, help="how many free cells are hidden for each wall cell")
-    add("--backup", default="logsumexp")
-    add("--beta", type=float, default=5.0)
-    add("--prior-mean", type=float, default=0.0)
-    add("--prior-variance", type=float, default=4.0)
-    add("--lines", type=float, default=1.0)
-    add("--iterations", type=int, help="at most this many")
-    add("--memory", type=float, default=2.0, help="GiB for the fit's arrays")
-    add("--seed", type=int, default=0)
-    return parser.parse_args()
-
-
-if __name__ == "__main__":
-    sys.exit(main(run, _arguments()))
+def show(records: Sequence[Record], options: Options) -> None:
+    """Print the table."""
+    columns = {"map": "problem", "cells": "cells", "goals": "goals", "walks": "walks", "moves": "moves"}
+    columns |= {"relevant": "relevant_walls", "method": "method", "average precision": "average_precision_relevant .3f"}
+    columns |= {"iterations": "iterations", "converged": "converged", "s": "seconds .0f", "GiB": "peak_bytes GiB"}
+    settings = described(changed(CONFIG, options.set))
+    print_table(f"{options.hidden:.0%} of the wall cells hidden, {settings}", records, columns)

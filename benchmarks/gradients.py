@@ -6,7 +6,7 @@
 The problem is that of `scaling.py`, with one task. These methods compute the gradient of the walkers' action
 log-likelihood with respect to all parameters, the values included:
 
-- sidestep gauss-seidel, sidestep jacobi: the adjoint, as a fit computes it, cold and warm (see `scaling.py`);
+- sidestep gauss_seidel, sidestep jacobi: the adjoint, as a fit computes it, cold and warm (see `scaling.py`);
 - unrolled: JAX's reverse-mode differentiation through plain value iteration, which keeps every sweep in memory;
 - dense implicit: values by Gauss–Seidel, and the adjoint from `jnp.linalg.solve` of the dense Jacobian;
 - optimistix: `optimistix.fixed_point` of one plain backup with its default `ImplicitAdjoint`, which builds that
@@ -23,7 +23,7 @@ Gauss–Seidel at a tolerance of 1e-12, or as small as it gets). A method that n
 that takes longer than `--limit` is timed once and not run on larger maps. Memory is measured for the first backup.
 
 Records: `name`, `model`, `backup`, `cells`, `parameters`, `tasks`, `cold_seconds`, `warm_seconds`, `dijkstra_seconds`
-(medians), `best_seconds`, `ratio` (to `sidestep gauss-seidel`, cold, in the same turn: above 1 is slower), `difference`
+(medians), `best_seconds`, `ratio` (to `sidestep gauss_seidel`, cold, in the same turn: above 1 is slower), `difference`
 (from the exact gradient, relative to its largest component), `sweeps`, `compiled_bytes` (by XLA), `compile_seconds`,
 `turns`, the fields of `benchmarks.peak_memory`, `failed` (null, or why it was not run).
 """
@@ -55,20 +55,10 @@ from benchmarks import (
     place,
     print_faster,
     print_table,
+    scaling,
     seconds_of,
 )
-from benchmarks.scaling import (
-    SOLVERS,
-    GradientOptions,
-    Problem,
-    World,
-    described,
-    draw,
-    half_learned_office,
-    stepped,
-    take,
-)
-from benchmarks.scaling import problem_of as problem_in
+from benchmarks.scaling import Problem, World, draw, take
 from sidestep.errors import NotConverged
 from sidestep.tabular.forward_gradients import forward_gradient
 from sidestep.tabular.models import TabularModel
@@ -84,7 +74,7 @@ Result = tuple[Array, Array]  # a gradient (or values), and the number of sweeps
 
 
 @dataclass
-class Options(GradientOptions):
+class Options(scaling.GradientOptions):
     """The options of this benchmark."""
 
     backups: list[str] = option(["boltzmann", "logsumexp"], "names of backups", quick=["boltzmann"])
@@ -106,7 +96,7 @@ class Options(GradientOptions):
 
 def problem_of(world: World, model: str, backup: str, options: Options) -> Problem:
     """Return the problem in a world, in one parametrization."""
-    problem = problem_in(world, backup, options)
+    problem = scaling.problem_of(world, backup, options)
     solving = SolveOptions(options.gradient, solver=problem.solving.solver)  # pyright: ignore[reportArgumentType]
     problem = eqx.tree_at(lambda p: p.solving, problem, solving)
     if model == "cells":
@@ -211,7 +201,7 @@ def forward(problem: Problem, parameters: Array) -> Result:
 
 
 METHODS: Mapping[str, Callable[..., Result]] = {
-    "sidestep gauss-seidel": adjoint,
+    "sidestep gauss_seidel": adjoint,
     "sidestep jacobi": adjoint,
     "values": solved,
     "plain values": plain_values,
@@ -247,7 +237,7 @@ def with_solver(name: str, problem: Problem) -> Problem:
     if name != "sidestep jacobi":
         return problem
     tolerance = problem.solving.solver.tolerance  # pyright: ignore[reportOptionalMemberAccess]
-    return eqx.tree_at(lambda p: p.solving.solver, problem, SOLVERS["jacobi"](tolerance=tolerance))
+    return eqx.tree_at(lambda p: p.solving.solver, problem, scaling.SOLVERS["jacobi"](tolerance=tolerance))
 
 
 def compiled(name: str, problem: Problem, exact: Array | None = None, limit: float = np.inf, sweeps: int = 0) -> Method:
@@ -308,7 +298,7 @@ def warm_call(name: str, problem: Problem, options: Options) -> Callable[[], Any
     problem = with_solver(name, problem)
     cold = problem.cold_start()
     first = take(problem, problem.model.parameters, cold, cold.region)
-    at, start = jax.block_until_ready((stepped(problem.model.parameters, first.gradient, options), first.start))
+    at, start = jax.block_until_ready((scaling.stepped(problem.model.parameters, first.gradient, options), first.start))
     call = lambda: jax.block_until_ready(take(problem, at, start, cold.region))  # noqa: E731
     return call if bool(call().converged) else None
 
@@ -316,7 +306,7 @@ def warm_call(name: str, problem: Problem, options: Options) -> Callable[[], Any
 def methods_for(problem: Problem, slow: set[str], options: Options) -> Iterator[Method]:
     """Yield all methods for a problem, compiled, run once and compared, but for those in `slow`."""
     limit, exact = options.memory * 2**30, exact_gradient(problem)
-    for name in ("sidestep gauss-seidel", "sidestep jacobi", "values"):
+    for name in ("sidestep gauss_seidel", "sidestep jacobi", "values"):
         method = compiled(name, problem, exact)
         method.warm = None if name == "values" else warm_call(name, problem, options)
         yield method
@@ -339,7 +329,7 @@ def measure(options: Options) -> Iterator[Record]:
     """Yield a record for each map, backup, parametrization and method."""
     slow: dict[tuple[str, str], set[str]] = {}
     for size in sorted(options.sizes):
-        world = half_learned_office(size, options.seed)
+        world = scaling.half_learned_office(size, options.seed)
         for backup in options.backups:
             for model in options.models:
                 yield from _of_one_problem(world, model, backup, slow.setdefault((backup, model), set()), options)
@@ -373,7 +363,7 @@ def _of_one_problem(world: World, model: str, backup: str, slow: set[str], optio
             "warm_seconds": median(taken.get(f"warm {method.name}")),
             "dijkstra_seconds": median(taken["dijkstra"]),
             "best_seconds": min(own, default=None),
-            "ratio": median_ratio(own, taken["sidestep gauss-seidel"]),
+            "ratio": median_ratio(own, taken["sidestep gauss_seidel"]),
             "difference": method.difference,
             "sweeps": method.sweeps,
             "compiled_bytes": method.bytes,
@@ -397,7 +387,7 @@ def show(records: Sequence[Record], options: Options) -> None:
     columns |= {"cold ms": "cold_seconds ms", "best ms": "best_seconds ms", "ratio": "ratio .2f"}
     columns |= {"warm ms": "warm_seconds ms", "sweeps": "sweeps", "difference": "difference .0e"}
     columns |= {"peak MiB": "peak_bytes MiB", "call MiB": "call_bytes MiB", "not run": "failed"}
-    print_table(f"a gradient ({options.gradient}), {described(options)}", records, columns)
+    print_table(f"a gradient ({options.gradient}), {scaling.described(options)}", records, columns)
     for record in records:
         off = np.inf if record["difference"] is None else record["difference"]
         if record["name"] not in ONLY_VALUES and record["ratio"] is not None and off > options.accuracy:

@@ -37,32 +37,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from benchmarks import Record, in_turns, median, note, option, print_table, seconds_of
-from sidestep.continuous import (
-    ContinuousTask,
-    Critic,
-    Dynamics,
-    FinitePolicy,
-    LinearGaussian,
-    ObstacleMotion,
-    Pendulum,
-    PendulumTask,
-    Planner,
-    PlannerState,
-    Policy,
-    QuadraticTask,
-    Rollout,
-    Schedule,
-    batch_tasks,
-    finite_policy,
-    fit_dynamics,
-    gather_trajectories,
-    gaussian_policy,
-    plan_policy,
-    sample_rollouts,
-    task_at,
-    task_features,
-    value_gradient,
-)
+from sidestep import continuous as ct
 from sidestep.continuous.estimators import Estimator
 from sidestep.experiments.pendulum import PendulumConfig
 from sidestep.experiments.room import RoomConfig
@@ -76,7 +51,7 @@ AGENTS, DISCOUNT = Behavior(LogSumExp(), 2.0), 0.95
 ESTIMATORS = ("score", "score and critic", "pathwise")
 PROBLEMS = ("linear, stable", "linear, unstable", "pendulum, hanging", "pendulum, upright")
 PLACES, STARTS, UNMOVED = 16, 128, 1e-30
-PLANNER = Planner(
+PLANNER = ct.Planner(
     horizon=1, batch_size=16, samples=2, candidates=4, learning_rate=0.02, critic_rate=0.01, critic_width=32
 )
 
@@ -112,11 +87,11 @@ def measure(options: Options) -> Iterator[Record]:
 class Case(NamedTuple):
     """A fit: its dynamics, demonstrations, agents, policy, planner, moves in a batch and estimator."""
 
-    dynamics: Dynamics
+    dynamics: ct.Dynamics
     demonstrations: Demonstrations
     behavior: Behavior
-    policy: FinitePolicy
-    planner: Planner
+    policy: ct.FinitePolicy
+    planner: ct.Planner
     moves: int
     estimator: Estimator
 
@@ -124,7 +99,7 @@ class Case(NamedTuple):
 class Batch(eqx.Module):
     """What one update looks at."""
 
-    tasks: ContinuousTask
+    tasks: ct.ContinuousTask
     states: Array
     chosen: Array
     choices: Array
@@ -139,19 +114,19 @@ def case_of(name: str) -> Case:
         rooms = room(config.lattice_points)
         known, tasks, actions = rooms.dynamics, rooms.tasks, rooms.actions
         begins = random_starts(rooms, WALKERS, random)
-        dynamics = ObstacleMotion(config.radial_field(rooms), known.low, known.high, known.noise)
+        dynamics = ct.ObstacleMotion(config.radial_field(rooms), known.low, known.high, known.noise)
     else:
-        dynamics, tasks, actions = Pendulum(noise=config.noise), config.tasks, config.actions
+        dynamics, tasks, actions = ct.Pendulum(noise=config.noise), config.tasks, config.actions
         begins = [np.array([goal, 0.0]) + random.uniform(-1, 1, (WALKERS, 2)) for goal in config.goals]
     states, task = jnp.asarray(np.concatenate(begins)), jnp.repeat(jnp.arange(len(tasks)), WALKERS)
-    features = task_features(task_at(batch_tasks(tasks), task), states)
-    policy = finite_policy(jax.random.key(0), actions, features, width=WIDTH)
+    features = ct.task_features(ct.task_at(ct.batch_tasks(tasks), task), states)
+    policy = ct.finite_policy(jax.random.key(0), actions, features, width=WIDTH)
     trajectories = [
         Trajectory(np.stack([state, state + random.normal(0, 0.1, 2)]), random.integers(len(actions), size=1), index)
         for state, index in zip(np.asarray(states), task.tolist(), strict=True)
     ]
     by: Estimator = "pathwise" if estimator == "pathwise" else "score"
-    demonstrations, moves = gather_trajectories(trajectories, tasks), config.schedule.batch_size
+    demonstrations, moves = ct.gather_trajectories(trajectories, tasks), config.schedule.batch_size
     return Case(dynamics, demonstrations, config.behavior, policy, config.planner, moves, by)
 
 
@@ -160,7 +135,7 @@ def speed(name: str, options: Options) -> Record:
     case, key = case_of(name), jax.random.key(2)
     planner, demos = case.planner, case.demonstrations
     drawn = jax.random.choice(key, len(demos), (case.moves,), replace=False)
-    tasks, states = task_at(demos.tasks, demos.task[drawn]), demos.states[drawn]
+    tasks, states = ct.task_at(demos.tasks, demos.task[drawn]), demos.states[drawn]
     note(f"{name}: compiling")
     planning, _ = _fitted(case, options.iterations)
     choices, weights = planner.candidate_actions(key, case.policy, tasks, states)
@@ -193,30 +168,30 @@ def speed(name: str, options: Options) -> Record:
     }
 
 
-def _fitted(case: Case, iterations: int) -> tuple[PlannerState[FinitePolicy], float]:
+def _fitted(case: Case, iterations: int) -> tuple[ct.PlannerState[ct.FinitePolicy], float]:
     """Return what a fit knows in the end, and the median time between reports (the first comes after compiling)."""
     reported: list[float] = []
-    result = fit_dynamics(
+    result = ct.fit_dynamics(
         case.dynamics,
         case.demonstrations,
         case.behavior,
         case.policy,
         case.planner,
         estimator=case.estimator,
-        schedule=Schedule(iterations=1 + iterations, policy_warmup=0, batch_size=case.moves),
+        schedule=ct.Schedule(iterations=1 + iterations, policy_warmup=0, batch_size=case.moves),
         report=lambda *_: reported.append(time.perf_counter()),
     )
     return result.planner_state, float(np.median(np.diff(reported)))
 
 
 @eqx.filter_jit
-def _roll(case: Case, batch: Batch, key: PRNGKeyArray) -> Rollout:
+def _roll(case: Case, batch: Batch, key: PRNGKeyArray) -> ct.Rollout:
     given = (case.dynamics, case.policy, batch.tasks, case.behavior, key, batch.states)
-    return sample_rollouts(*given, case.planner.horizon, batch.choices, case.planner.samples)
+    return ct.sample_rollouts(*given, case.planner.horizon, batch.choices, case.planner.samples)
 
 
 @eqx.filter_jit
-def _model_gradient(case: Case, planning: PlannerState[FinitePolicy], batch: Batch, key: PRNGKeyArray) -> PyTree:
+def _model_gradient(case: Case, planning: ct.PlannerState[ct.FinitePolicy], batch: Batch, key: PRNGKeyArray) -> PyTree:
     """Return ∇ of the actions' log-likelihood, with the roll-outs that it takes."""
     behavior, planner = case.behavior, case.planner
 
@@ -225,17 +200,17 @@ def _model_gradient(case: Case, planning: PlannerState[FinitePolicy], batch: Bat
 
     given = (case.dynamics, planning.policy, batch.tasks, behavior, key, batch.states, batch.choices, weigh)
     how = {"critic": planning.critic, "estimator": case.estimator}
-    return value_gradient(*given, horizon=planner.horizon, samples=planner.samples, **how)[0]
+    return ct.value_gradient(*given, horizon=planner.horizon, samples=planner.samples, **how)[0]
 
 
 @eqx.filter_jit
-def _policy_step(case: Case, planning: PlannerState, batch: Batch, rolled: Rollout) -> PyTree:
+def _policy_step(case: Case, planning: ct.PlannerState, batch: Batch, rolled: ct.Rollout) -> PyTree:
     """Return the policy after a step; the compiler leaves out the critic's."""
     return case.planner.update(planning, case.behavior, rolled, batch.weights)[0].policy
 
 
 @eqx.filter_jit
-def _critic_step(case: Case, planning: PlannerState, batch: Batch, rolled: Rollout) -> Critic:
+def _critic_step(case: Case, planning: ct.PlannerState, batch: Batch, rolled: ct.Rollout) -> ct.Critic:
     """Return the critic after a step; the compiler leaves out the policy's."""
     return case.planner.update(planning, case.behavior, rolled, batch.weights)[0].critic
 
@@ -246,10 +221,10 @@ def _critic_step(case: Case, planning: PlannerState, batch: Batch, rolled: Rollo
 class Problem(eqx.Module):
     """Dynamics with a gradient to estimate, a task in them, states where roll-outs may start, and a policy."""
 
-    dynamics: Dynamics
-    task: ContinuousTask
+    dynamics: ct.Dynamics
+    task: ct.ContinuousTask
     states: Array
-    policy: Policy
+    policy: ct.Policy
 
 
 class Noise(NamedTuple):
@@ -282,23 +257,23 @@ def problem_of(name: str) -> Problem:
     if kind == "linear":
         growth = 0.9 if place == "stable" else 1.05
         turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
-        dynamics = LinearGaussian(jnp.asarray(growth * turn), jnp.array([[0.0], [0.5]]), jnp.full(2, 0.1))
-        task = QuadraticTask(jnp.zeros(2), jnp.eye(2), 0.1 * jnp.eye(1), discount)
+        dynamics = ct.LinearGaussian(jnp.asarray(growth * turn), jnp.array([[0.0], [0.5]]), jnp.full(2, 0.1))
+        task = ct.QuadraticTask(jnp.zeros(2), jnp.eye(2), 0.1 * jnp.eye(1), discount)
         states = jnp.asarray(random.uniform(-1, 1, (STARTS, 2)))
         examples = jax.vmap(task.features)(states)
-        return Problem(dynamics, task, states, gaussian_policy(jax.random.key(1), 1, examples, spread=0.5, depth=0))
+        return Problem(dynamics, task, states, ct.gaussian_policy(jax.random.key(1), 1, examples, spread=0.5, depth=0))
     angle = np.pi if place == "hanging" else 0.0
-    task = PendulumTask(jnp.asarray(angle), discount)
+    task = ct.PendulumTask(jnp.asarray(angle), discount)
     states = jnp.asarray(np.array([angle, 0.0]) + random.uniform(-0.4, 0.4, (STARTS, 2)))
     examples, torques = jax.vmap(task.features)(states), jnp.linspace(-2.0, 2.0, 5)[:, None]
-    return Problem(Pendulum(), task, states, finite_policy(jax.random.key(1), torques, examples, width=32))
+    return Problem(ct.Pendulum(), task, states, ct.finite_policy(jax.random.key(1), torques, examples, width=32))
 
 
-def planned(problem: Problem, horizon: int, steps: int, *, moving: bool = True) -> tuple[Policy, Critic]:
+def planned(problem: Problem, horizon: int, steps: int, *, moving: bool = True) -> tuple[ct.Policy, ct.Critic]:
     """Return a policy for the problem and a critic for the policy; unless `moving`, the policy stays as it is."""
     planner = replace(PLANNER, horizon=horizon, learning_rate=PLANNER.learning_rate if moving else UNMOVED)
-    tasks, task = batch_tasks([problem.task]), jnp.zeros(STARTS, jnp.int32)
-    result = plan_policy(problem.dynamics, tasks, AGENTS, problem.policy, problem.states, task, planner, steps=steps)
+    tasks, task = ct.batch_tasks([problem.task]), jnp.zeros(STARTS, jnp.int32)
+    result = ct.plan_policy(problem.dynamics, tasks, AGENTS, problem.policy, problem.states, task, planner, steps=steps)
     return result.policy, result.planner_state.critic
 
 
@@ -332,7 +307,7 @@ def noise_records(name: str, horizon: int, noise: dict[str, Noise]) -> Iterator[
         }
 
 
-def measured(problem: Problem, critic: Critic, horizon: int, options: Options) -> dict[str, Noise]:
+def measured(problem: Problem, critic: ct.Critic, horizon: int, options: Options) -> dict[str, Noise]:
     """Return what each of the estimators shows, all with the same random numbers."""
     gradients: dict[str, list[np.ndarray]] = {name: [] for name in ESTIMATORS}
     keys = jax.random.key(2)
@@ -354,7 +329,7 @@ def measured(problem: Problem, critic: Critic, horizon: int, options: Options) -
 @eqx.filter_jit
 def _estimates(
     problem: Problem,
-    critic: Critic | None,
+    critic: ct.Critic | None,
     by: Estimator,
     key: PRNGKeyArray,
     choices: Array,
@@ -362,11 +337,11 @@ def _estimates(
     samples: int,
 ) -> Array:
     """Return the gradient that each roll-out gives by itself: places × samples × parameters."""
-    tasks = batch_tasks([problem.task])
+    tasks = ct.batch_tasks([problem.task])
 
     def one(state: Array, choice: Array, key: PRNGKeyArray) -> Array:
         given = (problem.dynamics, problem.policy, tasks, AGENTS, key, state[None], choice[None, None], jnp.ones_like)
-        return ravel_pytree(value_gradient(*given, horizon=horizon, samples=1, critic=critic, estimator=by)[0])[0]
+        return ravel_pytree(ct.value_gradient(*given, horizon=horizon, samples=1, critic=critic, estimator=by)[0])[0]
 
     keys = jax.random.split(key, (PLACES, samples))
     return jax.vmap(jax.vmap(one, (None, None, 0)))(problem.states[:PLACES], choices, keys)

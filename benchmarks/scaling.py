@@ -53,7 +53,7 @@ from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import Task, reach
 from sidestep.worlds.offices import connected_cells, office
 
-SOLVERS = {"gauss-seidel": GaussSeidel, "jacobi": Jacobi}
+SOLVERS = {"gauss_seidel": GaussSeidel, "jacobi": Jacobi}
 KINDS = ("cold", "warm", "region")
 FROM_CELLS = 128**2
 """From how many cells on the exponent is fitted; below, the overhead of a call counts."""
@@ -166,7 +166,7 @@ class Problem(eqx.Module):
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (tasks, *leaf.shape)), start)
 
 
-def problem_of(world: World, backup: str, options: GradientOptions, solver: str = "gauss-seidel") -> Problem:
+def problem_of(world: World, backup: str, options: GradientOptions, solver: str = "gauss_seidel") -> Problem:
     """Return the problem in a world."""
     demos = world.demonstrations(options.discount, None if options.goal_pays else options.step_cost)
     solving = SolveOptions(solver=SOLVERS[solver](tolerance=options.tolerance))

@@ -1,30 +1,17 @@
-"""Towns of which nobody says where one cannot drive, each so small that what is hidden is plain to see."""
+"""Mazes and towns so small that what is hidden is plain to see."""
 
-import argparse
-import importlib
 import json
-import sys
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks.__main__ import main
 
+from benchmarks import changed, people, towns
 from sidestep.errors import InputError
 from sidestep.io.maps import write_map
 from sidestep.tabular.grid import Grid
-
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-SCORES = {"auc", "average_precision", "auc_relevant", "average_precision_relevant"}
-
-
-@pytest.fixture
-def script(monkeypatch):
-    """Imports a script of the benchmarks by its name."""
-    monkeypatch.setattr(sys, "path", [str(BENCHMARKS), *sys.path])
-    return importlib.import_module
-
 
 # ---------------------------------------------------------------------------------------------------- buildings
 
@@ -33,10 +20,10 @@ BUILDING[3:6, 5:8] = 1
 
 
 @pytest.fixture
-def towns(tmp_path):
+def data(tmp_path):
     """A folder with one town: a building in the middle, which all drives from west to east go around."""
-    folder = tmp_path / "town_A"
-    folder.mkdir()
+    folder = tmp_path / "magellan" / "town_A"
+    folder.mkdir(parents=True)
     grid = Grid(BUILDING.astype(int), resolution=0.1)
     write_map(folder / "truth.yaml", BUILDING, grid)
     write_map(folder / "blank.yaml", np.full(BUILDING.shape, 0.5), replace(grid, known=np.full(BUILDING.shape, -1)))
@@ -50,85 +37,69 @@ def towns(tmp_path):
     return tmp_path
 
 
-def test_a_building_that_all_drive_around_is_found(script, towns):
-    magellan = script("magellan")
-    town = magellan.read_town(towns / "town_A", magellan.DRIVERS)
-    record = magellan.score(town, town.walks, replace(magellan.DRIVERS, beta=3.0))
-    blocked = np.asarray(record["blocked"])
-    # a place that nobody drove to either, but which was in nobody's way
+def read(data):
+    """The town in the folder."""
+    return people.read_mazes(data / "magellan", "town_*", "drives.csv", connectivity=8)[0]
+
+
+METHODS = ("behavior", "visits", "transitions")
+
+
+def test_learn_by_a_building_that_all_drive_around_is_found(data):
+    config = changed(towns.DRIVES, ["beta=3"])
+    results = {record["method"]: (record, result) for record, result, _ in people.learn_by(METHODS, read(data), config)}
+    record, result = results["behavior"]
+    blocked = result.ranking
+    # cells that no drive visits either, but which are in no one's way
     assert blocked[4, 5:8].min() > blocked[[0, 0, -1, -1], [0, -1, 0, -1]].max() + 0.02
-    assert record["into_buildings"] == 0
     assert record["moves"] == 8 * 10
     assert record["converged"]
-    assert set(record["learned"]) == set(record["visits"]) == set(record["transitions"]) == SCORES
+    assert record["behavior.beta"] == 3
     # neither of the others can tell the building from what else was not visited
-    learned, *others = (record[method]["average_precision"] for method in ("learned", "visits", "transitions"))
-    assert learned > max(others) + 0.2
+    precision = {name: own["average_precision"] for name, (own, _) in results.items()}
+    assert precision.pop("behavior") > max(precision.values()) + 0.2
 
 
-def test_moves_into_buildings_are_counted_and_survived(script, towns):
-    magellan = script("magellan")
-    with (towns / "town_A" / "drives.csv").open("a") as file:
+def test_learn_by_moves_into_buildings_are_counted_and_survived(data):
+    with (data / "magellan" / "town_A" / "drives.csv").open("a") as file:
         # straight through the building's three cells
         file.write("8,0,0.15,0.45,1.15,0.45\n8,1,1.15,0.45,1.15,0.45\n")
-    town = magellan.read_town(towns / "town_A", magellan.DRIVERS)
-    record = magellan.score(town, town.walks, magellan.DRIVERS)
-    assert record["into_buildings"] == 3
-    assert np.isfinite(record["blocked"]).all()
-    assert np.asarray(record["blocked"])[4, 5:8].max() < 0.2
+    ((_, result, demos),) = people.learn_by(["behavior"], read(data), towns.DRIVES)
+    assert towns.into_buildings(demos, read(data).truth) == 3
+    assert np.isfinite(result.ranking).all()
+    assert result.ranking[4, 5:8].max() < 0.2
 
 
-def test_scores_are_averaged_over_the_draws_of_a_town_then_over_towns(script):
-    magellan = script("magellan")
-
-    def record(town, seed, auc, converged=True):
-        scores = {**dict.fromkeys(SCORES, 0.5), "auc": auc, "auc_relevant": None}
-        methods = dict.fromkeys(magellan.METHODS, scores)
-        return {"town": town, "drives": 3, "seed": seed, "moves": 10, "into_buildings": 2, **methods} | {
-            "converged": converged
-        }
-
-    records = [record("a", 0, 0.2), record("a", 1, 0.4), record("b", 0, 0.9, converged=False)]
-    (row,) = magellan.summarise(records, [3])
-    assert row["learned"]["auc"] == pytest.approx(0.6)
-    assert row["learned"]["auc_relevant"] is None
-    assert row["into_buildings"] == 6
-    assert not row["converged"]
+def test_means_average_over_the_draws_of_a_town_then_over_towns():
+    scores = [("a", 0.2, None), ("a", 0.4, None), ("b", 0.9, None)]
+    records = [{"walks": 3, "method": "visits", "problem": p, "auc": a, "auc_relevant": r} for p, a, r in scores]
+    (row,) = people.means(records, {"AUC": "auc .3f", "relevant": "auc_relevant .3f"}, "problem")
+    assert row == {"walks": 3, "method": "visits", "auc": pytest.approx(0.6), "auc_relevant": None}
 
 
-def test_the_whole_script_writes_records_and_a_picture(script, towns, tmp_path, capsys):
-    magellan = script("magellan")
-    arguments = argparse.Namespace(
-        data=towns,
-        drives=[4, 8],
-        seeds=2,
-        picture=tmp_path / "town.png",
-        json=tmp_path / "records.json",
-        quick=False,
-        set=["iterations=3"],
-    )
-    magellan.run(arguments)
-    written = json.loads(arguments.json.read_text())
+def test_main_buildings_writes_records_and_a_picture(data, tmp_path, capsys):
+    file, picture = tmp_path / "records.json", tmp_path / "town.png"
+    options = ["--what", "buildings", "--data", str(data / "magellan"), "--counts", "4", "8", "--seeds", "2"]
+    settings = ["--set", "max_iterations=3", "--json", str(file), "--picture", str(picture)]
+    assert main(["towns", *options, *settings]) == 0
+    written = json.loads(file.read_text())
     # two draws of 4, and all 8 once
-    found = [(record["drives"], record["drives_found"], record["seed"]) for record in written["records"]]
-    assert found == [(4, 4, 0), (4, 4, 1), (8, 8, 0)]
-    assert [row["drives"] for row in written["means"]] == [4, 8]
-    assert written["learner"]["iterations"] == 3
-    assert arguments.picture.read_bytes().startswith(b"\x89PNG")
+    drawn = [(r["walks"], r["drawn"], r["draw"]) for r in written["records"] if r["method"] == "behavior"]
+    assert drawn == [(4, 4, 0), (4, 4, 1), (8, 8, 0)]
+    assert written["records"][0]["fit.max_iterations"] == 3
+    assert picture.read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr()
     assert "into buildings" in printed.out
-    assert "have not converged" in printed.err
+    assert "did not converge" in printed.err
 
 
-def test_towns_that_are_not_there_are_named(script, towns, tmp_path):
-    magellan = script("magellan")
-    arguments = argparse.Namespace(data=tmp_path / "nowhere", set=[], quick=False)
-    with pytest.raises(InputError, match=r"nowhere: expected folders town_A"):
-        magellan.run(arguments)
+def test_read_mazes_names_what_is_missing(data, tmp_path, capsys):
+    assert main(["people", "--data", str(tmp_path / "nowhere")]) == 1
+    assert "nowhere: expected folders maze_*" in capsys.readouterr().err
     for name in ("drives.csv", "truth.yaml"):
-        (towns / "town_A" / name).unlink()
+        (data / "magellan" / "town_A" / name).unlink()
         with pytest.raises(InputError, match=name):
-            magellan.read_town(towns / "town_A", magellan.DRIVERS)
+            read(data)
 
 
 # ---------------------------------------------------------------------------------------------------- one-way streets
@@ -172,99 +143,96 @@ TRIPS = [
     *[[0, 1, 2, 5, 8, 7, 6], [2, 1, 0, 3, 6, 7, 8], [5, 4, 3, 6, 7, 8], [3, 4, 5, 8, 7, 6]] * 5,
     *[[6, 7, 4, 1, 0], [8, 7, 4, 1, 2], [3, 4, 1], [5, 4, 1]] * 5,
 ]
-"""Who is at node 1 or 4 and wants to 7 takes a street at the side, which nobody has a reason to drive back."""
+"""Drivers from node 1 or 4 to 7 take a street at the side; no one has a reason to drive it back."""
 
 
 @pytest.fixture
-def city(script, tmp_path):
+def city(tmp_path):
     """The small town as the learner knows it, and all trips."""
-    return script("drivers").read_town(write_network(tmp_path, SHUT, TRIPS))
+    return towns.read_town(write_network(tmp_path, SHUT, TRIPS))
 
 
-def test_both_directions_of_each_street_come_back_with_their_turns(script, tmp_path):
+def test_both_ways_restores_links_and_turns(tmp_path):
     """What was taken out of a network is put in again as it was: links, turns, and where they lead."""
-    two_way = script("two_way")
 
     def described(roads):
         nodes = np.unique([label.split("-")[0] for label in roads.labels if " " not in label])
         ends = list(zip(nodes[roads.begins], nodes[roads.ends], strict=True))
         return {(ends[a], ends[b], int(way)) for (a, b), way in zip(roads.turns, roads.directions, strict=True)}
 
-    read = script("drivers").read_roads
+    read = towns.read_roads
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     for folder, shut in ((whole, set()), (cut, SHUT)):
         folder.mkdir()
         write_network(folder, shut)
-    found = two_way.two_way(read(cut / "links.csv", cut / "turns.csv"))
-    assert described(found.roads) == described(read(whole / "links.csv", whole / "turns.csv"))
-    assert [found.roads.labels[link] for link in np.flatnonzero(found.added)] == ["4-1 back", "7-4 back"]
+    results = towns.both_ways(read(cut / "links.csv", cut / "turns.csv"))
+    assert described(results) == described(read(whole / "links.csv", whole / "turns.csv"))
+    assert results.labels[-2:] == ["4-1 back", "7-4 back"]
 
 
-def test_a_street_that_says_it_is_one_way_but_leads_back_is_refused(script, tmp_path):
+def test_both_ways_refuses_a_one_way_street_with_a_reverse(tmp_path):
     links = write_network(tmp_path, SHUT) / "links.csv"
     links.write_text(links.read_text().replace("0-1,0,1,100,0", "0-1,0,1,100,1"))
     with pytest.raises(InputError, match="field 'oneway': link 0-1: expected 1 if no link"):
-        script("drivers").read_town(tmp_path)
+        towns.read_town(tmp_path)
 
 
 @pytest.mark.parametrize(("times", "many"), [(1, 1_000_000), (100, 1)])
-def test_streets_that_drivers_drive_around_are_found(script, city, times, many):
+def test_score_streets_that_drivers_avoid_are_found(city, times, many):
     """From few trips, and from above from many."""
-    shanghai = script("shanghai")
     town, trips = city[0], city[1] * times
-    record = shanghai.score(town, trips, trips[:4], shanghai.Settings(many=many))
+    record = towns.score(town, trips, trips[:4], towns.StreetConfig(many=many))
     chances, unused = np.asarray(record["rankings"]["P(closed)"]), town.uses(trips) == 0
-    closed = town.network.added
+    closed = town.added
     assert unused[closed].all()
     assert (unused & ~closed).any()
     assert chances[closed].min() > chances[unused & ~closed].max()
     assert record["P(closed)"] == pytest.approx(1.0)
-    assert record["share"] == pytest.approx(closed.sum() / unused.sum())
-    assert record["gain"] == pytest.approx(1 - record["share"])
+    assert record["closed_fraction"] == pytest.approx(closed.sum() / unused.sum())
+    assert record["gain"] == pytest.approx(1 - record["closed_fraction"])
     assert record["likely"] == (chances[unused] > 0.5).sum()
     assert record["converged"]
     # the four trips show nothing that the others do not
     assert record["later"] is None
-    assert -np.log(4) < record["log-likelihood"] < 0
+    assert -np.log(4) < record["log_likelihood"] < 0
 
 
-def test_draws_are_different_and_leave_others_out(script):
-    draws = script("shanghai").draws
+def test_draw_trips_are_different_and_leave_others_out():
+    draws = towns.draw_trips
     trips = [np.array([number, number + 1]) for number in range(20)]
-    found = list(draws(trips, 5, 2, 4))
-    assert [seed for seed, _, _ in found] == [0, 1]
-    for _, drawn, others in found:
+    results = list(draws(trips, 5, 2, 4))
+    assert [seed for seed, _, _ in results] == [0, 1]
+    for _, drawn, others in results:
         first = {int(trip[0]) for trip in (*drawn, *others)}
         assert (len(drawn), len(others), len(first)) == (5, 4, 9)
-    assert {int(trip[0]) for trip in found[0][1]} != {int(trip[0]) for trip in found[1][1]}
+    assert {int(trip[0]) for trip in results[0][1]} != {int(trip[0]) for trip in results[1][1]}
     (everything,) = draws(trips, 50, 2, 4)
     assert (len(everything[1]), len(everything[2])) == (20, 0)
 
 
-def test_later_trips_tell_a_good_ranking_from_a_bad_one(script):
-    later = script("shanghai").later
+def test_later_tells_a_good_ranking_from_a_bad_one():
+    later = towns.later
     chances, uses = np.array([0.9, 0.8, 0.1, 0.2]), np.array([0, 0, 3, 1])
     assert later(chances, uses) == 1.0
     assert later(-chances, uses) == 0.0
     assert later(chances, np.zeros(4)) is None
 
 
-def test_the_town_is_laid_out_as_it_is(script, city):
+def test_layout_has_the_true_distances(city):
     """Distances between the places of nodes, for the map is known up to a rotation."""
     town, _ = city
-    places = script("shanghai_picture").layout(town.roads)
+    places = towns.layout(town.roads)
     true = 100 * np.array(PLACES)
-    split_by_person = [np.linalg.norm(each[:, None] - each, axis=-1) for each in (places, true)]
-    assert split_by_person[0] == pytest.approx(split_by_person[1], abs=1.0)
+    distances = [np.linalg.norm(each[:, None] - each, axis=-1) for each in (places, true)]
+    assert distances[0] == pytest.approx(distances[1], abs=1.0)
     # no mirror image
     turn = np.linalg.lstsq(true - true.mean(axis=0), places - places.mean(axis=0), rcond=None)[0]
     assert np.linalg.det(turn) == pytest.approx(1.0, abs=0.05)
 
 
-def test_a_road_network_without_its_tables_is_named(script, tmp_path):
-    read = script("drivers").read_town
+def test_read_town_names_missing_tables(tmp_path):
     write_network(tmp_path, SHUT, TRIPS)
     for name in ("trips.csv", "turns.csv", "links.csv"):
         (tmp_path / name).unlink()
         with pytest.raises(InputError, match=name):
-            read(tmp_path)
+            towns.read_town(tmp_path)
