@@ -44,8 +44,8 @@ class Pendulum(GaussianDynamics):
 
     Example:
         >>> pendulum = Pendulum(gravity=10.0)
-        >>> pendulum.outcomes(jnp.zeros(2), jnp.array([1.0])).means.round(4).tolist()
-        [[0.0075, 0.15]]
+        >>> [round(float(x), 4) for x in pendulum.outcomes(jnp.zeros(2), jnp.array([1.0])).means[0]]
+        [0.0075, 0.15]
     """
 
     parameters: dict[str, Float[Array, ""]]
@@ -106,8 +106,8 @@ class PointMass(GaussianDynamics):
         InputError: friction, noise or a time step not above 0, or wind that is not finite.
 
     Example:
-        >>> PointMass().outcomes(jnp.zeros(4), jnp.array([1.0, 0.0])).means.round(3).tolist()
-        [[0.01, 0.0, 0.1, 0.0]]
+        >>> [round(float(x), 3) for x in PointMass().outcomes(jnp.zeros(4), jnp.array([1.0, 0.0])).means[0]]
+        [0.01, 0.0, 0.1, 0.0]
     """
 
     parameters: dict[str, Float[Array, "..."]]
