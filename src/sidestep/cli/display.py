@@ -3,20 +3,16 @@
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
-from sidestep.inference.maximize import Progress as FitProgress
+if TYPE_CHECKING:
+    from rich.progress import TaskID
+
+    from sidestep.inference.maximize import Progress as FitProgress
+
+    FitCallback = Callable[[FitProgress], None]
 
 _console = Console(highlight=False, width=None if sys.stdout.isatty() else 140)
 _errors = Console(stderr=True, highlight=False)
@@ -42,11 +38,20 @@ def working(text: str) -> Iterator[Callable[[str], None]]:
 
 
 @contextmanager
-def fit_progress(iterations: int) -> Iterator[tuple[Callable[[FitProgress], None], Callable[[str], None]]]:
+def fit_progress(iterations: int) -> "Iterator[tuple[FitCallback, Callable[[str], None]]]":
     """Show a progress bar on a terminal for a fit of at most `iterations`; the results report to it.
 
     When a fit converges cannot be known. So the time is the longest that is left, at the pace of the last ten minutes.
     """
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
     columns = (
         TextColumn("learning"),
         BarColumn(),
@@ -59,7 +64,7 @@ def fit_progress(iterations: int) -> Iterator[tuple[Callable[[FitProgress], None
     with Progress(*columns, console=_errors, transient=True, speed_estimate_period=600) as bar:
         task = bar.add_task("learning", total=iterations, state="compiling")
 
-        def report(progress: FitProgress) -> None:
+        def report(progress: "FitProgress") -> None:
             state = f"objective {progress.objective:.3f}, largest gradient {progress.gradient:.2g}"
             bar.update(task, completed=progress.iteration, state=state)
 
@@ -72,6 +77,15 @@ def stage_progress() -> Iterator[Callable[[str, int, int], None]]:
 
     The size of a later stage is known when it begins, so there is no time for the whole.
     """
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -81,7 +95,7 @@ def stage_progress() -> Iterator[Callable[[str, int, int], None]]:
         TextColumn("left"),
     )
     with Progress(*columns, console=_errors, transient=True, speed_estimate_period=600) as bar:
-        tasks: dict[str, TaskID] = {}
+        tasks: "dict[str, TaskID]" = {}
 
         def report(stage: str, done: int, total: int) -> None:
             if stage not in tasks:

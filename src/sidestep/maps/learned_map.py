@@ -9,25 +9,27 @@
 | `summary.json` | settings, the final objective and its parts, convergence, time, memory           |
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sidestep._files import read_array, read_json, write_array, write_json
 from sidestep.errors import InputError
-from sidestep.evaluation.evaluate import Evaluation, StageCallback, evaluate
 from sidestep.io.maps import read_map, write_map
-from sidestep.maps.goal_candidates import write_goal_posterior
-from sidestep.maps.learning import Learning
 from sidestep.robots.planners import ModelPlanner
 from sidestep.robots.robot import BUMP_COST, risk_averse_robot
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.reward import Reward
+
+if TYPE_CHECKING:
+    import sidestep.evaluation.evaluate
+    import sidestep.maps.learning
 
 Position = tuple[float, float]
 
@@ -65,7 +67,7 @@ class LearnedMap:
     blocked: Float[np.ndarray, "rows columns"]
     visited: Int[np.ndarray, "visits 2"]
     reward: Reward
-    learning: Learning | None = None
+    learning: "sidestep.maps.learning.Learning | None" = None
 
     @property
     def unknown(self) -> Bool[np.ndarray, "rows columns"]:
@@ -112,8 +114,13 @@ class LearnedMap:
         return PlannedPath(states, positions, self.blocked.reshape(-1)[states], length)
 
     def evaluate(
-        self, truth: Grid, *, seed: int = 0, bump_cost: float = BUMP_COST, callback: StageCallback = lambda *_: None
-    ) -> Evaluation:
+        self,
+        truth: Grid,
+        *,
+        seed: int = 0,
+        bump_cost: float = BUMP_COST,
+        callback: Callable[[str, int, int], None] = lambda *_: None,
+    ) -> "sidestep.evaluation.evaluate.Evaluation":
         """Score the map and the paths of its robot against the true map, as `sidestep.evaluate` does.
 
         Args:
@@ -122,6 +129,8 @@ class LearnedMap:
             bump_cost: As for `robot`.
             callback: Called with a stage, what is done of it and what there is to do.
         """
+        from sidestep.evaluation.evaluate import evaluate
+
         return evaluate(self.robot(bump_cost), self.blocked, truth, self.unknown, self.visited, seed, callback)
 
     def summary(self) -> dict[str, Any]:
@@ -148,6 +157,8 @@ class LearnedMap:
         write_array(folder / "blocked.npy", blocked)
         write_array(folder / "visited.npy", self.visited)
         if self.learning is not None and self.learning.goals is not None:
+            from sidestep.maps.goal_candidates import write_goal_posterior
+
             write_goal_posterior(folder / "posterior.csv", self.learning.goals, self.grid)
         write_json(folder / "summary.json", {**entries, **self.summary()})
 
