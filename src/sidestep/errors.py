@@ -22,6 +22,11 @@ class InputError(SidestepError):
         walks.csv, row 3, field 'x': expected a number, found 'abc'
     """
 
+    message: str
+    source: object | None
+    row: int | None
+    field: str | None
+
     def __init__(self, message: str, *, source: object | None = None, row: int | None = None, field: str | None = None):
         self.message, self.source, self.row, self.field = message, source, row, field
         place = [str(source)] if source is not None else []

@@ -23,8 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.scipy.stats import norm
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree, Scalar, Shaped
+from jaxtyping import Array, Float, PRNGKeyArray, Scalar, Shaped
 
+from sidestep._typing import ArrayTree, FloatTree, Tree
 from sidestep.errors import InputError
 from sidestep.tabular.models import TransitionModel
 
@@ -45,7 +46,7 @@ class Dynamics(eqx.Module):
         parameters: θ, a pytree of floating-point arrays, all of which are learned.
     """
 
-    parameters: eqx.AbstractVar[PyTree[Float[Array, "..."]]]
+    parameters: eqx.AbstractVar[FloatTree]
 
     @property
     @abc.abstractmethod
@@ -70,7 +71,7 @@ class Dynamics(eqx.Module):
         del value, state, action, next_state
         return jnp.zeros((), jnp.result_type(float))
 
-    def with_parameters(self: _Family, parameters: PyTree[Float[Array, "..."]]) -> _Family:
+    def with_parameters(self: _Family, parameters: FloatTree) -> _Family:
         """Return the same family at another θ."""
         return eqx.tree_at(lambda dynamics: dynamics.parameters, self, parameters)
 
@@ -209,7 +210,7 @@ class TableDynamics(Dynamics):
         self.model = model
 
     @property
-    def parameters(self) -> PyTree:
+    def parameters(self) -> Tree:
         """The parameters θ of the model."""
         return self.model.parameters
 
@@ -252,7 +253,7 @@ def checked_noise(noise: Float[Array, " _"] | np.ndarray, dimensions: int) -> Fl
     return noise
 
 
-def check_finite(arrays: PyTree[Shaped[Array, "..."]], field: str = "parameters") -> None:
+def check_finite(arrays: ArrayTree, field: str = "parameters") -> None:
     """Refuse arrays that are not finite; inside `jit` nothing is checked."""
     for leaf in jax.tree.leaves(arrays):
         if not isinstance(leaf, Tracer) and not np.isfinite(leaf).all():

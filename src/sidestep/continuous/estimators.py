@@ -26,8 +26,9 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree, Shaped
+from jaxtyping import Array, Float, PRNGKeyArray, Shaped
 
+from sidestep._typing import FloatTree
 from sidestep.continuous.critic import Critic
 from sidestep.continuous.dynamics import Dynamics
 from sidestep.continuous.policies import Policy
@@ -158,7 +159,7 @@ def value_gradient(
     samples: int,
     critic: Critic | None = None,
     estimator: Estimator = "score",
-) -> tuple[PyTree[Float[Array, "..."]], Rollout]:
+) -> tuple[FloatTree, Rollout]:
     """Estimate Σ_starts Σ_candidates weight · ∇_θ Q^π(s, c) by rollouts (eq. 11).
 
     With two samples or more, each half of them is weighted by the Q estimates of the other half: the noise of weights
@@ -189,7 +190,7 @@ def value_gradient(
     """
     check_estimator(estimator, dynamics, tasks)
 
-    def total(parameters: PyTree[Float[Array, "..."]]) -> tuple[Array, Rollout]:
+    def total(parameters: FloatTree) -> tuple[Array, Rollout]:
         moved = dynamics.with_parameters(parameters)
         sampled = moved if estimator == "pathwise" else dynamics
         rollouts = sample_rollouts(sampled, policy, tasks, behavior, key, states, horizon, choices, samples)

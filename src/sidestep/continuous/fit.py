@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from sidestep._typing import FloatTree, Tree
 from sidestep.continuous.dynamics import Dynamics
 from sidestep.continuous.estimators import Estimator
 from sidestep.continuous.likelihood import (
@@ -72,9 +73,9 @@ class _State(eqx.Module):
     `sums` are of θ: over the last quarter of the iterations but its second half, and over that half.
     """
 
-    parameters: PyTree[Float[Array, "..."]]
-    moments: PyTree
-    planner_state: PyTree
+    parameters: FloatTree
+    moments: Tree
+    planner_state: Tree
     sums: Float[Array, "2 parameters"]
 
 
@@ -150,7 +151,7 @@ def fit_dynamics(
     return _result(problem, eqx.combine(carried, fixed), history)
 
 
-def problem_fingerprint(problem: PyTree) -> str:
+def problem_fingerprint(problem: Tree) -> str:
     """Return a digest of a problem; functions count by name, because their addresses differ between processes."""
     numbers, rest = eqx.partition(problem, eqx.is_array_like)
     text = f"{jax.tree.structure(problem)} {jax.tree.leaves(rest)}"
@@ -189,8 +190,8 @@ def _warm_up(problem: FitProblem, state: _State, key: PRNGKeyArray) -> _State:
 
 @eqx.filter_jit
 def _step(
-    problem: FitProblem, carried: PyTree, fixed: PyTree, key: PRNGKeyArray, iteration: Int[Array, ""]
-) -> tuple[PyTree, FitProgress]:
+    problem: FitProblem, carried: Tree, fixed: Tree, key: PRNGKeyArray, iteration: Int[Array, ""]
+) -> tuple[Tree, FitProgress]:
     """Make one step of the policy, its critic and the model."""
     state: _State = eqx.combine(carried, fixed)
     schedule = problem.schedule

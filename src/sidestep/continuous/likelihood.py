@@ -16,8 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, Shaped
+from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
 
+from sidestep._typing import Tree
 from sidestep.continuous.dynamics import Dynamics, check_finite
 from sidestep.continuous.estimators import Estimator, check_estimator, value_gradient
 from sidestep.continuous.planner import Planner, PlannerState, PlanProgress, check_planner, check_starts
@@ -117,7 +118,7 @@ class _Batch(NamedTuple):
 
 
 def improve_policy(
-    problem: FitProblem, parameters: PyTree, planner_state: PlannerState, key: PRNGKeyArray
+    problem: FitProblem, parameters: Tree, planner_state: PlannerState, key: PRNGKeyArray
 ) -> PlannerState:
     """Make a step of the policy and its critic by rollouts from a batch of moves; the model stays the same."""
     batch_key, rollout_key = jax.random.split(key)
@@ -125,8 +126,8 @@ def improve_policy(
 
 
 def objective_gradient(
-    problem: FitProblem, parameters: PyTree, planner_state: PlannerState, key: PRNGKeyArray
-) -> tuple[PlannerState, PyTree, FitProgress]:
+    problem: FitProblem, parameters: Tree, planner_state: PlannerState, key: PRNGKeyArray
+) -> tuple[PlannerState, Tree, FitProgress]:
     """Estimate the gradient of minus the objective from one batch of moves.
 
     Returns:
@@ -155,12 +156,12 @@ def _draw_batch(problem: FitProblem, key: PRNGKeyArray) -> _Batch:
     return _Batch(jax.random.choice(key, moves, (count,), replace=False), moves / count)
 
 
-def _rollout_free_terms(problem: FitProblem, parameters: PyTree, batch: _Batch) -> tuple[PyTree, Array, Array]:
+def _rollout_free_terms(problem: FitProblem, parameters: Tree, batch: _Batch) -> tuple[Tree, Array, Array]:
     """Return the gradient of minus the transitions' term (if it counts) and the prior, and the two values."""
     demos = problem.demonstrations
     moves, scale = batch
 
-    def loss(parameters: PyTree) -> tuple[Array, tuple[Array, Array]]:
+    def loss(parameters: Tree) -> tuple[Array, tuple[Array, Array]]:
         dynamics, prior = problem.dynamics.with_parameters(parameters), problem.prior.log_density(parameters)
         transitions = jnp.zeros_like(prior)
         if "transitions" in problem.terms:
@@ -173,8 +174,8 @@ def _rollout_free_terms(problem: FitProblem, parameters: PyTree, batch: _Batch) 
 
 
 def _action_terms(
-    problem: FitProblem, parameters: PyTree, planner_state: PlannerState, batch: _Batch, key: PRNGKeyArray
-) -> tuple[PlannerState, PyTree, Array, PlanProgress]:
+    problem: FitProblem, parameters: Tree, planner_state: PlannerState, batch: _Batch, key: PRNGKeyArray
+) -> tuple[PlannerState, Tree, Array, PlanProgress]:
     """Estimate the actions' term by rollouts from the states of a batch of moves.
 
     Returns:

@@ -19,8 +19,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree, Scalar
+from jaxtyping import Array, Float, PRNGKeyArray, Scalar
 
+from sidestep._typing import FloatTree, Tree
 from sidestep.continuous.dynamics import GaussianDynamics, Outcomes, check_corners, check_finite, checked_noise
 from sidestep.errors import InputError
 
@@ -34,7 +35,7 @@ class Field(eqx.Module):
         parameters: θ, a pytree of floating-point arrays.
     """
 
-    parameters: eqx.AbstractVar[PyTree[Float[Array, "..."]]]
+    parameters: eqx.AbstractVar[FloatTree]
 
     @abc.abstractmethod
     def logit(self, place: Place) -> Float[Scalar, ""]:
@@ -97,11 +98,11 @@ class NetworkField(Field):
         structure: the rest of the network.
     """
 
-    parameters: PyTree[Float[Array, "..."]]
+    parameters: FloatTree
     center: Place
     scale: Place
     offset: float = eqx.field(static=True)
-    structure: PyTree = eqx.field(static=True)
+    structure: Tree = eqx.field(static=True)
 
     def logit(self, place: Place) -> Float[Scalar, ""]:
         """Return the network's output plus the offset."""
@@ -189,7 +190,7 @@ class ObstacleMotion(GaussianDynamics):
         self.low, self.high, self.noise = jnp.asarray(low), jnp.asarray(high), checked_noise(noise, len(low))
 
     @property
-    def parameters(self) -> PyTree:
+    def parameters(self) -> Tree:
         """The parameters θ of the field."""
         return self.field.parameters
 

@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, Shaped
+from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
 
+from sidestep._typing import Tree
 from sidestep.continuous.critic import Critic, make_critic
 from sidestep.continuous.dynamics import Dynamics, check_finite
 from sidestep.continuous.estimators import features_at_moves, policy_advantages, with_control_variates
@@ -59,8 +60,8 @@ class PlannerState(eqx.Module, Generic[SomePolicy]):
 
     policy: SomePolicy
     critic: Critic
-    policy_moments: PyTree
-    critic_moments: PyTree
+    policy_moments: Tree
+    critic_moments: Tree
 
 
 class Planner(eqx.Module):

@@ -24,8 +24,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, Shaped
 
+from sidestep._typing import Tree
 from sidestep.continuous.critic import Critic
 from sidestep.continuous.estimators import action_baselines, features_at_moves, policy_log_probs
 from sidestep.continuous.policies import Policy
@@ -35,7 +36,7 @@ from sidestep.tabular.backups import Behavior, HardMax
 Probabilities = Float[Array, "starts candidates"]
 
 
-def policy_gradient(policy: Policy, critic: Critic, rollouts: Rollout, probabilities: Probabilities) -> PyTree:
+def policy_gradient(policy: Policy, critic: Critic, rollouts: Rollout, probabilities: Probabilities) -> Tree:
     """Return the mean of eq. 12 over −β, with the sign of a loss: the policy improves against it.
 
     Args:
@@ -62,8 +63,8 @@ def policy_gradient(policy: Policy, critic: Critic, rollouts: Rollout, probabili
 
 
 def fit_critic(
-    critic: Critic, optimizer: optax.GradientTransformation, moments: PyTree, rollouts: Rollout, steps: int
-) -> tuple[Critic, PyTree]:
+    critic: Critic, optimizer: optax.GradientTransformation, moments: Tree, rollouts: Rollout, steps: int
+) -> tuple[Critic, Tree]:
     """Regress a critic on returns-to-go, one step of the optimizer for each of `steps` minibatches.
 
     First moves are left out, because their choices were not drawn from the policy. With a horizon of 1 no moves are
@@ -76,7 +77,7 @@ def fit_critic(
     batches = jax.tree.map(lambda leaf: minibatches(leaf[:, :, :, 1:], steps), moves)
     learned, fixed = eqx.partition(critic, eqx.is_inexact_array)
 
-    def step(carry: tuple[PyTree, PyTree], batch: tuple[Array, Array, Array, Array]) -> tuple[tuple, None]:
+    def step(carry: tuple[Tree, Tree], batch: tuple[Array, Array, Array, Array]) -> tuple[tuple, None]:
         learned, moments = carry
         slope = jax.grad(lambda learned: _critic_loss(eqx.combine(learned, fixed), *batch))(learned)
         change, moments = optimizer.update(slope, moments)

@@ -13,9 +13,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from sidestep._files import write_json
+from sidestep._typing import FloatTree
 from sidestep.continuous.likelihood import FitProgress
 from sidestep.continuous.obstacles import Field, ObstacleMotion, network_field
 from sidestep.experiments.room import Report, RoomConfig, blocked_map, fit_field, score_map
@@ -66,7 +67,7 @@ class FunctionSpacePrior(Prior):
     places: Float[Array, "places dimensions"]
     each: Normal
 
-    def log_density(self, parameters: PyTree[Float[Array, "..."]]) -> Float[Array, ""]:
+    def log_density(self, parameters: FloatTree) -> Float[Array, ""]:
         """Return the log-density of the logits at the places."""
         field = eqx.tree_at(lambda field: field.parameters, self.field, parameters)
         return self.each.log_density(jax.vmap(field.logit)(self.places))

@@ -42,7 +42,7 @@ class BehaviorConfig:
     horizon: int | None = None
     select: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _check_choice(self.backup, BackupName, "backup")
         for name in self.learn:
             _check_choice(name, Learnable, "learn")
@@ -82,7 +82,7 @@ class FitConfig:
     max_iterations: int | None = None
     memory: float = 2.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _check_choice(self.terms, Terms, "terms")
         _check_choice(self.gradient, GradientName, "gradient")
         if self.max_iterations is not None and self.max_iterations < 1:
@@ -140,7 +140,7 @@ class SimulationConfig:
     reward: Reward = field(default_factory=Reward)
     seed: int = 0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_count(self.walks, 1, "walks")
         check_count(self.goals, 1, "goals")
         _check_choice(self.backup, BackupName, "backup")

@@ -1,19 +1,20 @@
 """Demonstrations: the moves of agents as flat arrays, one trajectory after another, and the tasks that they pursued."""
 
 from collections.abc import Sequence
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Shaped
+from typing_extensions import TypeVar
 
 from sidestep.errors import InputError
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.tasks import Task, stack_tasks
 
-Tasks = TypeVar("Tasks", bound=eqx.Module)
+Tasks = TypeVar("Tasks", bound=eqx.Module, default=Any)
 """The type of the tasks: arrays in discrete worlds (`Task`), functions in continuous ones (`ContinuousTask`)."""
 
 _MIN_MOVES, _MIN_TASKS = 64, 8

@@ -59,7 +59,7 @@ class Grid:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     connectivity: Connectivity = 4
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.known.size == 0 or not np.isin(self.known, list(Cell)).all():
             raise InputError("expected at least one cell, each -1 (unknown), 0 (free) or 1 (occupied)", field="known")
         if not (np.isfinite(self.resolution) and self.resolution > 0):

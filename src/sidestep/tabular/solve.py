@@ -68,7 +68,7 @@ class SolveOptions(eqx.Module):
     horizon: int | None = eqx.field(static=True, default=None, converter=lambda n: None if n is None else int(n))
     solver: Solver | None = None
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         if self.gradient not in ("exact", "fixed_policy"):
             raise InputError(f"expected 'exact' or 'fixed_policy', found {self.gradient!r}", field="gradient")
         if self.horizon is not None and self.horizon < 1:

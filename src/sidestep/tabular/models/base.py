@@ -8,8 +8,9 @@ import abc
 from typing import TypeVar
 
 import equinox as eqx
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
+from sidestep._typing import FloatTree
 from sidestep.tabular.graph import Graph
 
 _Model = TypeVar("_Model", bound="TransitionModel")
@@ -30,13 +31,13 @@ class TransitionModel(eqx.Module):
     """
 
     graph: eqx.AbstractVar[Graph]
-    parameters: eqx.AbstractVar[PyTree[Float[Array, "..."]]]
+    parameters: eqx.AbstractVar[FloatTree]
 
     @abc.abstractmethod
     def probabilities(self) -> Float[Array, "states actions outcomes"]:
         """Return T_θ(s, a, s′) of each outcome s′ = `graph.successors[s, a, k]`; it sums to one over k."""
 
-    def with_parameters(self: _Model, parameters: PyTree[Float[Array, "..."]]) -> _Model:
+    def with_parameters(self: _Model, parameters: FloatTree) -> _Model:
         """Return the same model with other parameters.
 
         Args:

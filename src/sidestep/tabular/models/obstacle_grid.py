@@ -15,8 +15,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, Int
 
+from sidestep._typing import FloatTree
 from sidestep.errors import InputError
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph, grid_graph, grid_successors
@@ -85,7 +86,7 @@ class FeaturedGrid(TransitionModel):
     """
 
     graph: Graph
-    parameters: PyTree[Float[Array, "..."]]
+    parameters: FloatTree
     network: Callable[[Float[Array, " features"]], Float[Array, ""]]
     features: Float[Array, "cells features"]
     known: Int[Array, "rows columns"]
