@@ -153,8 +153,8 @@ def peak_bytes() -> int:
     return _status("VmHWM") or peak
 
 
-def peak_memory(build: Callable[..., Callable[[], object]], *given: object, limit: float = 600.0) -> Record:
-    """Return the peak memory of a process of its own that calls `build(*given)`, and then the result of that.
+def peak_memory(build: Callable[..., Callable[[], object]], *inputs: object, limit: float = 600.0) -> Record:
+    """Return the peak memory of a process of its own that calls `build(*inputs)`, and then the result of that.
 
     - `peak_bytes`: of the whole process; `imports_bytes`: held after the imports; `excess_bytes`: the difference.
     - `building_bytes`: the peak before the call; `call_bytes`: the peak of the call less what was held before it.
@@ -163,7 +163,7 @@ def peak_memory(build: Callable[..., Callable[[], object]], *given: object, limi
     """
     with multiprocessing.get_context("spawn").Pool(1, _begin, (build.__module__,)) as pool:
         try:
-            return pool.apply_async(_memory, (build, given)).get(limit)
+            return pool.apply_async(_memory, (build, inputs)).get(limit)
         except Exception as error:  # whatever goes wrong there, the times still count
             warn(f"the memory of {build.__module__} was not measured: {type(error).__name__}: {error}")
             return dict.fromkeys(MEMORY)
@@ -178,8 +178,8 @@ def _begin(module: str) -> None:
     _HELD.append(_status("VmRSS"))
 
 
-def _memory(build: Callable[..., Callable[[], object]], given: Sequence[object]) -> Record:
-    call = build(*given)
+def _memory(build: Callable[..., Callable[[], object]], inputs: Sequence[object]) -> Record:
+    call = build(*inputs)
     held, building, known = _status("VmRSS"), peak_bytes(), True
     try:
         _RESET.write_text("5")  # count the peak anew

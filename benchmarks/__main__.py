@@ -40,8 +40,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = first.parse_args(arguments)
     module = import_module(f"benchmarks.{chosen.name}")
     parser = argparse.ArgumentParser(f"{first.prog} {chosen.name}", description=module.__doc__, formatter_class=raw)
-    for key, how in _arguments(module):
-        parser.add_argument(key, **how)
+    for key, keywords in _arguments(module):
+        parser.add_argument(key, **keywords)
     if parser.parse_args(chosen.options).quick:
         quick = {each.name: each.metadata["quick"] for each in fields(module.Options)}
         parser.set_defaults(**{name: value for name, value in quick.items() if value is not None})
@@ -85,28 +85,20 @@ def _arguments(module: Any) -> list[tuple[str, dict[str, Any]]]:
         ("--from", {"type": Path, "metavar": "FILE", "dest": "records", "help": "show records that --json wrote"}),
         ("--quick", {"action": "store_true", "help": "a small part only, in about a minute"}),
     ]
-    picture = {
-        "type": Path,
-        "metavar": "FILE",
-        "help": "draw a picture" if hasattr(module, "draw") else argparse.SUPPRESS,
-    }
-    arguments.append(("--picture", picture))
+    about = "draw a picture" if hasattr(module, "draw") else argparse.SUPPRESS
+    arguments.append(("--picture", {"type": Path, "metavar": "FILE", "help": about}))
     hints = get_type_hints(module.Options)
     for each in fields(module.Options):
         assert each.default_factory is not MISSING
         default, hint = each.default_factory(), hints[each.name]
         kind = next((kind for kind in get_args(hint) if kind is not NoneType), hint)
-        how: dict[str, Any] = {"help": f"{each.metadata['help']} (default: {_plain(default)})", "default": default}
-        if hint is bool:
-            how["action"] = "store_true"
-        else:
-            how |= {
-                "type": kind,
-                "choices": each.metadata["choices"],
-                "nargs": "*" if isinstance(default, list) else None,
-            }
-            how |= {} if how["choices"] else {"metavar": kind.__name__.upper()}
-        arguments.append((f"--{each.name.replace('_', '-')}", how))
+        about = f"{each.metadata['help']} (default: {_plain(default)})"
+        keywords: dict[str, Any] = {"help": about, "default": default, "action": "store_true"}
+        if hint is not bool:
+            choices, many = each.metadata["choices"], isinstance(default, list)
+            keywords |= {"action": "store", "type": kind, "choices": choices, "nargs": "*" if many else None}
+            keywords |= {} if choices else {"metavar": kind.__name__.upper()}
+        arguments.append((f"--{each.name.replace('_', '-')}", keywords))
     return arguments
 
 

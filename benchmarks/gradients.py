@@ -110,8 +110,8 @@ def problem_of(world: World, model: str, backup: str, options: Options) -> Probl
 def process_of(problem: Problem, parameters: Array) -> DecisionProcess:
     """Return the one task under the model at some parameters."""
     model, task = problem.model.with_parameters(parameters), jax.tree.map(lambda x: x[0], problem.demonstrations.tasks)
-    given = (task.reward, task.terminal_reward, task.terminal, task.discount)
-    return DecisionProcess(model.graph.successors, model.probabilities(), *given)
+    inputs = (task.reward, task.terminal_reward, task.terminal, task.discount)
+    return DecisionProcess(model.graph.successors, model.probabilities(), *inputs)
 
 
 def one_backup(problem: Problem, parameters: Array, values: Array) -> Array:

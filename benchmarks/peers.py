@@ -43,11 +43,11 @@ def mdpsolver(problem: Arrays) -> Callable[[str, float, int], Call]:
     """`mdpsolver.model`, transitions element by element; a new one for each solve, as a used one goes on."""
     columns = (problem[name].tolist() for name in ("state", "action", "after", "chance"))
     moves = [list(move) for move in zip(*columns, strict=True)]
-    given = {"discount": float(problem["discount"]), "rewards": problem["reward"].tolist(), "tranMatElementwise": moves}
+    data = {"discount": float(problem["discount"]), "rewards": problem["reward"].tolist(), "tranMatElementwise": moves}
 
     def solver(algorithm: str, tolerance: float, _: int) -> Call:
         model = importlib.import_module(MODULES["mdpsolver"]).model()
-        model.mdp(**given)
+        model.mdp(**data)
         kind, *more = algorithm.split()
         options = {"update": "gs" if "gs" in more else "standard", "parallel": "serial" not in more}
         options |= {"algorithm": {"values": "vi", "policies": "pi", "modified": "mpi"}[kind], "tolerance": tolerance}

@@ -121,9 +121,9 @@ class Problem:
     @cached_property
     def moves(self) -> csr_array:
         """The transitions, a row for each state and action."""
-        (states, actions), given = self.arrays["reward"].shape, self.arrays
-        rows = given["state"] * actions + given["action"]
-        return csr_array((given["chance"], (rows, given["after"])), shape=(states * actions, states))
+        (states, actions), inputs = self.arrays["reward"].shape, self.arrays
+        rows = inputs["state"] * actions + inputs["action"]
+        return csr_array((inputs["chance"], (rows, inputs["after"])), shape=(states * actions, states))
 
     def exact_hard(self) -> np.ndarray:
         """Return the values of the best policy by a linear solve; raises `NotConverged` unless no action is better."""

@@ -142,8 +142,8 @@ def speed(name: str, options: Options) -> Record:
     batch = Batch(tasks, states, demos.actions[drawn], choices, weights)
     rolled = _roll(case, batch, key)
 
-    def timed(function: Callable, *given: object) -> Callable[[], float]:
-        return lambda: seconds_of(lambda: jax.block_until_ready(function(case, *given)))
+    def timed(function: Callable, *inputs: object) -> Callable[[], float]:
+        return lambda: seconds_of(lambda: jax.block_until_ready(function(case, *inputs)))
 
     calls = {
         "update": lambda: _fitted(case, options.iterations)[1],
@@ -186,8 +186,8 @@ def _fitted(case: Case, iterations: int) -> tuple[ct.PlannerState[ct.FinitePolic
 
 @eqx.filter_jit
 def _roll(case: Case, batch: Batch, key: PRNGKeyArray) -> ct.Rollout:
-    given = (case.dynamics, case.policy, batch.tasks, case.behavior, key, batch.states)
-    return ct.sample_rollouts(*given, case.planner.horizon, batch.choices, case.planner.samples)
+    inputs = (case.dynamics, case.policy, batch.tasks, case.behavior, key, batch.states)
+    return ct.sample_rollouts(*inputs, case.planner.horizon, batch.choices, case.planner.samples)
 
 
 @eqx.filter_jit
@@ -198,9 +198,9 @@ def _model_gradient(case: Case, planning: ct.PlannerState[ct.FinitePolicy], batc
     def weigh(q: Array) -> Array:
         return behavior.beta * (jax.nn.one_hot(batch.chosen, q.shape[1]) - jnp.exp(behavior.log_policy(q)))
 
-    given = (case.dynamics, planning.policy, batch.tasks, behavior, key, batch.states, batch.choices, weigh)
-    how = {"critic": planning.critic, "estimator": case.estimator}
-    return ct.value_gradient(*given, horizon=planner.horizon, samples=planner.samples, **how)[0]
+    inputs = (case.dynamics, planning.policy, batch.tasks, behavior, key, batch.states, batch.choices, weigh)
+    keywords = {"critic": planning.critic, "estimator": case.estimator}
+    return ct.value_gradient(*inputs, horizon=planner.horizon, samples=planner.samples, **keywords)[0]
 
 
 @eqx.filter_jit
@@ -340,8 +340,8 @@ def _estimates(
     tasks = ct.batch_tasks([problem.task])
 
     def one(state: Array, choice: Array, key: PRNGKeyArray) -> Array:
-        given = (problem.dynamics, problem.policy, tasks, AGENTS, key, state[None], choice[None, None], jnp.ones_like)
-        return ravel_pytree(ct.value_gradient(*given, horizon=horizon, samples=1, critic=critic, estimator=by)[0])[0]
+        inputs = (problem.dynamics, problem.policy, tasks, AGENTS, key, state[None], choice[None, None], jnp.ones_like)
+        return ravel_pytree(ct.value_gradient(*inputs, horizon=horizon, samples=1, critic=critic, estimator=by)[0])[0]
 
     keys = jax.random.split(key, (PLACES, samples))
     return jax.vmap(jax.vmap(one, (None, None, 0)))(problem.states[:PLACES], choices, keys)

@@ -12,7 +12,7 @@ parameters of all cells, as a fit computes it:
   gradient, its largest component `--step` long; with `--step-by-sign` every component is that long;
 - region: the same, restricted to the states that mattered to the solve before (Gauss–Seidel only), as a fit of a
   large map does where it tries a step that changes little;
-- Dijkstra: `scipy.sparse.csgraph.dijkstra` from the goal over the expected cost of every move, the matrix given.
+- Dijkstra: `scipy.sparse.csgraph.dijkstra` from the goal over the expected cost of every move, matrix not counted.
 
 Memory is that of a process of its own that takes a gradient of each kind. The exponent is that of the power law through
 the times from 128² cells on, and the largest between two sizes in a row.
@@ -191,8 +191,8 @@ def take(problem: Problem, parameters: Array, start: WarmStart, region: Array) -
         model, begun = problem.model.with_parameters(parameters), start._replace(adjoint=adjoint)
 
         def one(task: Task, choices: Choices, begun: WarmStart, region: Array) -> tuple[Array, Solution]:
-            how = {"options": problem.solving, "region": region}
-            return choice_log_likelihood(model, task, choices, problem.behavior, begun, **how)
+            keywords = {"options": problem.solving, "region": region}
+            return choice_log_likelihood(model, task, choices, problem.behavior, begun, **keywords)
 
         values, solution = jax.vmap(one)(problem.demonstrations.tasks, problem.choices, begun, region)
         return values.sum(), (solution.start, solution.sweeps, solution.converged.all())
