@@ -129,7 +129,7 @@ def learn_by(
             iterations=fit.final.iteration, objective=fit.final.objective, largest_gradient=fit.final.gradient
         )
         result = model_result(learned.model, demonstrations, config)
-        return result._replace(behavior=fit.people.behavior_of(), converged=fit.converged, planner=learned.robot())
+        return result._replace(behavior=fit.behavior.behavior_of(), converged=fit.converged, planner=learned.robot())
 
     for name in methods:
         fitted.clear()

@@ -274,9 +274,9 @@ def learn(town: Town, trips: Sequence[Trip], config: StreetConfig) -> Learned:
     demos, driven = town.demonstrations(trips, costs), jnp.asarray(town.uses(trips) > 0)
     start = means = jnp.where(driven, DRIVEN, config.prior_mean)
     prior = Normal(means, jnp.where(driven, CERTAIN, config.prior_variance))
-    optimizer = LBFGS(iterations=config.iterations, tolerance=config.tolerance)
+    optimizer = LBFGS(max_iterations=config.iterations, tolerance=config.tolerance)
     if len(demos) >= config.many:
-        optimizer = Rprop(iterations=config.iterations, tolerance=PER_TURN * len(demos))
+        optimizer = Rprop(max_iterations=config.iterations, tolerance=PER_TURN * len(demos))
         start = jnp.where(driven, means, CLOSED)
     model = town.model.with_parameters(start)
     return Learned(fit(model, demos, behavior, prior=prior, optimizer=optimizer), costs, behavior)

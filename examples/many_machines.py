@@ -56,7 +56,7 @@ def main() -> None:
     people = ss.Behavior(ss.BoltzmannAverage(), beta=20.0)
     mesh = ss.tasks_mesh()
     found = ss.fit(
-        ss.ObstacleGrid(blank, -2.0), walks_in(truth, blank), people, mesh=mesh, optimizer=ss.LBFGS(iterations=20)
+        ss.ObstacleGrid(blank, -2.0), walks_in(truth, blank), people, mesh=mesh, optimizer=ss.LBFGS(max_iterations=20)
     )
     if jax.process_index() == 0:
         blocked = np.asarray(found.model.blocked).reshape(truth.shape)

@@ -62,12 +62,19 @@ from .tabular.solvers.gauss_seidel import GaussSeidel as GaussSeidel
 from .tabular.solvers.jacobi import Jacobi as Jacobi
 
 # learning: maps from walks, and any model from demonstrations
-from .inference.calibration import effective_sample_ratio as effective_sample_ratio, scores as scores
+from .inference.calibration import (
+    Dispersion as Dispersion,
+    ScoreStatistics as ScoreStatistics,
+    dispersion as dispersion,
+    effective_sample_ratio as effective_sample_ratio,
+    score_statistics as score_statistics,
+)
+from .inference.checkpoints import Checkpoint as Checkpoint
 from .inference.fit import Fit as Fit, fit as fit
 from .inference.goals import GoalFit as GoalFit, fit_goals as fit_goals, goal_posterior as goal_posterior
-from .inference.maximize import Progress as Progress
+from .inference.maximize import Progress as Progress, Status as Status
 from .inference.objective import tasks_mesh as tasks_mesh
-from .inference.optimizers import LBFGS as LBFGS, Adam as Adam, Rprop as Rprop
+from .inference.optimizers import LBFGS as LBFGS, Adam as Adam, Optimizer as Optimizer, Rprop as Rprop
 from .inference.priors import (
     FreeCellEvidence as FreeCellEvidence,
     GaussianMRF as GaussianMRF,

@@ -23,7 +23,9 @@ QUICK = {
 }
 ROOM = room.RoomConfig(**QUICK, lattice_points=21)
 PENDULUM = pendulum.PendulumConfig(**QUICK, moves=5, lattice_points=(24, 21))
-REPRESENTATIONS = representations.RepresentationsConfig(**QUICK, lattice_points=21, grid_optimizer=LBFGS(iterations=1))
+REPRESENTATIONS = representations.RepresentationsConfig(
+    **QUICK, lattice_points=21, grid_optimizer=LBFGS(max_iterations=1)
+)
 
 
 @pytest.mark.slow

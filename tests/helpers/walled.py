@@ -1,8 +1,8 @@
-"""A small world for the tests of fits: a wall with a way around it, and walks that take it.
+"""A small world for the tests of fits: a wall, and paths around it.
 
 . . # . .
 . . # . .
-. . # . .        People walk from side to side; nobody touches the wall.
+. . # . .        Paths lead from side to side; none touches the wall.
 . . # . .
 . . . . .
 """
@@ -29,24 +29,24 @@ PATHS = (
     (2, 4, "DDDDLLLLUUUU"),
     (2, 4, "LDDDDLLLUUUU"),
 )
-"""The index of the goal, the start, and the moves: up, down, left, right."""
+"""The index of the goal, the start state, and the moves: up, down, left, right."""
 REPEATS = 4
 
 
 def follow(start: int, moves: str, grid: Grid = BLANK) -> tuple[np.ndarray, np.ndarray]:
-    """The states and actions along moves that all succeed."""
+    """Return the states and actions of moves that all succeed."""
     actions = np.array(["UDLR".index(move) for move in moves])
     changes = grid.steps[actions] @ np.array([grid.shape[1], 1])
     return start + np.append(0, np.cumsum(changes)), actions
 
 
 def walks(grid: Grid = BLANK, discount: float = 0.95, step_cost: float | None = None) -> Demonstrations:
-    """The demonstrations, with the reward that `reach` takes."""
+    """Return the demonstrations; the other arguments are those of `reach`."""
     trajectories = [Trajectory(*follow(start, moves), task) for task, start, moves in PATHS for _ in range(REPEATS)]
     return gather(trajectories, [reach(grid, goal, discount=discount, step_cost=step_cost) for goal in GOALS])
 
 
 def objective(model, demonstrations, behavior, parameters, mean=-2.0, variance=2.0, **settings):
-    """log L(θ) − Σ (θ − b)²/(2σ²): the objective of a fit, from the likelihood and a normal prior."""
+    """Return log L(θ) − Σ (θ − b)²/(2σ²), the objective of a fit with a normal prior."""
     likelihood = log_likelihood(model.with_parameters(parameters), demonstrations, behavior, **settings)
     return likelihood.total - jnp.sum((parameters - mean) ** 2 / (2 * variance))

@@ -1,4 +1,4 @@
-"""The same fit on one device, on several, and in several processes: one objective, one gradient, one map."""
+"""One device, several devices and several processes give the same objective, gradient and fit."""
 
 import os
 import socket
@@ -10,69 +10,70 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers.spread import GOALS, WAYS, measured
+from helpers.spread import CASES, GOALS, measured
 
 PROGRAM = Path(__file__).parents[1] / "helpers" / "spread.py"
 LIMIT = 240
-"""After how many seconds children that have not ended are given up; on idle cores they take a tenth of that."""
+"""The time limit of child processes in seconds; on idle cores they take a tenth of it."""
 SPREAD = {"4 devices": (1, 4), "2 processes with 2 devices each": (2, 2)}
-"""How many processes, and how many devices each has."""
+"""The number of processes, and of devices of each."""
 
 
-@pytest.mark.parametrize("way", SPREAD)
-def test_the_same_fit_however_it_is_spread(tmp_path, way):
-    """One test, so that the children run once."""
-    processes, devices = SPREAD[way]
+@pytest.mark.slow
+@pytest.mark.parametrize("case", SPREAD)
+def test_fit_over_devices_and_processes_equals_fit_on_one_device(tmp_path, case):
+    """One test, so that the child processes run once."""
+    processes, devices = SPREAD[case]
     run_children(tmp_path, processes, devices)
-    for name in WAYS:
-        found = [dict(np.load(tmp_path / f"{name}-{process}.npz")) for process in range(processes)]
+    for name in CASES:
+        results = [dict(np.load(tmp_path / f"{name}-{process}.npz")) for process in range(processes)]
         expected = measured(name, None)
-        for own in found:
+        for own in results:
             assert own["devices"] == processes * devices
             check_objective(own, expected)
             check_fit(own, expected)
-            check_resumed(own, to_the_last_bit=processes == 1)
-        for other in found[1:]:
-            for key, value in found[0].items():
+            check_resumed(own, bit_for_bit=processes == 1)
+        for other in results[1:]:
+            for key, value in results[0].items():
                 np.testing.assert_array_equal(other[key], value, err_msg=key)
-        # one task a device at a time, as there is no memory for more, and all at once
-        assert found[0]["batches"] == {"jacobi": 2, "ordered": 1}[name]
+        # with the memory for one task per device, and for all
+        assert results[0]["batches"] == {"jacobi": 2, "gauss_seidel": 1}[name]
     if processes > 1:
         check_refusals([(tmp_path / f"refusal-{process}.txt").read_text() for process in range(processes)])
 
 
-def check_objective(found, expected):
-    """Parts and slope are those of one device."""
-    np.testing.assert_allclose(found["parts"], expected["parts"], rtol=1e-9)
-    largest = np.abs(expected["slope"]).max()
-    np.testing.assert_allclose(found["slope"], expected["slope"], rtol=1e-9, atol=1e-9 * largest)
+def check_objective(result, expected):
+    """The parts and the gradient are those of one device."""
+    np.testing.assert_allclose(result["parts"], expected["parts"], rtol=1e-9)
+    largest = np.abs(expected["gradient"]).max()
+    np.testing.assert_allclose(result["gradient"], expected["gradient"], rtol=1e-9, atol=1e-9 * largest)
 
 
-def check_fit(found, expected):
-    """A fit of a few iterations ends where that on one device does, and knows of all tasks."""
-    np.testing.assert_allclose(found["found"], expected["found"], rtol=1e-7)
-    assert found["converged"].all()
-    assert found["sweeps"].shape == (len(GOALS),)
+def check_fit(result, expected):
+    """A short fit ends where that on one device does, and reports all tasks."""
+    np.testing.assert_allclose(result["learned"], expected["learned"], rtol=1e-7)
+    assert result["converged"].all()
+    assert result["sweeps"].shape == (len(GOALS),)
 
 
-def check_resumed(found, to_the_last_bit):
-    """A fit that was interrupted ends where an uninterrupted one does; several processes solve anew what was solved."""
-    np.testing.assert_allclose(found["resumed"], found["found"], rtol=0 if to_the_last_bit else 1e-5)
+def check_resumed(result, bit_for_bit):
+    """A resumed fit ends where an uninterrupted one does; several processes start from cold starts."""
+    np.testing.assert_allclose(result["resumed"], result["learned"], rtol=0 if bit_for_bit else 1e-5)
 
 
-def check_refusals(said):
-    """Processes that were given different walks all say so."""
-    assert all("the same model, demonstrations, settings and checkpoint in all processes" in each for each in said), (
-        said
-    )
+def check_refusals(messages):
+    """Processes with different demonstrations all raise."""
+    expected = "the same model, demonstrations, settings and checkpoint in all processes"
+    assert all(expected in message for message in messages), messages
 
 
 def run_children(out, processes, devices):
-    """Runs the program in so many processes at once, and ends them all if one fails or takes too long."""
+    """Run the program in several processes at once, and end them all if one fails or takes too long."""
     flags = f"--xla_cpu_use_fusion_emitters=false --xla_force_host_platform_device_count={devices}"
     changes = {
         "XLA_FLAGS": flags,
         "JAX_PLATFORMS": "cpu",
+        "PYTHONPATH": os.pathsep.join(filter(None, (str(PROGRAM.parents[1]), os.environ.get("PYTHONPATH")))),
         "JAX_ENABLE_X64": "1",
         "JAX_CPU_COLLECTIVES_IMPLEMENTATION": "gloo",
     }
@@ -95,14 +96,14 @@ def run_children(out, processes, devices):
             child.wait()
         for log in logs:
             log.close()
-    said = "\n".join(Path(log.name).read_text() for log in logs)
+    output = "\n".join(Path(log.name).read_text() for log in logs)
     assert ends == [0] * processes, (
-        f"children ended with {ends} (None: not within {LIMIT} s, or not before another failed)\n{said}"
+        f"children ended with {ends} (None: not within {LIMIT} s, or not before another failed)\n{output}"
     )
 
 
 def ends_of(children):
-    """How the children ended; None for those that had not when time was up, or when another had failed."""
+    """The exit codes of the children; None for those that had not ended in time, or before another failed."""
     until = time.monotonic() + LIMIT
     ends = [None] * len(children)
     while None in ends and not any(ends) and time.monotonic() < until:

@@ -1,4 +1,4 @@
-"""Goals that nobody named: the posterior over candidates, and what is learned with it."""
+"""Unknown goals: the posterior over candidates, and what is learned with it."""
 
 import jax
 import numpy as np
@@ -6,7 +6,7 @@ import pytest
 
 from sidestep.errors import InputError
 from sidestep.inference.fit import fit
-from sidestep.inference.goals import fit_goals, goal_posterior, weighted
+from sidestep.inference.goals import fit_goals, goal_posterior, weighted_demonstrations
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.grid import Grid
@@ -16,7 +16,7 @@ from sidestep.tabular.planning import plan
 from sidestep.tabular.simulation import simulate
 from sidestep.tabular.tasks import reach
 
-PEOPLE = Behavior(BoltzmannAverage(), 30.0)
+BEHAVIOR = Behavior(BoltzmannAverage(), 30.0)
 WALL = np.zeros((6, 7), dtype=int)
 WALL[1:5, 3] = 1
 WORLD = true_model(Grid(WALL))
@@ -25,60 +25,64 @@ GOALS = (0, 6, 35, 41)
 TASKS = [reach(BLANK, goal) for goal in GOALS]
 
 
-def walks(cut=0):
-    """People who walk round the wall to one of four corners; the last `cut` moves of each are not seen."""
+def trajectories(cut=0):
+    """Paths around the wall to one of four corners, without the last `cut` moves of each."""
     free = np.flatnonzero(WALL.ravel() == 0)
     starts = [np.random.default_rng(goal).choice(np.setdiff1d(free, GOALS), 8) for goal in GOALS]
-    seen = simulate(jax.random.key(0), WORLD, TASKS, starts, PEOPLE)
+    whole = simulate(jax.random.key(0), WORLD, TASKS, starts, BEHAVIOR)
     return [
         Trajectory(walk.states[: len(walk.states) - cut], walk.actions[: len(walk.actions) - cut], walk.task)
-        for walk in seen
+        for walk in whole
         if len(walk.actions) > cut
     ]
 
 
-def test_the_posterior_is_bayes_rule():
-    seen, shares = walks(cut=2), np.array([0.4, 0.3, 0.2, 0.1])
-    posterior, evidence = goal_posterior(WORLD, seen, TASKS, PEOPLE, shares)
-    policies = [np.asarray(plan(WORLD, task, PEOPLE).policy) for task in TASKS]
+def test_goal_posterior_is_bayes_rule():
+    seen, probabilities = trajectories(cut=2), np.array([0.4, 0.3, 0.2, 0.1])
+    posterior, log_likelihood = goal_posterior(WORLD, seen, TASKS, BEHAVIOR, probabilities)
+    policies = [np.asarray(plan(WORLD, task, BEHAVIOR).policy) for task in TASKS]
     total = 0.0
-    for walk, found in zip(seen, posterior, strict=True):
-        joint = shares * [
+    for walk, row in zip(seen, posterior, strict=True):
+        joint = probabilities * [
             0.0 if goal in walk.states[:-1] else policy[walk.states[:-1], walk.actions].prod()
             for goal, policy in zip(GOALS, policies, strict=True)
         ]
-        np.testing.assert_allclose(found, joint / joint.sum(), rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(row, joint / joint.sum(), rtol=1e-6, atol=1e-12)
         total += np.log(joint.sum())
-    assert evidence == pytest.approx(total, rel=1e-8)
+    assert log_likelihood == pytest.approx(total, rel=1e-8)
 
 
-def test_weights_count_as_so_many_copies():
-    seen = walks()[:3]
+def test_weighted_demonstrations_count_as_copies():
+    seen = trajectories()[:3]
     posterior = np.zeros((3, 4))
     posterior[[0, 1, 2], [0, 0, 1]] = 1.0, 0.5, 2.0
-    found = log_likelihood(WORLD, weighted(seen, TASKS, posterior), PEOPLE)
-    alone = [
-        log_likelihood(WORLD, gather([walk._replace(task=task)], TASKS), PEOPLE)
+    weighted = log_likelihood(WORLD, weighted_demonstrations(seen, TASKS, posterior), BEHAVIOR)
+    separate = [
+        log_likelihood(WORLD, gather([walk._replace(task=task)], TASKS), BEHAVIOR)
         for walk, task in zip(seen, (0, 0, 1), strict=True)
     ]
     for term in ("actions", "transitions"):
-        expected = sum(weight * float(getattr(one, term)) for weight, one in zip((1.0, 0.5, 2.0), alone, strict=True))
-        assert float(getattr(found, term)) == pytest.approx(expected, rel=1e-9)
+        expected = sum(
+            weight * float(getattr(one, term)) for weight, one in zip((1.0, 0.5, 2.0), separate, strict=True)
+        )
+        assert float(getattr(weighted, term)) == pytest.approx(expected, rel=1e-9)
 
 
-def test_goals_and_the_wall_are_found_from_walks_that_break_off():
-    seen = walks(cut=1)
-    found = fit_goals(ObstacleGrid(BLANK, -1.0), seen, TASKS, PEOPLE, lambda model, shown: fit(model, shown, PEOPLE))
-    assert found.converged
-    assert (np.diff(found.evidence) > -0.5).all()
-    assert np.mean(found.posterior.argmax(axis=1) == [walk.task for walk in seen]) >= 0.9
-    assert found.shares.sum() == pytest.approx(1)
-    blocked = np.asarray(found.fit.model.blocked).ravel()
+def test_fit_goals_learns_goals_and_the_wall_from_truncated_paths():
+    seen = trajectories(cut=1)
+    result = fit_goals(
+        ObstacleGrid(BLANK, -1.0), seen, TASKS, BEHAVIOR, lambda model, demos: fit(model, demos, BEHAVIOR)
+    )
+    assert result.converged
+    assert (np.diff(result.log_likelihoods) > -0.5).all()
+    assert np.mean(result.posterior.argmax(axis=1) == [walk.task for walk in seen]) >= 0.9
+    assert result.goal_probabilities.sum() == pytest.approx(1)
+    blocked = np.asarray(result.fit.model.blocked).ravel()
     assert blocked[WALL.ravel() == 1].min() > blocked[WALL.ravel() == 0].max()
 
 
-def test_a_walk_that_passes_all_candidates_is_refused():
+def test_goal_posterior_of_a_path_past_all_candidates_raises():
     states = np.array([1, 0, 1])
     walk = Trajectory(states, np.array([2, 3]), 0)
-    with pytest.raises(InputError, match=r"walk, row 2: goes on after it has reached each of the candidates"):
-        goal_posterior(WORLD, [walks()[0], walk], TASKS[:1], PEOPLE)
+    with pytest.raises(InputError, match=r"trajectory, row 2: continues after the terminal states of all candidates"):
+        goal_posterior(WORLD, [trajectories()[0], walk], TASKS[:1], BEHAVIOR)

@@ -1,53 +1,99 @@
-"""The maximize of a fit: which of its looks save work."""
+"""Maximization: which evaluations are approximate, and why it stops."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from sidestep.inference import batching, maximize, objective
+from helpers.walled import BLANK, walks
+from sidestep.inference.batching import BatchPlan
 from sidestep.inference.fit import fit
-from sidestep.inference.objective import Objective
-from sidestep.inference.optimizers import Rprop
+from sidestep.inference.maximize import Status, maximize, solve_tolerances
+from sidestep.inference.objective import Objective, Problem
+from sidestep.inference.optimizers import LBFGS, Adam, Rprop
+from sidestep.inference.priors import Normal
 from sidestep.maps.config import SimulationConfig
-from sidestep.tabular.backups import Behavior, LogSumExp
+from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax, LogSumExp
+from sidestep.tabular.behavior_model import behavior_model
 from sidestep.tabular.demonstrations import gather
+from sidestep.tabular.likelihood import ALL_TERMS
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.reward import Reward
+from sidestep.tabular.solve import SolveOptions
+from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.tasks import reach
 from sidestep.worlds.offices import office
 from sidestep.worlds.walks import simulate_walks
 
+LOOSE = Rprop.solve_tolerance
 
-def test_states_are_left_out_only_where_a_step_is_tried(monkeypatch):
-    """And not once solves are exact; whether a step is taken is decided by all states."""
-    for module in (maximize, batching):
-        monkeypatch.setattr(module, "LARGE", 1)
-    looks, solved, again = [], [], []
-    evaluate, of_actions = Objective.evaluate, objective._of_actions
 
-    def watched(self, parameters, starts, tolerance, known, negligible, little):
-        looks.append((tolerance, negligible > 0, little > 0))
-        found, left = evaluate(self, parameters, starts, tolerance, known, negligible, little)
-        assert little > 0 or all(part.everywhere for part in found.parts)
-        again.extend(
-            part.everywhere
-            for part in known
-            if little == 0 and all(map(np.array_equal, jax.tree.leaves(part.parameters), jax.tree.leaves(parameters)))
-        )
-        return found, left
+class Watched(Objective):
+    """Records the arguments of evaluations, and which batches were evaluated with all states."""
 
-    def of_batch(problem, parameters, batch, starts, everywhere, mesh):
-        solved.append((looks[-1], everywhere))
-        return of_actions(problem, parameters, batch, starts, everywhere, mesh)
+    def __init__(self, problem):
+        super().__init__(problem, BatchPlan(1, keeps_warm_starts=True, reuses=True))
+        self.evaluations, self.solves, self.reused = [], [], set()
 
-    monkeypatch.setattr(Objective, "evaluate", watched)
-    monkeypatch.setattr(objective, "_of_actions", of_batch)
+    def evaluate(self, parameters, warm_starts, *, tolerance=None, known=(), reuse_below=0.0, partial_below=0.0):
+        self.evaluations.append((tolerance, reuse_below > 0, partial_below > 0))
+        if partial_below == 0:
+            here = jax.tree.leaves(parameters)
+            self.reused |= {
+                each.all_states for each in known if all(map(np.array_equal, jax.tree.leaves(each.parameters), here))
+            }
+        settings = {"reuse_below": reuse_below, "partial_below": partial_below}
+        result, starts = super().evaluate(parameters, warm_starts, tolerance=tolerance, known=known, **settings)
+        assert partial_below > 0 or all(each.all_states for each in result.contributions)
+        return result, starts
+
+    def evaluate_batch(self, problem, parameters, batch, start, all_states):
+        self.solves.append((self.evaluations[-1], all_states))
+        return super().evaluate_batch(problem, parameters, batch, start, all_states)
+
+
+@pytest.fixture(scope="module")
+def problem():
     truth = office(20, 24, 2)
     trajectories, goals = simulate_walks(truth, SimulationConfig(24, 6, reward=Reward(1.0, 1.0)))
-    shown = gather(trajectories, [reach(truth.forget(), goal, discount=1.0, step_cost=1.0) for goal in goals])
-    found = fit(ObstacleGrid(truth.forget(), 0.0), shown, Behavior(LogSumExp(), 5.0), optimizer=Rprop(tolerance=1.0))
-    assert found.converged
-    assert {look for look, everywhere in solved if not everywhere} == {(Rprop.exactness, True, True)}
-    assert {rough for _, rough, _ in looks} == {False, True}
-    # proper looks come after rough ones at the same point, some of whose parts are not of all states
-    assert set(again) == {False, True}
-    assert all(little == (rough and tolerance == Rprop.exactness) for tolerance, rough, little in looks)
+    demos = gather(trajectories, [reach(truth.forget(), goal, discount=1.0, step_cost=1.0) for goal in goals])
+    behavior = behavior_model(Behavior(LogSumExp(), 5.0))
+    options = SolveOptions(solver=GaussSeidel())
+    return Problem(ObstacleGrid(truth.forget(), 0.0), behavior, demos, Normal(), ALL_TERMS, options)
+
+
+@pytest.mark.slow
+def test_maximize_solves_a_part_of_the_states_only_at_trial_points(problem):
+    optimizer, objective = Rprop(), Watched(problem)
+    result = maximize(objective, optimizer, tolerances=solve_tolerances(problem, optimizer, large_map=1))
+    assert result.status is Status.CONVERGED
+    # only approximate evaluations with the loose tolerance leave out states
+    assert {evaluation for evaluation, all_states in objective.solves if not all_states} == {(LOOSE, True, True)}
+    assert {approximate for _, approximate, _ in objective.evaluations} == {False, True}
+    assert all(partial == (near and tolerance == LOOSE) for tolerance, near, partial in objective.evaluations)
+    # exact evaluations follow approximate ones at the same point
+    assert objective.reused == {False, True}
+
+
+def test_fit_in_32_bits_advises_64_bits():
+    with jax.enable_x64(False):
+        start, optimizer = ObstacleGrid(BLANK, jnp.full(25, -2.0)), LBFGS(tolerance=1e-9)
+        result = fit(start, walks(BLANK), Behavior(BoltzmannAverage()), optimizer=optimizer)
+    assert result.status is Status.PRECISION_LIMIT
+    assert not result.converged
+    assert "32-bit numbers cannot resolve smaller changes of the objective" in result.message
+    assert "jax.config.update('jax_enable_x64', True)" in result.message
+
+
+@pytest.mark.parametrize(("backup", "optimizer", "status", "advice"), [
+    (BoltzmannAverage(), LBFGS(), Status.CONVERGED, ""),
+    (BoltzmannAverage(), Adam(max_iterations=3), Status.MAX_ITERATIONS, "a larger max_iterations"),
+    (HardMax(), LBFGS(), Status.NO_ASCENT_STEP, "a kink"),
+])  # fmt: skip
+def test_fit_status_has_advice(backup, optimizer, status, advice):
+    result = fit(ObstacleGrid(BLANK, -2.0), walks(BLANK), Behavior(backup, 10.0), optimizer=optimizer)
+    assert result.status is status
+    assert result.message.startswith(status.value)
+    assert f"the largest gradient is {result.final.gradient:.2g}" in result.message
+    assert result.message.endswith(status.advice)
+    assert advice in status.advice

@@ -1,15 +1,14 @@
-"""The objective of a fit, batch by batch, beside the likelihood and the prior differentiated directly."""
+"""The objective of a fit, batch by batch, against the likelihood and the prior differentiated directly."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.spread import BENT, GOALS, at, demonstrations
+from helpers.spread import GOALS, STEP, at, demonstrations
 from helpers.walled import BLANK
-from sidestep.inference import batching
-from sidestep.inference.batching import planned
-from sidestep.inference.objective import MEMORY, Objective, Problem, _of_actions
+from sidestep.inference.batching import MEMORY, BatchPlan, plan_batches
+from sidestep.inference.objective import Objective, Problem
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.behavior_model import behavior_model
@@ -24,63 +23,81 @@ from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.solvers.native import cores
 from sidestep.tabular.tasks import reach
 
-SOLVERS = {"jacobi": Jacobi(), "ordered": GaussSeidel()}
-PEOPLE = Behavior(BoltzmannAverage(), 10.0)
+SOLVERS = {"jacobi": Jacobi(), "gauss_seidel": GaussSeidel()}
+BEHAVIOR = Behavior(BoltzmannAverage(), 10.0)
 MODEL = ObstacleGrid(BLANK, -2.0)
-PRIOR = Normal(-1.0, 3.0)
-POINT = MODEL.parameters + BENT
+PRIOR = Normal(-1.0, 1.5)
+POINT = MODEL.parameters + STEP
 TASKS, STATES = len(GOALS), BLANK.size
 ONE_TASK = STATES * 4 * 2 * 8.0
-"""The bytes of one model's probabilities: four actions, two outcomes, numbers of eight bytes."""
+"""The bytes of the probabilities: four actions, two outcomes, numbers of eight bytes."""
 
 
-def problem_of(solver=SOLVERS["jacobi"], terms=ALL_TERMS, shown=None, model=MODEL):
-    return Problem(model, behavior_model(PEOPLE), shown or demonstrations(), PRIOR, terms, SolveOptions(solver=solver))
+class Watched(Objective):
+    """Records for each batch that is evaluated whether all states are solved."""
+
+    def __init__(self, *args):
+        super().__init__(*args)
+        self.calls = []
+
+    def evaluate_batch(self, problem, parameters, batch, start, all_states):
+        self.calls.append(all_states)
+        return super().evaluate_batch(problem, parameters, batch, start, all_states)
+
+
+def problem_of(solver=SOLVERS["jacobi"], terms=ALL_TERMS, demos=None, model=MODEL):
+    return Problem(
+        model, behavior_model(BEHAVIOR), demos or demonstrations(), PRIOR, terms, SolveOptions(solver=solver)
+    )
+
+
+def objective_of(memory, **changes):
+    problem = problem_of(**changes)
+    return Objective(problem, plan_batches(problem.model, problem.solver, TASKS, memory=memory))
 
 
 def directly(problem, parameters):
-    """The parts and the slope of the loss, from the likelihood of all demonstrations and the prior."""
+    """The parts of the objective and the gradient of the loss, from all demonstrations and the prior."""
 
     def loss(parameters):
         likelihood = log_likelihood(
             problem.model.with_parameters(parameters),
             problem.demonstrations,
-            PEOPLE,
+            BEHAVIOR,
             options=SolveOptions(solver=problem.solver),
         )
         prior = problem.prior.log_density(parameters)
         return -likelihood.total - prior, (likelihood.actions, likelihood.transitions, prior)
 
-    (_, parts), slope = jax.jit(jax.value_and_grad(loss, has_aux=True))(parameters)
-    return np.array(parts), np.asarray(slope)
+    (_, parts), gradient = jax.jit(jax.value_and_grad(loss, has_aux=True))(parameters)
+    return np.array(parts), np.asarray(gradient)
 
 
 @pytest.mark.parametrize("memory", [MEMORY, 46 * ONE_TASK, 1.0])
 @pytest.mark.parametrize("name", SOLVERS)
-def test_batches_add_up_to_the_likelihood_and_the_prior(name, memory):
-    problem = problem_of(SOLVERS[name])
-    objective = Objective(problem, memory)
-    found, _ = objective.evaluate(at(POINT), objective.cold_starts())
-    parts, slope = directly(problem, POINT)
-    np.testing.assert_allclose([found.actions, found.transitions, found.prior], parts, rtol=1e-9)
-    assert found.objective == pytest.approx(parts.sum(), rel=1e-9)
-    np.testing.assert_allclose(found.slope.model, slope, rtol=1e-9, atol=1e-9 * np.abs(slope).max())
+def test_evaluate_equals_likelihood_and_prior_for_every_batch_size(name, memory):
+    objective = objective_of(memory, solver=SOLVERS[name])
+    result, _ = objective.evaluate(at(POINT), objective.cold_starts())
+    parts, gradient = directly(objective.problem, POINT)
+    np.testing.assert_allclose([result.actions, result.transitions, result.prior], parts, rtol=1e-9)
+    assert result.objective == pytest.approx(parts.sum(), rel=1e-9)
+    np.testing.assert_allclose(result.gradient.model, gradient, rtol=1e-9, atol=1e-9 * np.abs(gradient).max())
 
 
-def test_one_compiled_function_serves_data_of_many_sizes():
-    """More walks and goals come in arrays of the same shapes, as long as they fit into one batch."""
+def test_batches_of_several_data_sizes_have_equal_shapes():
+    """One compiled function serves them all, as long as they fit into one batch."""
     shapes = []
     for goals in (5, 6, 8):
-        walks = [Trajectory(np.arange(goal, -1, -1), np.full(goal, 2), 0) for goal in range(1, goals - 3)]
+        paths = [Trajectory(np.arange(goal, -1, -1), np.full(goal, 2), 0) for goal in range(1, goals - 3)]
         tasks = [reach(BLANK, 5 * goal % 24) for goal in range(goals)]
-        objective = Objective(problem_of(shown=gather(walks, tasks)), MEMORY)
+        objective = Objective(problem_of(demos=gather(paths, tasks)))
         shapes.append(jax.tree.map(jnp.shape, (objective.batches, objective.arrivals)))
     assert shapes[0] == shapes[1] == shapes[2]
 
 
-def test_the_less_memory_the_more_batches():
+def test_plan_batches_with_less_memory_has_more_batches():
     memories = (MEMORY, 46 * ONE_TASK, 25 * ONE_TASK, 1.0)
-    objectives = [Objective(problem_of(), memory) for memory in memories]
+    objectives = [objective_of(memory) for memory in memories]
     assert [len(objective.batches) for objective in objectives] == [1, 2, 5, 5]
     for objective in objectives:
         tasks = [np.asarray(batch.choices.counts).sum() for batch in objective.batches]
@@ -89,20 +106,20 @@ def test_the_less_memory_the_more_batches():
 
 
 @pytest.mark.parametrize(("tasks", "devices", "expected"), [(5, 1, 8), (5, 4, 8), (8, 4, 8), (3, 4, 4), (9, 2, 16)])
-def test_devices_share_tasks_equally(tasks, devices, expected):
-    assert planned(MODEL, Jacobi(), tasks, MEMORY, devices) == (expected, True, False)
+def test_plan_batches_gives_devices_equal_numbers_of_tasks(tasks, devices, expected):
+    assert plan_batches(MODEL, Jacobi(), tasks, devices=devices) == (expected, True, False)
 
 
-def test_memory_is_that_of_each_device():
+def test_plan_batches_takes_memory_per_device():
     """Six tasks need two batches on one device, and one on two devices."""
     memory = 46 * ONE_TASK
-    assert planned(MODEL, Jacobi(), 6, memory, 1)[0] == 3
-    assert planned(MODEL, Jacobi(), 6, memory, 2)[0] == 6
+    assert plan_batches(MODEL, Jacobi(), 6, memory=memory).size == 3
+    assert plan_batches(MODEL, Jacobi(), 6, memory=memory, devices=2).size == 6
 
 
-def test_starts_are_dropped_where_there_is_no_room():
-    roomy, tight = Objective(problem_of(), MEMORY), Objective(problem_of(), 1.0)
-    assert (roomy.planned.keeps_starts, tight.planned.keeps_starts) == (True, False)
+def test_evaluate_without_memory_for_warm_starts_returns_cold_starts():
+    roomy, tight = objective_of(MEMORY), objective_of(1.0)
+    assert (roomy.plan.keeps_warm_starts, tight.plan.keeps_warm_starts) == (True, False)
     cold = tight.cold_starts()
     _, left = tight.evaluate(at(POINT), cold)
     assert left is cold
@@ -112,191 +129,172 @@ def test_starts_are_dropped_where_there_is_no_room():
 
 
 @pytest.mark.parametrize("name", SOLVERS)
-def test_where_solves_start_makes_no_difference(name):
-    objective = Objective(problem_of(SOLVERS[name]), MEMORY)
+def test_evaluate_from_warm_starts_equals_from_cold_starts(name):
+    objective = Objective(problem_of(SOLVERS[name]))
     cold, starts = objective.evaluate(at(POINT), objective.cold_starts())
     warm, _ = objective.evaluate(at(POINT), starts)
-    assert np.mean(warm.solved[0].sweeps) < np.mean(cold.solved[0].sweeps)
+    assert np.mean(warm.solves[0].sweeps) < np.mean(cold.solves[0].sweeps)
     np.testing.assert_allclose(warm[:4], cold[:4], rtol=1e-8)
     np.testing.assert_allclose(
-        warm.slope.model, cold.slope.model, rtol=1e-7, atol=1e-7 * np.abs(cold.slope.model).max()
+        warm.gradient.model, cold.gradient.model, rtol=1e-7, atol=1e-7 * np.abs(cold.gradient.model).max()
     )
 
 
+@pytest.fixture(scope="module")
+def one_batch():
+    """All five tasks in one batch."""
+    return Objective(problem_of(SOLVERS["gauss_seidel"]))
+
+
 @pytest.fixture
-def a_task_a_batch(monkeypatch):
-    """An objective with a batch for each of its five tasks, whose parts are taken over, and one with all in one."""
-    monkeypatch.setattr(batching, "LARGE", 1)
-    monkeypatch.setattr(batching, "cores", lambda: 1)
-    problem = problem_of(SOLVERS["ordered"])
-    objective, whole = Objective(problem, MEMORY, takes_over=True), Objective(problem, MEMORY)
-    assert (len(objective.batches), objective.planned.takes_over, len(whole.batches)) == (5, True, 1)
-    return objective, whole
+def batches():
+    """A batch for each of the five tasks; contributions are reused."""
+    return Watched(problem_of(SOLVERS["gauss_seidel"]), BatchPlan(1, keeps_warm_starts=True, reuses=True))
 
 
-def test_what_a_batch_added_at_the_same_point_is_taken_over(a_task_a_batch):
-    objective, _ = a_task_a_batch
-    found, starts = objective.evaluate(at(POINT), objective.cold_starts())
-    assert sum(part.actions for part in found.parts) == found.actions
-    marked = [part._replace(actions=2.0**index) for index, part in enumerate(found.parts)]
-    again, left = objective.evaluate(at(POINT), starts, known=marked)
+def test_evaluate_at_the_same_point_reuses_contributions(batches):
+    result, starts = batches.evaluate(at(POINT), batches.cold_starts())
+    assert sum(part.actions for part in result.contributions) == result.actions
+    changed = [part._replace(actions=2.0**index) for index, part in enumerate(result.contributions)]
+    again, left = batches.evaluate(at(POINT), starts, known=changed)
     assert again.actions == 31
-    np.testing.assert_array_equal(again.slope.model, found.slope.model)
+    np.testing.assert_array_equal(again.gradient.model, result.gradient.model)
     assert all(one is other for one, other in zip(left, starts, strict=True))
-    elsewhere, _ = objective.evaluate(at(POINT + 1e-9), starts, known=marked)
-    assert elsewhere.actions == pytest.approx(found.actions, rel=1e-6)
+    elsewhere, _ = batches.evaluate(at(POINT + 1e-9), starts, known=changed)
+    assert elsewhere.actions == pytest.approx(result.actions, rel=1e-6)
 
 
-def test_only_batches_that_a_change_concerns_are_solved_anew(a_task_a_batch):
-    """One parameter is moved by as much as would change one task's part by a nat, and others hardly."""
-    objective, whole = a_task_a_batch
-    found, starts = objective.evaluate(at(POINT), objective.cold_starts())
-    slopes = np.abs([part.slope.model for part in found.parts])
-    rest = slopes.sum(axis=0) - slopes.max(axis=0)
-    cell = np.argmin(np.where(slopes.max(axis=0) > 1e-3, rest / slopes.max(axis=0), np.inf))
-    move = 1 / slopes[:, cell].max()
+def test_evaluate_solves_only_batches_that_change(batches, one_batch):
+    """One parameter is moved so that one task's contribution changes by a nat, and others hardly."""
+    result, starts = batches.evaluate(at(POINT), batches.cold_starts())
+    gradients = np.abs([part.gradient.model for part in result.contributions])
+    rest = gradients.sum(axis=0) - gradients.max(axis=0)
+    cell = np.argmin(np.where(gradients.max(axis=0) > 1e-3, rest / gradients.max(axis=0), np.inf))
+    move = 1 / gradients[:, cell].max()
     moved = POINT.at[cell].add(move)
-    concerned = slopes[:, cell] * move >= 0.1
+    concerned = gradients[:, cell] * move >= 0.1
     assert 0 < concerned.sum() < 5
-    again, _ = objective.evaluate(at(moved), starts, known=found.parts, negligible=0.1)
-    kept = [now is before for now, before in zip(again.parts, found.parts, strict=True)]
+    again, _ = batches.evaluate(at(moved), starts, known=result.contributions, reuse_below=0.1)
+    kept = [now is before for now, before in zip(again.contributions, result.contributions, strict=True)]
     np.testing.assert_array_equal(kept, ~concerned)
-    exact, _ = whole.evaluate(at(moved), whole.cold_starts())
-    assert abs(exact.actions - found.actions) > 0.5
+    exact, _ = one_batch.evaluate(at(moved), one_batch.cold_starts())
+    assert abs(exact.actions - result.actions) > 0.5
     assert again.actions == pytest.approx(exact.actions, abs=0.1)
 
 
-def test_what_changed_since_is_counted_from_where_a_part_was_solved(a_task_a_batch):
-    """A part that was taken over twice does not drift away by less than is negligible each time."""
-    objective, _ = a_task_a_batch
-    found, starts = objective.evaluate(at(POINT), objective.cold_starts())
-    first = found.parts[0]
-    direction = 0.06 * np.sign(first.slope.model) / np.abs(first.slope.model).sum()
-    once, starts = objective.evaluate(at(POINT + direction), starts, known=found.parts, negligible=0.1)
-    assert once.parts[0] is first
-    twice, _ = objective.evaluate(at(POINT + 2 * direction), starts, known=once.parts, negligible=0.1)
-    assert twice.parts[0] is not first
+def test_evaluate_counts_changes_from_where_a_contribution_was_computed(batches):
+    """A contribution that is reused twice does not drift by a negligible amount each time."""
+    result, starts = batches.evaluate(at(POINT), batches.cold_starts())
+    first = result.contributions[0]
+    direction = 0.06 * np.sign(first.gradient.model) / np.abs(first.gradient.model).sum()
+    once, starts = batches.evaluate(at(POINT + direction), starts, known=result.contributions, reuse_below=0.1)
+    assert once.contributions[0] is first
+    twice, _ = batches.evaluate(at(POINT + 2 * direction), starts, known=once.contributions, reuse_below=0.1)
+    assert twice.contributions[0] is not first
 
 
-@pytest.fixture
-def evaluated(monkeypatch):
-    """For each batch that is evaluated, whether all states were to be solved."""
-    asked = []
-
-    def of_actions(problem, parameters, batch, starts, everywhere, mesh):
-        asked.append(everywhere)
-        return _of_actions(problem, parameters, batch, starts, everywhere, mesh)
-
-    monkeypatch.setattr("sidestep.inference.objective._of_actions", of_actions)
-    return asked
-
-
-def test_where_little_has_changed_only_states_that_mattered_are_solved(a_task_a_batch, evaluated):
-    objective, whole = a_task_a_batch
-    found, starts = objective.evaluate(at(POINT), objective.cold_starts())
-    moved = at(POINT + 1e-3 * BENT)
-    changes = [np.abs(part.slope.model * 1e-3 * BENT).sum() / abs(part.actions) for part in found.parts]
+def test_evaluate_after_small_changes_solves_only_states_that_mattered(batches, one_batch):
+    result, starts = batches.evaluate(at(POINT), batches.cold_starts())
+    moved = at(POINT + 1e-3 * STEP)
+    changes = [np.abs(part.gradient.model * 1e-3 * STEP).sum() / abs(part.actions) for part in result.contributions]
     little = float(np.mean(np.sort(changes)[1:3]))
-    exact, _ = whole.evaluate(moved, whole.cold_starts())
-    evaluated.clear()
-    again, _ = objective.evaluate(moved, starts, known=found.parts, little=little)
-    assert evaluated == [not change < little for change in changes]
-    assert set(evaluated) == {False, True}
+    exact, _ = one_batch.evaluate(moved, one_batch.cold_starts())
+    batches.calls.clear()
+    again, _ = batches.evaluate(moved, starts, known=result.contributions, partial_below=little)
+    assert batches.calls == [not change < little for change in changes]
+    assert set(batches.calls) == {False, True}
     np.testing.assert_allclose(again[:4], exact[:4], rtol=1e-8)
-    evaluated.clear()
-    objective.evaluate(moved, starts, known=found.parts)
-    objective.evaluate(moved, starts, little=little)
-    assert evaluated == [True] * 10
+    batches.calls.clear()
+    batches.evaluate(moved, starts, known=result.contributions)
+    batches.evaluate(moved, starts, partial_below=little)
+    assert batches.calls == [True] * 10
 
 
-def test_states_that_come_to_matter_are_solved_after_all(a_task_a_batch, evaluated):
-    """Where solves of the states that are said to matter leave no gradient, all states are solved."""
-    objective, whole = a_task_a_batch
-    found, starts = objective.evaluate(at(POINT), objective.cold_starts())
-    moved = at(POINT + 0.1 * BENT)
-    exact, _ = whole.evaluate(moved, whole.cold_starts())
-    hardly_any = [start._replace(adjoint=jnp.zeros_like(start.adjoint).at[:, 12].set(1.0)) for start in starts]
-    evaluated.clear()
-    again, left = objective.evaluate(moved, hardly_any, known=found.parts, little=np.inf)
-    assert evaluated == [False, True] * 5
+def test_evaluate_solves_states_that_come_to_matter(batches, one_batch):
+    """If the states that mattered do not give a gradient, all states are solved."""
+    result, starts = batches.evaluate(at(POINT), batches.cold_starts())
+    moved = at(POINT + 0.1 * STEP)
+    exact, _ = one_batch.evaluate(moved, one_batch.cold_starts())
+    wrong_starts = [start._replace(adjoint=jnp.zeros_like(start.adjoint).at[:, 12].set(1.0)) for start in starts]
+    batches.calls.clear()
+    again, left = batches.evaluate(moved, wrong_starts, known=result.contributions, partial_below=np.inf)
+    assert batches.calls == [False, True] * 5
     np.testing.assert_allclose(again[:4], exact[:4], rtol=1e-8)
-    np.testing.assert_allclose(again.slope.model, exact.slope.model, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(again.gradient.model, exact.gradient.model, rtol=1e-7, atol=1e-7)
     assert all(np.isfinite(start.adjoint).all() for start in left)
 
 
-def test_values_that_fail_are_not_solved_again(a_task_a_batch, evaluated):
-    """They would do no better. And where nothing is known of a part, all states are solved."""
-    objective, _ = a_task_a_batch
-    found, starts = objective.evaluate(at(POINT), objective.cold_starts())
-    hasty = Objective(problem_of(GaussSeidel(max_sweeps=1)), MEMORY, takes_over=True)
-    evaluated.clear()
-    again, _ = hasty.evaluate(at(POINT + BENT), starts, known=found.parts, little=np.inf)
+def test_evaluate_does_not_repeat_solves_that_fail(batches):
+    """All states would not help. After them, contributions are NaN, and all states are solved."""
+    result, starts = batches.evaluate(at(POINT), batches.cold_starts())
+    hasty = Watched(problem_of(GaussSeidel(max_sweeps=1)), BatchPlan(1, keeps_warm_starts=True, reuses=True))
+    again, _ = hasty.evaluate(at(POINT + STEP), starts, known=result.contributions, partial_below=np.inf)
     assert np.isnan(again.objective)
-    assert evaluated == [False] * 5
-    evaluated.clear()
-    objective.evaluate(at(POINT), starts, known=again.parts, little=np.inf)
-    assert evaluated == [True] * 5
+    assert hasty.calls == [False] * 5
+    batches.calls.clear()
+    batches.evaluate(at(POINT), starts, known=again.contributions, partial_below=np.inf)
+    assert batches.calls == [True] * 5
 
 
-def test_long_solves_to_take_over_come_in_batches_of_no_more_tasks_than_cores():
+def test_plan_batches_for_reuse_on_a_large_map_has_a_task_per_core():
     large, small = (ObstacleGrid(Grid.unknown(100, columns), 0.0) for columns in (100, 99))
     tasks = 2 * cores()
-    assert planned(large, GaussSeidel(), tasks, MEMORY, 1, takes_over=True) == (cores(), True, True)
-    for model, solver, devices, asked in (
+    assert plan_batches(large, GaussSeidel(), tasks, reuse=True) == (cores(), True, True)
+    for model, solver, devices, reuse in (
         (small, GaussSeidel(), 1, True),
         (large, Jacobi(), 1, True),
         (large, GaussSeidel(), 2, True),
         (large, GaussSeidel(), 1, False),
     ):
-        assert planned(model, solver, tasks, MEMORY, devices, takes_over=asked) == (tasks, True, False)
+        assert plan_batches(model, solver, tasks, devices=devices, reuse=reuse) == (tasks, True, False)
 
 
-def test_where_memory_is_short_parts_go_before_starts():
-    """In a table, where every outcome has a parameter, they are larger than starts."""
+def test_plan_batches_with_little_memory_drops_contributions_before_warm_starts():
+    """In a `TabularModel`, which has a parameter per outcome, they are larger than warm starts."""
     graph = grid_graph(Grid.unknown(100, 100))
     model = TabularModel(graph, jnp.zeros(graph.successors.shape))
     kept = [
-        planned(model, GaussSeidel(), 100, memory, 1, takes_over=True)[1:] for memory in (2.0**32, 2.0**27, 2.0**22)
+        plan_batches(model, GaussSeidel(), 100, memory=memory, reuse=True)[1:] for memory in (2.0**32, 2.0**27, 2.0**22)
     ]
     assert kept == [(True, True), (True, False), (False, False)]
 
 
-def test_transitions_alone_need_no_batches():
+def test_objective_of_transitions_alone_has_no_batches():
     problem = problem_of(terms=("transitions",))
-    objective = Objective(problem, MEMORY)
+    objective = Objective(problem)
     assert (objective.batches, objective.cold_starts()) == ([], [])
-    found, starts = objective.evaluate(at(POINT), [])
-    transitions = log_likelihood(MODEL.with_parameters(POINT), problem.demonstrations, PEOPLE).transitions
-    assert (found.actions, found.solved, starts) == (0.0, [], [])
-    assert found.transitions == pytest.approx(float(transitions), rel=1e-12)
-    assert found.objective == found.transitions + found.prior
+    result, starts = objective.evaluate(at(POINT), [])
+    transitions = log_likelihood(MODEL.with_parameters(POINT), problem.demonstrations, BEHAVIOR).transitions
+    assert (result.actions, result.solves, starts) == (0.0, [], [])
+    assert result.transitions == pytest.approx(float(transitions), rel=1e-12)
+    assert result.objective == result.transitions + result.prior
 
 
 @pytest.mark.parametrize("name", SOLVERS)
-def test_32_bit_parameters(name):
+def test_evaluate_in_32_bits_stays_in_32_bits(name):
     model = ObstacleGrid(BLANK, jnp.full(STATES, -2.0, jnp.float32))
-    objective = Objective(problem_of(SOLVERS[name], model=model), MEMORY)
+    objective = Objective(problem_of(SOLVERS[name], model=model))
     parameters = POINT.astype(jnp.float32)
-    found, starts = objective.evaluate(at(parameters), objective.cold_starts())
-    assert found.slope.model.dtype == starts[0].values.dtype == starts[0].adjoint.dtype == np.float32
-    parts, slope = directly(problem_of(), POINT)
-    np.testing.assert_allclose([found.actions, found.transitions, found.prior], parts, rtol=1e-4)
-    np.testing.assert_allclose(found.slope.model, slope, atol=1e-3 * np.abs(slope).max())
+    result, starts = objective.evaluate(at(parameters), objective.cold_starts())
+    assert result.gradient.model.dtype == starts[0].values.dtype == starts[0].adjoint.dtype == np.float32
+    parts, gradient = directly(problem_of(), POINT)
+    np.testing.assert_allclose([result.actions, result.transitions, result.prior], parts, rtol=1e-4)
+    np.testing.assert_allclose(result.gradient.model, gradient, atol=1e-3 * np.abs(gradient).max())
 
 
-def test_a_solve_that_fails_makes_the_objective_nan():
-    objective = Objective(problem_of(Jacobi(max_sweeps=2)), MEMORY)
-    found, _ = objective.evaluate(at(POINT), objective.cold_starts())
-    assert np.isnan(found.objective)
-    assert not np.asarray(found.solved[0].converged)[:TASKS].any()
+def test_evaluate_with_a_failed_solve_is_nan():
+    objective = Objective(problem_of(Jacobi(max_sweeps=2)))
+    result, _ = objective.evaluate(at(POINT), objective.cold_starts())
+    assert np.isnan(result.objective)
+    assert not np.asarray(result.solves[0].converged)[:TASKS].any()
 
 
-def test_tasks_that_fill_up_a_batch_count_for_nothing():
-    """Two batches of three tasks, of which there are five: the sixth has ended."""
-    objective = Objective(problem_of(), 46 * ONE_TASK)
-    found, _ = objective.evaluate(at(POINT), objective.cold_starts())
-    last = found.solved[-1]
+def test_padding_of_a_batch_contributes_nothing():
+    """Two batches of three tasks, of which there are five: the sixth is padding."""
+    objective = objective_of(46 * ONE_TASK)
+    result, _ = objective.evaluate(at(POINT), objective.cold_starts())
+    last = result.solves[-1]
     assert (len(objective.batches), len(last.converged)) == (2, 3)
     assert np.asarray(objective.batches[-1].tasks.terminal)[-1].all()
     assert np.asarray(last.converged).all()
-    assert not np.asarray(last.stuck).any()
+    assert not np.asarray(last.unreachable).any()

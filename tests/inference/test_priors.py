@@ -41,7 +41,7 @@ INDEPENDENT = Normal(0.5, 4.0)
 
 
 def test_gaussian_mrf_penalizes_differences_of_neighbors():
-    """A square of four cells, whose pairs are its sides: (1, 2), (0, 4), (1, 0) and (2, 4)."""
+    """A square of four cells; the pairs are its sides: (1, 2), (0, 4), (1, 0) and (2, 4)."""
     theta = jnp.asarray([1.0, 2.0, 0.0, 4.0])
     prior = GaussianMRF(INDEPENDENT, borders(Grid.unknown(2, 2)), 0.3)
     differences = 1 + 16 + 1 + 4

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.optimize import root_scalar
 
 from sidestep.inference.fit import fit
-from sidestep.inference.goals import weighted
+from sidestep.inference.goals import weighted_demonstrations
 from sidestep.inference.priors import Normal
 from sidestep.maps.config import FitConfig, MapConfig, PriorConfig
 from sidestep.maps.fit import behavior_of, fit_map
@@ -56,7 +56,7 @@ def test_of_a_known_map_the_first_cells_say_nothing():
 def test_a_walk_that_may_have_had_several_goals_begins_once():
     candidates = [reach(GRID, goal) for goal in (3, 2)]
     walk = Trajectory(np.array([0, 1, 2]), np.array([3, 3]), 0)
-    shown = weighted([walk, walk], candidates, np.array([[0.3, 0.7], [1.0, 0.0]]))
+    shown = weighted_demonstrations([walk, walk], candidates, np.array([[0.3, 0.7], [1.0, 0.0]]))
     np.testing.assert_allclose(logits(shown), [*[most_probable(2)] * 3, 1.0], atol=1e-4)
 
 

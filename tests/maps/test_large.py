@@ -8,8 +8,10 @@ import pytest
 
 from sidestep.evaluation.metrics import score_map, visit_ranking
 from sidestep.evaluation.relevance import relevant_obstacles
-from sidestep.inference import batching, maximize, objective
+from sidestep.inference import batching, maximize
 from sidestep.inference.fit import fit
+from sidestep.inference.maximize import Approximation
+from sidestep.inference.objective import Objective
 from sidestep.inference.optimizers import LBFGS, Adam, Rprop
 from sidestep.inference.priors import FreeCellEvidence, Normal
 from sidestep.maps import fit as map_fit
@@ -38,8 +40,7 @@ def demonstrations():
 @pytest.fixture
 def everything_is_large(monkeypatch):
     """For the choice of the optimiser, for solves that are only as exact as it needs, and for a batch for each task."""
-    for module in (map_fit, maximize, batching):
-        monkeypatch.setattr(module, "LARGE", 1)
+    monkeypatch.setattr(map_fit, "LARGE_MAP", 1)
     monkeypatch.setattr(batching, "cores", lambda: 1)
 
 
@@ -79,19 +80,18 @@ def two_offices():
 
 @pytest.mark.usefixtures("everything_is_large")
 def test_taking_over_what_does_not_change_changes_nothing_but_the_work(monkeypatch):
-    solves, solve_batch = [], objective._of_actions
+    solves, solve_batch = [], Objective.evaluate_batch
 
-    def weights(*given):
+    def counted(*given):
         solves.append(given)
         return solve_batch(*given)
 
-    monkeypatch.setattr(objective, "_of_actions", weights)
+    monkeypatch.setattr(Objective, "evaluate_batch", counted)
     unknown, demonstrations = two_offices()
     found = fit_map(ObstacleGrid(unknown, 0.5), demonstrations, CONFIG)
     once = len(solves)
     solves.clear()
-    for share in ("_NEGLIGIBLE", "_LITTLE"):
-        monkeypatch.setattr(maximize, share, 0.0)
+    monkeypatch.setattr(maximize, "Approximation", lambda: Approximation(0.0, 0.0))
     expected = fit_map(ObstacleGrid(unknown, 0.5), demonstrations, CONFIG)
     assert once < len(solves)
     assert len(found.history) == len(expected.history)
@@ -103,7 +103,7 @@ def test_taking_over_what_does_not_change_changes_nothing_but_the_work(monkeypat
 def test_it_ends_where_a_search_along_the_gradient_does(demonstrations, monkeypatch):
     """But for what the tolerance leaves: some thousandths of a nat a move."""
     by_search = fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, CONFIG)
-    monkeypatch.setattr(map_fit, "LARGE", 1)
+    monkeypatch.setattr(map_fit, "LARGE_MAP", 1)
     from_above = fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, CONFIG)
     assert len(from_above.history) < len(by_search.history)
     assert from_above.final.objective > by_search.final.objective - 5e-3 * len(demonstrations)
@@ -152,5 +152,5 @@ def test_who_climbs(options, cells, kind):
     assert isinstance(chosen, kind)
     if isinstance(chosen, Rprop):
         assert chosen.tolerance == pytest.approx(2.0)
-    assert optimizer_for(replace(config, max_iterations=7), cells, moves=2000).iterations == 7
-    assert max_iterations(config) == chosen.iterations
+    assert optimizer_for(replace(config, max_iterations=7), cells, moves=2000).max_iterations == 7
+    assert max_iterations(config) == chosen.max_iterations

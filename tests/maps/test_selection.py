@@ -80,9 +80,9 @@ def test_people_of_whom_no_values_are_found_are_passed_over(office, tmp_path, mo
     def not_of_those_who_pay(model, shown, people, *, options):
         if float(shown.tasks.discount[0]) == 1:
             raise NotConverged("the values of a task were not found")
-        return calibration.scores(model, shown, people, options=options)
+        return calibration.score_statistics(model, shown, people, options=options)
 
-    monkeypatch.setattr(behavior, "scores", not_of_those_who_pay)
+    monkeypatch.setattr(behavior, "score_statistics", not_of_those_who_pay)
     told = chosen(office, walked(office, "some", "--walks", 12), tmp_path)
     assert told["settings"]["reward"]["step_cost"] is None
     assert {trial["step_cost"] for trial in told["behavior"]["trials"]} == {None}

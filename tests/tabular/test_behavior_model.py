@@ -8,7 +8,7 @@ from jax.flatten_util import ravel_pytree
 
 from sidestep.errors import InputError
 from sidestep.inference.fit import fit
-from sidestep.inference.objective import MEMORY, Objective, Problem
+from sidestep.inference.objective import Objective, Problem
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
 from sidestep.tabular.behavior_model import LEARNABLE, behavior_model
@@ -65,7 +65,7 @@ def test_objective_of_all_parameters_has_the_gradient_of_central_differences(bac
     )
     model = ObstacleGrid(GRID, 0.3 * np.sin(np.arange(GRID.size)))
     problem = Problem(model, someone, shown, Normal(), ALL_TERMS, SolveOptions(solver=Jacobi(tolerance=1e-13)), 0.7)
-    objective = Objective(problem, MEMORY)
+    objective = Objective(problem)
     point, back = ravel_pytree(problem.parameters)
     starts = objective.cold_starts()
     costs = GRID.size + 2 + 1 + 1 + 2
@@ -73,7 +73,7 @@ def test_objective_of_all_parameters_has_the_gradient_of_central_differences(bac
     # away from where the costs' prior is flat
     point = point.at[costs:].add(np.cos(np.arange(GRID.size)))
     found, starts = objective.evaluate(back(point), starts)
-    slope = ravel_pytree(found.slope)[0]
+    slope = ravel_pytree(found.gradient)[0]
     for index in (3, *range(GRID.size, costs), costs, costs + 8, costs + 29):
         ends = [objective.evaluate(back(point.at[index].add(width)), starts)[0].objective for width in (-1e-5, 1e-5)]
         assert slope[index] == pytest.approx(-(ends[1] - ends[0]) / 2e-5, rel=1e-5, abs=1e-6)
@@ -83,8 +83,8 @@ def test_fit_of_beta_and_lapse_in_a_known_room_recovers_them():
     shown = walks(Behavior(BoltzmannAverage(), 60.0, lapse=0.15), count=400)
     found = fit(OPEN, shown, behavior_model(Behavior(BoltzmannAverage(), 30.0), ["beta", "lapse"]))
     assert found.converged
-    assert float(found.people.behavior_of().beta) == pytest.approx(60, rel=0.15)
-    lapse = found.people.behavior_of().lapse
+    assert float(found.behavior.behavior_of().beta) == pytest.approx(60, rel=0.15)
+    lapse = found.behavior.behavior_of().lapse
     assert lapse is not None
     assert float(lapse) == pytest.approx(0.15, abs=0.03)
 
@@ -93,7 +93,7 @@ def test_fit_of_discount_in_a_known_room_recovers_it():
     sharp = Behavior(BoltzmannAverage(), 60.0)
     shown = walks(sharp, count=200)
     found = fit(OPEN, shown, behavior_model(sharp, ["discount"], discount=0.8))
-    np.testing.assert_allclose(found.people.tasks_of(shown.tasks).discount, 0.9, atol=0.01)
+    np.testing.assert_allclose(found.behavior.tasks_of(shown.tasks).discount, 0.9, atol=0.01)
 
 
 def test_fit_with_persons_pools_their_betas():
@@ -104,7 +104,7 @@ def test_fit_with_persons_pools_their_betas():
     person = np.repeat([0, 1, 2], [len(own) for own in trajectories])
     shown, of_tasks = split_by_person(gather([walk for own in trajectories for walk in own], tasks_of()), person)
     someone = behavior_model(Behavior(BoltzmannAverage(), 8.0), person=of_tasks)
-    found = fit(OPEN, shown, someone).people
+    found = fit(OPEN, shown, someone).behavior
     betas = [float(found.behavior_of(person).beta) for person in range(3)]
     assert betas[0] == pytest.approx(20, rel=0.25)
     assert betas[1] == pytest.approx(6, rel=0.25)
@@ -126,7 +126,7 @@ def test_fit_of_reward_weights_tells_a_disliked_carpet_from_a_wall():
     sharp = Behavior(LogSumExp(), 40.0)
     shown = simulate(jax.random.key(0), true_model(Grid(wall)), disliked, [np.tile(own, 4) for own in starts], sharp)
     found = fit(ObstacleGrid(GRID, -2.0), gather(shown, plain), behavior_model(sharp, features=carpet))
-    weights = found.people.parameters.reward_weights
+    weights = found.behavior.parameters.reward_weights
     assert weights is not None
     assert float(weights[0]) == pytest.approx(-0.05, abs=0.01)
     blocked, hidden = np.asarray(found.model.blocked).ravel(), wall.ravel() == 1

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.inference.calibration import scores
+from sidestep.inference.calibration import score_statistics
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax
 from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.graph import graph
@@ -158,7 +158,7 @@ def test_likelihoods_of_subjects_of_any_length_compile_once():
         walk = np.resize([8, 9], moves + 1), np.resize([3, 2], moves)
         walks = [Trajectory(*walk, goal) for goal in range(goals)]
         shown = gather(walks, [reach(grid, goal) for goal in range(goals)])
-        each, scored = np.asarray(log_policies(model, shown, behavior)), scores(model, shown, behavior)
+        each, scored = np.asarray(log_policies(model, shown, behavior)), score_statistics(model, shown, behavior)
         assert len(each) == len(scored.score) == len(transition_probabilities(model, shown)) == moves * goals
         assert float(log_likelihood(model, shown, behavior).actions) == pytest.approx(each.sum(), rel=1e-12)
         np.testing.assert_allclose(scored.log_policy, each, rtol=1e-12)

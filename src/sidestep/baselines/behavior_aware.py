@@ -14,7 +14,7 @@ def behavior_aware(grid: Grid, demonstrations: Demonstrations, config: MapConfig
     """Learn P(blocked) from actions and transitions, by the fit of `learn_map`."""
     fit = fit_map(ObstacleGrid(grid, config.prior.mean), demonstrations, config)
     result = model_result(fit.model, demonstrations, config)
-    return result._replace(behavior=fit.people.behavior_of(), converged=fit.converged)
+    return result._replace(behavior=fit.behavior.behavior_of(), converged=fit.converged)
 
 
 def transitions_only(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:

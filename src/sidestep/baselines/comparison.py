@@ -160,7 +160,7 @@ def _result_of(learned: LearnedMap, demonstrations: Demonstrations) -> ModelResu
     learning = learned.learning
     assert learning is not None
     result = model_result(learned.model, demonstrations, learning.config)
-    behavior = learning.fit.people.behavior_of()
+    behavior = learning.fit.behavior.behavior_of()
     return result._replace(behavior=behavior, converged=learning.fit.converged, planner=learned.robot())
 
 
@@ -172,7 +172,7 @@ def _with_probable_goals(moves: Moves, learned: LearnedMap | None) -> Moves:
     posterior, config = learning.goals, learning.config
     tasks = [config.reward.reach(learned.grid, int(state)) for state in posterior.candidates]
     behavior, walks = behavior_of(config.behavior), moves.trajectories()
-    probability, _ = goal_posterior(learned.model, walks, tasks, behavior, posterior.fit.shares)
+    probability, _ = goal_posterior(learned.model, walks, tasks, behavior, posterior.fit.goal_probabilities)
     goals = moves.goals.copy()
     goals[np.unique(moves.walk)] = posterior.candidates[probability.argmax(axis=1)]
     return replace(moves, goals=goals)

@@ -31,5 +31,5 @@ def joint_estimation(grid: Grid, demonstrations: Demonstrations, config: MapConf
     model, agents = ObstacleGrid(grid, config.prior.mean), cost_behavior_model(grid, config)
     fit = fit_map(model, demonstrations, config, behavior=agents)
     result = model_result(fit.model, demonstrations, config)
-    reward = CostlyReward(config.reward.discount, config.reward.step_cost, np.asarray(fit.people.costs))
-    return result._replace(reward=reward, behavior=fit.people.behavior_of(), converged=fit.converged)
+    reward = CostlyReward(config.reward.discount, config.reward.step_cost, np.asarray(fit.behavior.costs))
+    return result._replace(reward=reward, behavior=fit.behavior.behavior_of(), converged=fit.converged)

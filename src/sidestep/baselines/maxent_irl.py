@@ -62,14 +62,14 @@ class CostlyReward(Reward):
 def maxent_irl(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
     """Learn a cost of each cell, by which cells are ranked; robots plan by the agents' reward and these costs."""
     model, agents = true_model(grid.passable()), cost_behavior_model(grid, config)
-    optimizer = LBFGS(iterations=_ITERATIONS, tolerance=_TOLERANCE)
+    optimizer = LBFGS(max_iterations=_ITERATIONS, tolerance=_TOLERANCE)
     result = fit(model, demonstrations, agents, terms=("actions",), optimizer=optimizer)
     if not result.converged:
         raise NotConverged(f"the costs of cells did not converge: {result.message}")
-    costs = np.asarray(result.people.costs)
+    costs = np.asarray(result.behavior.costs)
     reward = CostlyReward(config.reward.discount, config.reward.step_cost, costs)
     planner = ModelPlanner(model, partial(reward.reach, model.blank))
-    return ModelResult(model, reward, result.people.behavior_of(), costs.reshape(grid.shape), planner, True)
+    return ModelResult(model, reward, result.behavior.behavior_of(), costs.reshape(grid.shape), planner, True)
 
 
 def cost_behavior_model(grid: Grid, config: MapConfig) -> BehaviorModel:

@@ -1,1 +1,1 @@
-"""From likelihood to a learned model: priors, and fits that maximise the posterior."""
+"""Priors, and fits that maximize the posterior."""

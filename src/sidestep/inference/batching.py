@@ -1,10 +1,11 @@
-"""Batches of tasks: as many together as fit into memory, so that one compiled function serves them all."""
+"""Batches of tasks of one size that fit into memory, so that one compiled function serves them all."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Int
 
 from sidestep.tabular.behavior_model import BehaviorModel
@@ -17,83 +18,101 @@ from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.solvers.native import cores
 from sidestep.tabular.tasks import Task
 
-LARGE = 10_000
-"""From how many states on a solve takes long."""
+LARGE_MAP = 10_000
+"""The number of states from which a map is large: a solve takes long there."""
+MEMORY = 2.0 * 2**30
+"""The bytes that the arrays of a fit may take on a device by default."""
 
-_WORKSPACE: dict[type[Solver], int] = {Jacobi: 12}
-"""How many times a task's probabilities a solve and its gradient take (the default is for `GaussSeidel`), roughly."""
-_FIXED = 8
-"""And how many times, whatever the number of tasks."""
+_WORKSPACE_PER_TASK: dict[type[Solver], int] = {Jacobi: 12}
+"""About how many times the size of the probabilities a solve and its gradient take; 3 for `GaussSeidel`."""
+_FIXED_WORKSPACE = 8
+"""About how many times the size of the probabilities all batches take together."""
 
 
 class Batch(NamedTuple):
-    """Some tasks, whose each is, and what was done in pursuit of it."""
+    """Some tasks, the person of each, and the choices of its demonstrations."""
 
     tasks: Task
     person: Int[Array, " tasks"]
     choices: Choices
 
 
-class Planned(NamedTuple):
-    """How tasks are batched: how many are together in a batch, and what there is room for.
+class BatchPlan(NamedTuple):
+    """The size of batches, and what is stored between evaluations.
 
-    - `keeps_starts`: to keep where solves start, from evaluation to evaluation.
-    - `takes_over`: to keep what each batch added, for the next evaluation to take over.
+    Attributes:
+        size: the number of tasks of a batch, on all devices together.
+        keeps_warm_starts: whether solves start where those of the last evaluation ended.
+        reuses: whether evaluations keep the contributions of batches for the next one.
     """
 
-    together: int
-    keeps_starts: bool
-    takes_over: bool
+    size: int
+    keeps_warm_starts: bool
+    reuses: bool
 
 
-def planned(
-    model: TransitionModel, solver: Solver, tasks: int, memory: float, devices: int, takes_over: bool = False
-) -> Planned:
-    """The batches of so many tasks: as few and as equal as can be, of a multiple of the devices.
+def plan_batches(
+    model: TransitionModel,
+    solver: Solver,
+    tasks: int,
+    *,
+    memory: float = MEMORY,
+    devices: int = 1,
+    reuse: bool = False,
+    large_map: int = LARGE_MAP,
+) -> BatchPlan:
+    """Return the fewest batches of equal size that fit into memory.
 
-    They fit into `memory` bytes on each device; one of a task a device always is possible. If evaluations are to take
-    over what batches added to earlier ones (`takes_over`), and solves take long, a batch on a single device has no more
-    tasks than there are cores: the fewer, the more often it can. Where solves do not take long and there is
-    room, a device's share of a single batch is rounded up to a power of two, for one compiled function to serve other
-    data too.
+    With `reuse`, a batch of a large map on a single device has at most one task per core: the smaller a batch is, the
+    more often it can be reused. On maps that are not large, a single batch is rounded up to a power of two per device
+    if it fits, so that one compiled function serves other data too.
+
+    Args:
+        model: the transition model, for its size.
+        solver: computes the values.
+        tasks: the number of tasks.
+        memory: bytes per device. A batch has at least one task per device, even if that takes more.
+        devices: the number of devices that share a batch.
+        reuse: whether evaluations should reuse the contributions of batches (see `Objective.evaluate`).
+        large_map: the number of states from which a map is large.
     """
     probabilities, parameters = jax.eval_shape(model.probabilities), jax.eval_shape(lambda: model.parameters)
-    item = probabilities.dtype.itemsize
+    states, item = model.graph.states, probabilities.dtype.itemsize
     size = probabilities.size * item
-    share = math.ceil(tasks / devices)
-    starts = share * model.graph.states * (2 * item + 4)
-    keeps_starts = starts <= memory / 2
-    free = memory - _FIXED * size - (starts if keeps_starts else 0)
-    # of each batch a slope and the parameters that it belongs to
-    parts = 2 * share * sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(parameters))
-    long = isinstance(solver, GaussSeidel) and model.graph.states >= LARGE
-    takes_over = takes_over and long and devices == 1 and keeps_starts and parts <= free / 2
-    most = max(1, int((free - (parts if takes_over else 0)) / (_WORKSPACE.get(type(solver), 3) * size)))
-    rounds = math.ceil(share / (min(most, cores()) if takes_over else most))
-    together = math.ceil(share / rounds)
-    if rounds == 1 and model.graph.states < LARGE:
+    per_task = _WORKSPACE_PER_TASK.get(type(solver), 3) * size
+    tasks_per_device = math.ceil(tasks / devices)
+    start = states * (2 * item + 4)
+    starts = tasks_per_device * start
+    keeps_warm_starts = starts <= memory / 2
+    free = memory - _FIXED_WORKSPACE * size - (starts if keeps_warm_starts else 0)
+    # a contribution has a gradient and the parameters where it was computed
+    contributions = 2 * tasks_per_device * sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(parameters))
+    slow = isinstance(solver, GaussSeidel) and states >= large_map
+    reuses = reuse and slow and devices == 1 and keeps_warm_starts and contributions <= free / 2
+    most = max(1, int((free - (contributions if reuses else 0)) / per_task))
+    batches = math.ceil(tasks_per_device / (min(most, cores()) if reuses else most))
+    together = math.ceil(tasks_per_device / batches)
+    if batches == 1 and states < large_map:
         rounded = next_power_of_two(together)
-        added = (rounded - share) * model.graph.states * (2 * item + 4) + _FIXED * size
-        fits = rounded * _WORKSPACE.get(type(solver), 3) * size + starts + added <= memory
-        together = rounded if fits else together
-    return Planned(devices * together, keeps_starts, takes_over)
+        added = (rounded - tasks_per_device) * start + _FIXED_WORKSPACE * size
+        together = rounded if rounded * per_task + starts + added <= memory else together
+    return BatchPlan(devices * together, keeps_warm_starts, reuses)
 
 
-def batches_of(demonstrations: Demonstrations, people: BehaviorModel, together: int) -> list[Batch]:
-    """Batches of that many tasks; the last is filled up with tasks that have ended, and nothing done."""
-    tasks, choices = demonstrations.tasks, choices_of(demonstrations)
+def make_batches(demonstrations: Demonstrations, behavior: BehaviorModel, size: int) -> list[Batch]:
+    """Return batches of `size` tasks; the last is padded with terminated tasks without choices."""
+    tasks = demonstrations.tasks
     count = len(tasks.terminal)
-    missing = -count % together
+    missing = -count % size
 
-    def filled(leaf: Array, value: float | bool = 0) -> Array:
-        return jnp.concatenate([leaf, jnp.full((missing, *leaf.shape[1:]), value, leaf.dtype)])
+    def padded(leaf: Array | np.ndarray, value: float | bool = 0) -> Any:
+        leaf = np.asarray(leaf)
+        return np.concatenate([leaf, np.full((missing, *leaf.shape[1:]), value, leaf.dtype)])
 
-    ended = Task(
-        filled(tasks.reward), filled(tasks.terminal_reward), filled(tasks.terminal, True), filled(tasks.discount)
-    )
-    person = jnp.zeros(count, jnp.int32) if people.person is None else people.person
-    whole = Batch(ended, filled(person), jax.tree.map(filled, choices))
+    padded_tasks = eqx.tree_at(lambda task: task.terminal, jax.tree.map(padded, tasks), padded(tasks.terminal, True))
+    person = np.zeros(count, np.int32) if behavior.person is None else behavior.person
+    whole = Batch(padded_tasks, padded(person), jax.tree.map(padded, choices_of(demonstrations)))
     return [
-        jax.tree.map(lambda leaf, first=first: leaf[first : first + together], whole)
-        for first in range(0, count, together)
+        jax.tree.map(lambda leaf, first=first: jax.device_put(leaf[first : first + size]), whole)
+        for first in range(0, count, size)
     ]

@@ -1,21 +1,22 @@
-"""How much the steps of a walk say: what people do is less independent than the likelihood of single actions has it.
+"""Calibrate the actions' likelihood: how many independent steps the steps of a trajectory are worth.
 
-Who takes a long way because of a wrong turn takes many steps of it. If each counts as a decision of its own, the map is
-bent until it explains them all: behavior that is taken to be sharp (a large β) predicts actions better and puts walls
-where there are none. Whether it does shows in walks that were not learned from. With
+The likelihood treats the steps of a trajectory as independent. They are not: after a wrong turn an agent takes many
+steps of a long path. If each counts as a decision of its own, the map is bent until it explains them all: a large β
+predicts actions better, and puts walls where there are none. Trajectories that the model was not learned from show it.
+With
 
-    u_t = ∂ log π(a_t | s_t) / ∂ log β  (Q held),       I = Σ_t Σ_a π(a | s_t) u(s_t, a)²,
+    u_t = ∂ log π(a_t | s_t) / ∂ log β  (at fixed Q),       I = Σ_t Σ_a π(a | s_t) u(s_t, a)²,
 
-the score of a step and the information that the steps would have, were each drawn from π by itself, the sums of the
-scores over walks would vary by I as well (the information matrix equality; White 1982). If they vary more, by
-J = Σ_walks (Σ_{t in walk} (u_t − ū))², then
+the score of a step and the information of independent steps drawn from π, the scores summed over trajectories should
+vary by I too (the information matrix equality; White 1982). If they vary by J = Σ_trajectories (Σ_t (u_t − ū))², then
 
     κ = I / J
 
-is the share of independent steps that theirs are worth. That is the adjustment of composite likelihoods (Varin, Reid
-and Firth 2011): log L^κ. A share above 1 says that people are more regular than they are taken to be.
+is the ratio of effective to actual steps. A composite likelihood is adjusted by it to log L^κ (Varin, Reid & Firth
+2011). κ above 1 means that behavior is more regular than the model's.
 """
 
+import enum
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -33,8 +34,15 @@ from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import SolveOptions, solve
 
 
-class Scores(NamedTuple):
-    """Of each move that counts: u, Σ_a π u², log π(a | s), and the trajectory that it belongs to."""
+class ScoreStatistics(NamedTuple):
+    """The score of each move with a positive weight.
+
+    Attributes:
+        score: u = ∂ log π(a | s) / ∂ log β.
+        information: Σ_a π(a | s) u(s, a)².
+        log_policy: log π(a | s), in nats.
+        trajectory: the index of the move's trajectory.
+    """
 
     score: Float[np.ndarray, " moves"]
     information: Float[np.ndarray, " moves"]
@@ -42,54 +50,85 @@ class Scores(NamedTuple):
     trajectory: Int[np.ndarray, " moves"]
 
 
-def scores(
+def score_statistics(
     model: TransitionModel,
     demonstrations: Demonstrations,
     behavior: Behavior,
     *,
     options: SolveOptions | None = None,
-) -> Scores:
-    """The scores of the moves whose weight is not 0, under a model that should not have been learned from them.
+) -> ScoreStatistics:
+    """Return the scores of moves under a model that was learned from other trajectories.
 
-    `options`: as for `solve`. Raises `NotConverged` if values are not found.
+    Args:
+        model: the learned transition model.
+        demonstrations: held-out trajectories; moves of weight 0 are left out.
+        behavior: the behavior that the scores are of.
+        options: as for `solve`.
+
+    Raises:
+        NotConverged: if the values of a task do not converge.
     """
     padded = pad_to_power_of_two(demonstrations)
     converged, *numbers = _scores(model, padded, behavior, options)
     if not bool(converged):
-        raise NotConverged("the values of a task were not found: a smaller β may help")
+        raise NotConverged("the values of a task did not converge: a smaller β may help")
     counts = np.asarray(padded.weights) > 0
-    return Scores(*(np.asarray(each)[counts] for each in (*numbers, padded.trajectory)))
+    return ScoreStatistics(*(np.asarray(each)[counts] for each in (*numbers, padded.trajectory)))
 
 
 @eqx.filter_jit
 def _scores(
     model: TransitionModel, demonstrations: Demonstrations, behavior: Behavior, options: SolveOptions | None
 ) -> tuple[Bool[Array, ""], Float[Array, " moves"], Float[Array, " moves"], Float[Array, " moves"]]:
-    """Whether all values converged, and of each move: u, Σ_a π u² and log π(a | s)."""
+    """Return whether all values converged, and of each move: u, Σ_a π u² and log π(a | s)."""
     solution = solve(model, demonstrations.tasks, behavior, options=options)
     q = visited_action_values(model, demonstrations.tasks, solution.values, demonstrations.task, demonstrations.states)
-    log_policy, by_log_beta = jax.jvp(
+    log_policy, scores = jax.jvp(
         lambda log_beta: Behavior(behavior.backup, jnp.exp(log_beta), behavior.lapse).log_policy(q),
         (jnp.log(behavior.beta),),
         (jnp.ones_like(behavior.beta),),
     )
-    information = jnp.sum(jnp.exp(log_policy) * by_log_beta**2, axis=-1)
-    taken = jnp.arange(len(q)), demonstrations.actions
-    return solution.converged.all(), by_log_beta[taken], information, log_policy[taken]
+    information = jnp.sum(jnp.exp(log_policy) * scores**2, axis=-1)
+    chosen = jnp.arange(len(q)), demonstrations.actions
+    return solution.converged.all(), scores[chosen], information, log_policy[chosen]
 
 
-def effective_sample_ratio(held_out: Sequence[Scores]) -> float:
-    """κ, from the scores of walks that were not learned from; infinite where scores do not vary."""
-    score, information, _, trajectory = (np.concatenate(part) for part in zip(*held_out, strict=True))
-    of_walks = np.bincount(trajectory, score - score.mean())
-    varies = float(np.sum(of_walks**2))
-    return float(information.sum()) / varies if varies > 0 else float("inf")
+def effective_sample_ratio(held_out: Sequence[ScoreStatistics]) -> float:
+    """Return κ = I/J, the ratio of effective to actual steps; infinite where scores do not vary.
 
+    Args:
+        held_out: scores of trajectories that the models were not learned from, with distinct trajectory indices.
 
-def doubtful(share: float, walks: int, errors: float) -> tuple[bool, bool]:
-    """Whether κ from so many walks is below 1, and whether it is above, by more than so many standard errors.
-
-    A sum of n squares of normal numbers is off by the share √(2/n).
+    Example:
+        >>> scores = ScoreStatistics(*(np.array(each) for each in ([1.0, -1.0], [0.5, 0.5], [-1.0, -1.0], [0, 1])))
+        >>> effective_sample_ratio([scores])
+        0.5
     """
-    margin = errors * (2 / walks) ** 0.5
-    return bool(np.log(share) < -margin), bool(np.log(share) > margin)
+    score, information, _, trajectory = (np.concatenate(part) for part in zip(*held_out, strict=True))
+    by_trajectory = np.bincount(trajectory, score - score.mean())
+    variation = float(np.sum(by_trajectory**2))
+    return float(information.sum()) / variation if variation > 0 else float("inf")
+
+
+class Dispersion(enum.Enum):
+    """Whether scores vary more, less or as much as those of independent steps."""
+
+    OVERDISPERSED = "overdispersed"
+    UNDERDISPERSED = "underdispersed"
+    CONSISTENT = "consistent"
+
+
+def dispersion(ratio: float, trajectories: int, standard_errors: float) -> Dispersion:
+    """Return whether κ differs from 1 significantly: κ < 1 is overdispersion.
+
+    A sum of n squares of normal numbers has a relative standard error of √(2/n).
+
+    Args:
+        ratio: κ (see `effective_sample_ratio`).
+        trajectories: the number of trajectories that it was estimated from.
+        standard_errors: the number of standard errors that count as significant.
+    """
+    margin = standard_errors * (2 / trajectories) ** 0.5
+    if abs(np.log(ratio)) <= margin:
+        return Dispersion.CONSISTENT
+    return Dispersion.OVERDISPERSED if ratio < 1 else Dispersion.UNDERDISPERSED

@@ -1,8 +1,7 @@
-"""Checkpoints: where a fit stood, in one file, so that it can go on from there.
+"""Checkpoints: the state of a fit in one file, from which it can be resumed.
 
-The first line is JSON (what was being fitted, and the history so far), the rest the arrays that the optimiser carries,
-and those that it can do without: they depend on how the tasks are batched and spread over devices, and a fit that is
-resumed on others goes on without them.
+The first line is JSON: a fingerprint of the problem, and the history. Then come the arrays of the state, and optional
+arrays: these depend on the batches and devices, and a fit that is resumed on others does without them.
 """
 
 import hashlib
@@ -11,7 +10,7 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,9 +20,11 @@ from jaxtyping import PyTree
 from sidestep._files import read_whole, write_whole
 from sidestep.errors import InputError
 
+History = Sequence[Sequence[int | float]]
+
 
 def fingerprint(problem: PyTree) -> str:
-    """A digest of everything in a pytree: structure, static settings, numbers and shapes."""
+    """Return a digest of everything in a pytree: structure, static settings, numbers, types and shapes."""
     leaves, structure = jax.tree.flatten(problem)
     digest = hashlib.sha256(str(structure).encode())
     for leaf in leaves:
@@ -33,44 +34,56 @@ def fingerprint(problem: PyTree) -> str:
     return digest.hexdigest()
 
 
-def save_checkpoint(
-    path: Path, key: str, carried: PyTree, history: Sequence[Sequence[int | float]], kept: PyTree = ()
-) -> None:
-    """Writes a checkpoint, whole or not at all; `kept` are arrays that a resumed fit can do without."""
+def save_checkpoint(path: Path, key: str, state: PyTree, history: History, optional: PyTree = ()) -> None:
+    """Write a checkpoint, completely or not at all.
+
+    Args:
+        path: the file.
+        key: the fingerprint of the problem.
+        state: the arrays from which the fit is resumed.
+        history: a row of numbers per iteration.
+        optional: arrays that a resumed fit can do without.
+    """
 
     def write(file: BinaryIO) -> None:
-        header = {"fit": key, "history": list(history), "kept": _shapes(kept)}
+        header = {"fit": key, "history": list(history), "optional": _shapes(optional)}
         file.write(json.dumps(header).encode() + b"\n")
-        eqx.tree_serialise_leaves(file, (carried, kept))
+        eqx.tree_serialise_leaves(file, (state, optional))
 
     write_whole(path, write)
 
 
-def load_checkpoint(
-    path: Path, key: str, like: PyTree, kept: PyTree = ()
-) -> tuple[PyTree, list[list[int | float]], PyTree]:
-    """What the optimiser carried, in the structure of `like`, the history, and what was kept.
+def load_checkpoint(path: Path, key: str, like: PyTree, optional: PyTree = ()) -> tuple[PyTree, History, PyTree]:
+    """Read a checkpoint.
 
-    That is `kept` itself where the file has arrays of other shapes.
+    Args:
+        path: the file.
+        key: the fingerprint of the problem.
+        like: arrays of the structure, types and shapes of the state.
+        optional: likewise, of the optional arrays.
 
-    Raises `InputError` for a file that is no checkpoint, or one of a fit of other data or with other settings.
+    Returns:
+        The state, the history, and the optional arrays: `optional` itself if those of the file have other shapes.
+
+    Raises:
+        InputError: for a file that is not a checkpoint, or one of a fit of other data or with other settings.
     """
     file = io.BytesIO(read_whole(path))
     try:
         header = json.loads(file.readline())
-        key_found, history = header["fit"], header["history"]
+        saved_key, history = header["fit"], header["history"]
     except (ValueError, TypeError, KeyError) as error:
         raise InputError("not a checkpoint", source=path) from error
-    if key_found != key:
+    if saved_key != key:
         raise InputError(
             "belongs to a fit of other data or with other settings; start without resuming to replace it",
             source=path,
         )
     try:
-        if header.get("kept") != _shapes(kept):
-            return eqx.tree_deserialise_leaves(file, like), history, kept
-        carried, kept = eqx.tree_deserialise_leaves(file, (like, kept))
-        return carried, history, kept
+        if header.get("optional") != _shapes(optional):
+            return eqx.tree_deserialise_leaves(file, like), history, optional
+        state, optional = eqx.tree_deserialise_leaves(file, (like, optional))
+        return state, history, optional
     except Exception as error:  # what is not an array raises errors of many kinds
         raise InputError("not a checkpoint: the arrays cannot be read", source=path) from error
 
@@ -79,33 +92,54 @@ def _shapes(arrays: PyTree) -> list[str]:
     return [f"{leaf.dtype}{leaf.shape}" for leaf in jax.tree.leaves(arrays)]
 
 
-class Saver:
-    """Keeps a checkpoint file up to date while something runs; without a path it keeps nothing.
+class Checkpoint(NamedTuple):
+    """The file of a fit's checkpoint, and how often it is saved.
 
-    Saving takes no more than a tenth of the time, and happens every few seconds at most.
+    Attributes:
+        path: the file.
+        min_interval: the least time between two saves, in seconds.
+        max_fraction: the largest fraction of the time that saving may take, in (0, 1].
     """
 
-    def __init__(self, path: str | Path | None, key: str):
-        self.path, self.key = None if path is None else Path(path), key
-        self.next = 0.0
+    path: str | Path
+    min_interval: float = 5.0
+    max_fraction: float = 0.1
 
-    def load(self, like: PyTree, kept: PyTree = ()) -> tuple[PyTree, list[list[int | float]], PyTree]:
-        """What was carried, the history and what was kept; `like` and `kept` themselves if there is no file yet.
 
-        Raises `InputError` without a path, and for a file that `load_checkpoint` refuses.
+class Saver:
+    """Keeps a checkpoint up to date while a fit runs; without one it does nothing.
+
+    Args:
+        checkpoint: a file, a `Checkpoint`, or None.
+        key: the fingerprint of the problem.
+    """
+
+    def __init__(self, checkpoint: str | Path | Checkpoint | None, key: str):
+        self.checkpoint = Checkpoint(checkpoint) if isinstance(checkpoint, str | Path) else checkpoint
+        self.key, self.next = key, 0.0
+
+    def load(self, like: PyTree, optional: PyTree = ()) -> tuple[PyTree, History, PyTree]:
+        """Return the state, the history and the optional arrays; those of the arguments if there is no file yet.
+
+        Raises:
+            InputError: without a checkpoint, and for a file that `load_checkpoint` refuses.
         """
-        if self.path is None:
+        if self.checkpoint is None:
             raise InputError("expected a checkpoint to resume from", field="resume")
-        return load_checkpoint(self.path, self.key, like, kept) if self.path.exists() else (like, [], kept)
+        path = Path(self.checkpoint.path)
+        return load_checkpoint(path, self.key, like, optional) if path.exists() else (like, [], optional)
 
-    def save(self, carried: PyTree, history: Sequence[Sequence[int | float]], kept: PyTree = ()) -> None:
-        """Saves, if it is time to."""
-        if self.path is not None and time.monotonic() >= self.next:
-            started = time.monotonic()
-            save_checkpoint(self.path, self.key, carried, history, kept)
-            took = time.monotonic() - started
-            self.next = started + took + self.pause(took)
+    def save(self, state: PyTree, history: History, optional: PyTree = ()) -> None:
+        """Write the checkpoint, unless the last save is too recent."""
+        if self.checkpoint is None or time.monotonic() < self.next:
+            return
+        started = time.monotonic()
+        save_checkpoint(Path(self.checkpoint.path), self.key, state, history, optional)
+        ended = time.monotonic()
+        self.next = ended + self.pause(ended - started)
 
-    def pause(self, took: float) -> float:
-        """How many seconds to wait after a save that took so many."""
-        return max(5.0, 9 * took)
+    def pause(self, duration: float) -> float:
+        """Return how many seconds to wait after a save of this duration."""
+        if self.checkpoint is None:
+            return 0.0
+        return float(max(self.checkpoint.min_interval, duration * (1 / self.checkpoint.max_fraction - 1)))

@@ -1,17 +1,17 @@
-"""Goals that nobody named: a posterior over candidates for every walk, and dynamics learned with it.
+"""Learn dynamics from trajectories with unknown goals, by expectation maximization (Dempster, Laird & Rubin 1977).
 
-Where a walk i does not say what it was after, the likelihood is a mixture over the candidate tasks g, with shares p_g,
+The likelihood of a trajectory i with an unknown goal is a mixture over candidate tasks g with probabilities p_g,
 
     L(θ) = Π_i Σ_g p_g Π_t π_θ,g(a_t | s_t) T_θ(s_t, a_t, s_{t+1}),
 
-and the posterior over what it was after is its share of the sum,
+and the posterior of its goal is
 
-    P(g | walk i) ∝ p_g Π_t π_θ,g(a_t | s_t).
+    P(g | i) ∝ p_g Π_t π_θ,g(a_t | s_t).
 
-Expectation maximisation takes turns: the posterior under the present model; then shares p_g, the mean posterior, and a
-fit in which every walk is a demonstration of every candidate, weighted by its posterior. Where each fit begins at the
-model before, L and the prior never fall. A walk that goes on after it has reached a candidate was not after that one;
-where it stops elsewhere, it was cut short.
+The E-step computes the posterior under the present model. The M-step sets p_g to the mean posterior, and fits the model
+to each trajectory as a demonstration of each candidate, weighted by the posterior. It differs from the textbook in that
+the M-step is a fit that starts at the last model and may stop early; L and the prior never decrease all the same. A
+trajectory that continues after a candidate's terminal state did not have this goal; it may stop short of its goal.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,44 +33,57 @@ from sidestep.tabular.tasks import Task, stack_tasks
 
 
 class GoalFit(eqx.Module, Generic[Model]):
-    """A model learned from walks without goals.
+    """A model learned from trajectories with unknown goals.
 
-    - `fit`: the last fit. `posterior`: P(g | walk) by walks and candidates. `shares`: p_g.
-    - `evidence`: log L(θ) without the transitions' part, before each round and at the end.
-    - `converged`: whether the fits were, and the posterior changed by less than the tolerance in the last round.
+    Attributes:
+        fit: the last fit.
+        posterior: P(g | trajectory).
+        goal_probabilities: p_g.
+        log_likelihoods: the actions' log-likelihood, before each round and at the end.
+        converged: whether the last fit converged, and the posterior changed by less than the tolerance in the last
+            round.
     """
 
     fit: Fit[Model]
-    posterior: Float[np.ndarray, "walks candidates"]
-    shares: Float[np.ndarray, " candidates"]
-    evidence: tuple[float, ...] = eqx.field(static=True)
+    posterior: Float[np.ndarray, "trajectories candidates"]
+    goal_probabilities: Float[np.ndarray, " candidates"]
+    log_likelihoods: tuple[float, ...] = eqx.field(static=True)
     converged: bool = eqx.field(static=True)
 
 
 def goal_posterior(
     model: TransitionModel,
-    walks: Sequence[Trajectory],
+    trajectories: Sequence[Trajectory],
     candidates: Sequence[Task],
     behavior: Behavior,
-    shares: Float[np.ndarray, " candidates"] | None = None,
-) -> tuple[Float[np.ndarray, "walks candidates"], float]:
-    """P(g | walk) of every walk and candidate, and the actions' log-likelihood, Σ_i log Σ_g p_g Π_t π_g.
+    goal_probabilities: Float[np.ndarray, " candidates"] | None = None,
+) -> tuple[Float[np.ndarray, "trajectories candidates"], float]:
+    """Return the posterior of each trajectory's goal, and the actions' log-likelihood.
 
-    - `walks`: their tasks do not matter. `shares`: p_g, by default all alike.
+    Args:
+        model: the transition model.
+        trajectories: their tasks do not matter.
+        candidates: the tasks that may be the goals.
+        behavior: the behavior of the agents.
+        goal_probabilities: p_g, by default equal.
 
-    Raises `InputError` for a walk that could not have been after any of the candidates, and as `gather` does;
-    `NotConverged` where a candidate's values are not found.
+    Returns:
+        P(g | trajectory), and Σ_i log Σ_g p_g Π_t π_g in nats.
+
+    Raises:
+        InputError: for a trajectory that cannot have any of the goals, and as `gather` does.
+        NotConverged: if the values of a candidate do not converge.
     """
-    if shares is None:
-        shares = np.full(len(candidates), 1 / len(candidates))
-    likelihoods = np.stack([_if_after(task, model, walks, behavior) for task in candidates], axis=1)
+    if goal_probabilities is None:
+        goal_probabilities = np.full(len(candidates), 1 / len(candidates))
+    log_likelihood = [_trajectory_log_likelihoods(task, model, trajectories, behavior) for task in candidates]
     with np.errstate(divide="ignore"):
-        joint = np.log(shares) + likelihoods
+        joint = np.log(goal_probabilities) + np.stack(log_likelihood, axis=1)
     total = np.asarray(logsumexp(jnp.asarray(joint), axis=1))
     if not np.isfinite(total).all():
         raise InputError(
-            "goes on after it has reached each of the candidates: expected one that it may have been after",
-            source="walk",
+            "continues after the terminal states of all candidates: expected one that it may have as its goal",
+            source="trajectory",
             row=int(np.argmin(np.isfinite(total))) + 1,
         )
     return np.exp(joint - total[:, None]), float(total.sum())
@@ -78,7 +91,7 @@ def goal_posterior(
 
 def fit_goals(
     model: Model,
-    walks: Sequence[Trajectory],
+    trajectories: Sequence[Trajectory],
     candidates: Sequence[Task],
     behavior: Behavior,
     learn: Callable[[Model, Demonstrations], Fit[Model]],
@@ -86,58 +99,66 @@ def fit_goals(
     rounds: int = 20,
     tolerance: float = 1e-3,
 ) -> GoalFit[Model]:
-    """The model and the goals that make walks most probable, by expectation maximisation from `model`.
+    """Learn a model and the goals of trajectories by expectation maximization.
 
-    - `learn`: a fit of weighted demonstrations from a model, with the same behavior.
-    - `rounds`: at most so many, one at least. `tolerance`: the largest change of a posterior that counts as none.
+        result = fit_goals(model, trajectories, tasks, behavior, lambda model, demos: fit(model, demos, behavior))
 
-        found = fit_goals(model, walks, tasks, people, lambda model, shown: fit(model, shown, people))
+    Args:
+        model: the transition model to start from.
+        trajectories: their tasks do not matter.
+        candidates: the tasks that may be the goals.
+        behavior: the behavior of the agents.
+        learn: a fit of weighted demonstrations that starts at a model, with the same behavior.
+        rounds: the largest number of rounds, at least 1.
+        tolerance: the largest change of a posterior probability that counts as none.
 
-    Raises `InputError` as `goal_posterior` does.
+    Raises:
+        InputError: as `goal_posterior` does.
     """
     check_count(rounds, 1, "rounds")
-    posterior, evidence = goal_posterior(model, walks, candidates, behavior)
-    history = [evidence]
+    posterior, log_likelihood = goal_posterior(model, trajectories, candidates, behavior)
+    history = [log_likelihood]
     while True:
-        found = learn(model, weighted(walks, candidates, posterior))
-        model, shares = found.model, posterior.mean(axis=0)
-        before = posterior
-        posterior, evidence = goal_posterior(model, walks, candidates, behavior, shares)
-        history.append(evidence)
+        result = learn(model, weighted_demonstrations(trajectories, candidates, posterior))
+        model, goal_probabilities, before = result.model, posterior.mean(axis=0), posterior
+        posterior, log_likelihood = goal_posterior(model, trajectories, candidates, behavior, goal_probabilities)
+        history.append(log_likelihood)
         change = float(np.abs(posterior - before).max())
         if change < tolerance or len(history) > rounds:
-            return GoalFit(found, posterior, shares, tuple(history), found.converged and change < tolerance)
+            converged = result.converged and change < tolerance
+            return GoalFit(result, posterior, goal_probabilities, tuple(history), converged)
 
 
-def weighted(
-    walks: Sequence[Trajectory], candidates: Sequence[Task], posterior: Float[np.ndarray, "walks candidates"]
+def weighted_demonstrations(
+    trajectories: Sequence[Trajectory],
+    candidates: Sequence[Task],
+    posterior: Float[np.ndarray, "trajectories candidates"],
 ) -> Demonstrations:
-    """Every walk as a demonstration of every candidate that it may have been after, weighted by the posterior."""
-    # however improbable a candidate: while the pairs stay the same, nothing is compiled anew
+    """Return each trajectory as a demonstration of each possible candidate, weighted by the posterior."""
+    # improbable candidates too: while the pairs stay the same, no function is compiled anew
     pairs = np.argwhere(posterior > 0)
-    shown = gather([walks[walk]._replace(task=int(candidate)) for walk, candidate in pairs], candidates)
-    lengths = [len(walks[walk].actions) for walk, _ in pairs]
-    weight = np.repeat(posterior[posterior > 0], lengths)
+    demos = gather([trajectories[index]._replace(task=int(candidate)) for index, candidate in pairs], candidates)
+    weights = np.repeat(posterior[posterior > 0], [len(trajectories[index].actions) for index, _ in pairs])
     return Demonstrations(
-        shown.states, shown.actions, shown.next_states, shown.task, shown.trajectory, shown.tasks, jnp.asarray(weight)
+        demos.states, demos.actions, demos.next_states, demos.task, demos.trajectory, demos.tasks, jnp.asarray(weights)
     )
 
 
-def _if_after(
-    task: Task, model: TransitionModel, walks: Sequence[Trajectory], behavior: Behavior
-) -> Float[np.ndarray, " walks"]:
-    """Σ_t log π(a_t | s_t) of every walk in pursuit of a task; −∞ for a walk that goes on after the task has ended."""
-    lengths = np.array([len(walk.actions) for walk in walks])
+def _trajectory_log_likelihoods(
+    task: Task, model: TransitionModel, trajectories: Sequence[Trajectory], behavior: Behavior
+) -> Float[np.ndarray, " trajectories"]:
+    """Return Σ_t log π(a_t | s_t) of each trajectory for a task; −∞ if it continues after a terminal state."""
+    lengths = np.array([len(trajectory.actions) for trajectory in trajectories])
     moves = Demonstrations(
-        flat_moves([walk.states[:-1] for walk in walks]),
-        flat_moves([walk.actions for walk in walks]),
-        flat_moves([walk.states[1:] for walk in walks]),
-        jnp.zeros(lengths.sum(), jnp.int32),
-        jnp.asarray(np.repeat(np.arange(len(walks)), lengths), jnp.int32),
+        flat_moves([trajectory.states[:-1] for trajectory in trajectories]),
+        flat_moves([trajectory.actions for trajectory in trajectories]),
+        flat_moves([trajectory.states[1:] for trajectory in trajectories]),
+        jnp.asarray(np.zeros(lengths.sum(), np.int32)),
+        jnp.asarray(np.repeat(np.arange(len(trajectories)), lengths), jnp.int32),
         stack_tasks([task]),
     )
-    each = np.asarray(log_policies(model, moves, behavior))
-    if np.isnan(each).any():
-        raise NotConverged("the values of a candidate's task were not found: a smaller β may help")
+    log_policy = np.asarray(log_policies(model, moves, behavior))
+    if np.isnan(log_policy).any():
+        raise NotConverged("the values of a candidate's task did not converge: a smaller β may help")
     ended = np.asarray(task.terminal)[np.asarray(moves.states)]
-    return np.bincount(np.asarray(moves.trajectory), np.where(ended, -np.inf, each), minlength=len(walks))
+    return np.bincount(np.asarray(moves.trajectory), np.where(ended, -np.inf, log_policy), minlength=len(trajectories))

@@ -1,31 +1,41 @@
-"""The climb of a fit: from point to point up the objective, with solves as exact as the optimiser needs.
+"""Maximize the objective of a fit with an optimizer.
 
-On large maps the solves of the first points are loose. Where the optimiser has converged, or finds no step that gains
-anything, the same point is looked at again with exact solves and the climb goes on from there; it ends only on exact
-ones. A rough look, which tells whether a step is worth a proper one, takes over batches of tasks that have hardly
-changed; in those that have changed little, loose solves are of the states only that mattered.
+The loop of every fit: evaluate the objective, stop or take a step of the optimizer. Two devices save work on large
+maps:
+
+- Solves are loose at first. Where the optimizer has converged, or finds no better point, it continues from there with
+  exact solves. It ends only with exact solves.
+- An optimizer may ask for an approximate loss at a trial point (see `Optimizer.approximates`). It reuses the
+  contributions of tasks that have hardly changed, and of tasks that have changed little it solves only the states that
+  mattered (see `Objective.evaluate`).
 """
 
-from collections.abc import Callable
+import enum
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
 from sidestep.errors import InputError, NotConverged
-from sidestep.inference.batching import LARGE
+from sidestep.inference.batching import LARGE_MAP
 from sidestep.inference.checkpoints import Saver
-from sidestep.inference.objective import Objective, Part, Problem, Solved
-from sidestep.inference.optimizers import Optimizer
-from sidestep.tabular.likelihood import choices_of
+from sidestep.inference.objective import Contribution, Objective, Parameters, Problem, SolveSummary
+from sidestep.inference.optimizers import Optimizer, Vector
+from sidestep.tabular.likelihood import choices_of, transition_probabilities
 from sidestep.tabular.solvers.base import WarmStart
 
 
 class Progress(NamedTuple):
-    """Where a fit stands after an iteration: the objective, its parts, and its largest gradient component."""
+    """The state of a fit after an iteration.
+
+    Attributes:
+        iteration: 0 before the first step.
+        objective: log L(θ) + log p(θ), in nats.
+        actions, transitions, prior: its parts.
+        gradient: the largest component of its gradient.
+    """
 
     iteration: int
     objective: float
@@ -35,185 +45,271 @@ class Progress(NamedTuple):
     gradient: float
 
 
-class Summit(NamedTuple):
-    """Where a climb ended: θ, the way there, how the last solves went, whether the optimiser had settled, and why."""
+class Status(enum.Enum):
+    """Why an optimization stopped; the values are the readable form."""
 
-    parameters: PyTree
+    CONVERGED = "converged"
+    MAX_ITERATIONS = "stopped at max_iterations"
+    NO_ASCENT_STEP = "stopped, no step increases the objective"
+    PRECISION_LIMIT = "stopped, no step increases the objective in 32-bit numbers"
+
+    @property
+    def advice(self) -> str:
+        """What may help; nothing after convergence."""
+        return _ADVICE.get(self, "")
+
+
+_ADVICE = {
+    Status.MAX_ITERATIONS: "a larger max_iterations of the optimizer lets it continue",
+    Status.NO_ASCENT_STEP: (
+        "the objective has a kink here (as with HardMax), or the solver's tolerance does not resolve smaller changes"
+    ),
+    Status.PRECISION_LIMIT: (
+        "32-bit numbers cannot resolve smaller changes of the objective; set jax.config.update('jax_enable_x64', True) "
+        "before the model is made"
+    ),
+}
+
+
+class OptimizationResult(NamedTuple):
+    """The end of an optimization.
+
+    Attributes:
+        parameters: the last and best point.
+        history: the progress before the first step and after each step.
+        solves: the solves of each batch at this point.
+        status: why it stopped.
+        message: the status, the number that the optimizer compares with its tolerance, and advice.
+    """
+
+    parameters: Parameters
     history: list[Progress]
-    solved: list[Solved]
-    settled: bool
+    solves: list[SolveSummary]
+    status: Status
     message: str
 
 
-class _Point(NamedTuple):
-    """What is known of the objective at one θ; arrays and numbers only, so that a checkpoint can hold it."""
+class Approximation(NamedTuple):
+    """What an approximate evaluation may omit.
 
-    x: np.ndarray
-    parts: np.ndarray
-    slope: np.ndarray
-
-
-class Climb:
-    """The way of an optimiser up an objective.
-
-    The last point is remembered, for line searches ask twice; its solves are where the next ones start. What batches of
-    tasks added is remembered too, for rough looks (see `objective`).
+    Attributes:
+        reuse: the largest change of all reused contributions together, as a fraction of the objective.
+        partial: the largest change of a contribution, as a fraction of it, for which only the states that mattered are
+            solved, while solves are loose.
     """
 
-    def __init__(self, objective: Objective, optimizer: Optimizer, saver: Saver):
-        self.objective, self.optimizer, self.saver = objective, optimizer, saver
-        start, self.to_parameters = ravel_pytree(objective.problem.parameters)
-        self.start = np.asarray(start)
-        self.starts = objective.cold_starts()
+    reuse: float = 2e-5
+    partial: float = 0.01
+
+
+def maximize(
+    objective: Objective,
+    optimizer: Optimizer,
+    *,
+    tolerances: Sequence[float | None] = (None,),
+    approximation: Approximation | None = None,
+    saver: Saver | None = None,
+    report: Callable[[Progress], None] | None = None,
+    resume: bool = False,
+) -> OptimizationResult:
+    """Maximize an objective from the parameters of its problem.
+
+    Args:
+        objective: the objective.
+        optimizer: `LBFGS`, `Adam` or `Rprop`.
+        tolerances: those of the solves, one after the other (see `solve_tolerances`); None for the solver's own.
+        approximation: what approximate evaluations may omit.
+        saver: keeps a checkpoint up to date.
+        report: called with the progress before the first step and after each step.
+        resume: continue from the saver's checkpoint.
+
+    Raises:
+        NotConverged: if values do not converge at the start, or stop converging on the way.
+        InputError: if a visited state cannot reach its goal, and as `Saver.load` does.
+    """
+    saver = saver or Saver(None, "")
+    evaluator = _Evaluator(objective, tolerances, approximation or Approximation())
+    x, state, history = evaluator.start, optimizer.init(evaluator.start), []
+    if resume:
+        x, state, history = evaluator.load(saver, x, state)
+    while True:
+        point = evaluator.evaluate(x)
+        progress = Progress(len(history), *point.terms.tolist(), gradient=float(np.abs(point.gradient).max()))
+        if progress.iteration == 0:
+            _check_start(objective.problem, progress, evaluator.solves)
+        _check_finite(progress)
+        evaluator.set_scale(progress.objective)
+        history.append(progress)
+        if report:
+            report(progress)
+        status, update = None, None
+        if optimizer.terminate(point.gradient, state):
+            status = Status.CONVERGED
+        elif progress.iteration >= optimizer.max_iterations:
+            status = Status.MAX_ITERATIONS
+        else:
+            update = optimizer.step(evaluator.loss, x, -progress.objective, point.gradient, state)
+        if update is not None:
+            x, state = update
+            evaluator.save(saver, x, state, history)
+        elif evaluator.tighten():
+            history.pop()
+        else:
+            status = status or (Status.NO_ASCENT_STEP if x.dtype == np.float64 else Status.PRECISION_LIMIT)
+            measure = optimizer.measure.format(optimizer.convergence(point.gradient, state))
+            message = "; ".join(filter(None, (f"{status.value}: {measure}", status.advice)))
+            return OptimizationResult(evaluator.parameters(x), history, evaluator.solves_at(x), status, message)
+
+
+def solve_tolerances(problem: Problem, optimizer: Optimizer, large_map: int = LARGE_MAP) -> list[float | None]:
+    """Return the tolerances of the solves for `maximize`: loose ones first on large maps in 64-bit numbers."""
+    dtype = jax.eval_shape(problem.model.probabilities).dtype
+    if problem.solver.tolerance is not None or dtype != np.float64 or problem.model.graph.states < large_map:
+        return [None]
+    return [optimizer.solve_tolerance, float(problem.solver.tolerance_for(dtype))]
+
+
+class _Point(NamedTuple):
+    """The objective and its parts, and the gradient of the loss, at x."""
+
+    x: np.ndarray
+    terms: np.ndarray
+    gradient: np.ndarray
+
+
+class _Evaluator:
+    """Evaluates an objective at vectors, each time from the warm starts of the last time.
+
+    It keeps the last exact point, because line searches ask for it twice.
+    """
+
+    def __init__(self, objective: Objective, tolerances: Sequence[float | None], approximation: Approximation):
+        self.objective, self.tolerances, self.approximation = objective, list(tolerances), approximation
+        self.start, self.unravel = _ravel(objective.problem.parameters)
+        self.warm_starts = objective.cold_starts()
         self.last = _Point(np.full_like(self.start, np.nan), np.zeros(4), np.zeros_like(self.start))
-        self.solved: list[Solved] = []
-        self.known: list[Part] = []
-        self.negligible = 0.0
-        self.tolerances = _tolerances(objective.problem, optimizer)
+        self.solves: list[SolveSummary] = []
+        self.contributions: list[Contribution] = []
+        self.reuse_below = 0.0
 
-    def run(self, report: Callable[[Progress], None] | None, resume: bool) -> Summit:
-        """Climbs until converged or stopped; raises `NotConverged` where values stop converging on the way."""
-        x, state, history = self.start, self.optimizer.init(self.start), []
-        if resume:
-            x, state, history = self._resumed(x, state)
-        while True:
-            point = self._look(x)
-            objective, actions, transitions, prior = point.parts.tolist()
-            steepest = float(np.abs(point.slope).max())
-            progress = Progress(len(history), objective, actions, transitions, prior, steepest)
-            self._check(progress)
-            self.negligible = _NEGLIGIBLE * abs(objective) / max(1, len(self.objective.batches))
-            history.append(progress)
-            if report:
-                report(progress)
-            settled = self.optimizer.settled(point.slope, state)
-            message = _reason_to_stop(progress, settled, self.optimizer)
-            after = None if message else self.optimizer.step(self._loss, x, -progress.objective, point.slope, state)
-            if after is not None:
-                x, state = after
-                self._save(x, state, history)
-            elif len(self.tolerances) > 1:
-                history.pop()
-                self._be_more_exact()
-            else:
-                unsaid = f"stopped: no step gains anything; the largest gradient is {progress.gradient:.2g}"
-                parameters = self.to_parameters(jnp.asarray(x))
-                return Summit(parameters, history, self._solved_at(x), bool(settled), message or unsaid)
+    def parameters(self, x: Vector) -> Parameters:
+        return jax.tree.map(jax.device_put, self.unravel(x))
 
-    def _look(self, x: np.ndarray, rough: bool = False) -> _Point:
-        """The objective at x; a rough look saves work where little seems to have changed since the last one."""
+    def set_scale(self, objective: float) -> None:
+        """Set the change of a batch's contribution that may be omitted, from the objective's size."""
+        self.reuse_below = self.approximation.reuse * abs(objective) / max(1, len(self.objective.batches))
+
+    def evaluate(self, x: Vector, approximate: bool = False) -> _Point:
         if np.array_equal(x, self.last.x):
             return self.last
-        rough = rough and bool(self.known)
-        found, self.starts = self.objective.evaluate(
-            self.to_parameters(jnp.asarray(x)),
-            self.starts,
-            self.tolerances[0],
-            self.known,
-            self.negligible if rough else 0.0,
-            _LITTLE if rough and len(self.tolerances) > 1 else 0.0,
+        approximate = approximate and bool(self.contributions)
+        evaluation, self.warm_starts = self.objective.evaluate(
+            self.parameters(x),
+            self.warm_starts,
+            tolerance=self.tolerances[0],
+            known=self.contributions,
+            reuse_below=self.reuse_below if approximate else 0.0,
+            partial_below=self.approximation.partial if approximate and len(self.tolerances) > 1 else 0.0,
         )
-        parts = np.array([found.objective, found.actions, found.transitions, found.prior])
-        point, self.known = _Point(x, parts, np.asarray(ravel_pytree(found.slope)[0])), found.parts
-        if not rough:
-            self.last, self.solved = point, found.solved
+        point = _Point(x, np.array(evaluation.terms), _ravel(evaluation.gradient)[0])
+        self.contributions = evaluation.contributions
+        if not approximate:
+            self.last, self.solves = point, evaluation.solves
         return point
 
-    def _loss(self, x: np.ndarray, rough: bool = False) -> tuple[float, np.ndarray]:
-        """Minus the objective, and its slope."""
-        point = self._look(x, rough)
-        # a solve that failed makes them NaN: worse than any other point, so that no search ends there
-        usable = np.isfinite(point.parts[0]) and np.isfinite(point.slope).all()
-        return -float(point.parts[0]) if usable else np.inf, point.slope
+    def loss(self, x: Vector, *, approximate: bool = False) -> tuple[float, Vector]:
+        """Return minus the objective and its gradient; infinity where a solve failed, so that no search ends there."""
+        point = self.evaluate(x, approximate)
+        usable = np.isfinite(point.terms[0]) and np.isfinite(point.gradient).all()
+        return -float(point.terms[0]) if usable else np.inf, point.gradient
 
-    def _be_more_exact(self) -> None:
+    def tighten(self) -> bool:
+        """Continue with the next tolerance; return whether there is one."""
+        if len(self.tolerances) == 1:
+            return False
         self.tolerances = self.tolerances[1:]
         self._forget()
+        return True
+
+    def solves_at(self, x: Vector) -> list[SolveSummary]:
+        """Return the solves at x; after an interruption or elsewhere, evaluate them once more."""
+        if not self.solves:
+            self._forget()
+        self.evaluate(x)
+        return self.solves
 
     def _forget(self) -> None:
-        """Makes the next look at any point a new one."""
-        self.last, self.known = self.last._replace(x=np.full_like(self.start, np.nan)), []
+        self.last, self.contributions = self.last._replace(x=np.full_like(self.start, np.nan)), []
 
-    def _solved_at(self, x: np.ndarray) -> list[Solved]:
-        """How the solves at x went; looked at once more if the last look was elsewhere or before an interruption."""
-        if not self.solved:
-            self._forget()
-        self._look(x)
-        return self.solved
-
-    def _save(self, x: np.ndarray, state: PyTree, history: list[Progress]) -> None:
+    def save(self, saver: Saver, x: Vector, state: PyTree, history: list[Progress]) -> None:
+        """Save all that the rest of the optimization depends on."""
         if jax.process_index() == self.objective.processes[0]:
-            self.saver.save(self._carried(x, state), history, self._kept())
+            saver.save(self._saved(x, state), history, self._saved_starts())
 
-    def _resumed(self, x: np.ndarray, state: PyTree) -> tuple[np.ndarray, PyTree, list[Progress]]:
-        carried, records, kept = self.saver.load(self._carried(x, state), self._kept())
-        x, state, self.last, left = carried
-        if kept:
-            self.starts = self.objective.placed(kept)
-        self.tolerances = self.tolerances[len(self.tolerances) - int(left) :]
-        return x, state, [Progress(int(record[0]), *record[1:]) for record in records]
+    def load(self, saver: Saver, x: Vector, state: PyTree) -> tuple[Vector, PyTree, list[Progress]]:
+        """Return the point, the optimizer's state and the history of a checkpoint."""
+        saved, rows, starts = saver.load(self._saved(x, state), self._saved_starts())
+        x, state, self.last, remaining = saved
+        if starts:
+            self.warm_starts = self.objective.place(starts)
+        self.tolerances = self.tolerances[len(self.tolerances) - int(remaining) :]
+        return x, state, [Progress(int(row[0]), *row[1:]) for row in rows]
 
-    def _carried(self, x: np.ndarray, state: PyTree) -> PyTree:
-        """All that the rest of the climb depends on, as arrays, but for where solves start."""
+    def _saved(self, x: Vector, state: PyTree) -> PyTree:
         return x, state, self.last, np.asarray(len(self.tolerances))
 
-    def _kept(self) -> list[WarmStart]:
-        """Where solves start, for a checkpoint: nothing where that is never changed, or is spread over processes."""
-        return self.starts if self.objective.planned.keeps_starts and len(self.objective.processes) == 1 else []
-
-    def _check(self, progress: Progress) -> None:
-        """Raises if what was found at a point cannot be used."""
-        if progress.iteration == 0:
-            _check_start(self.objective.problem, self.solved)
-        if not np.isfinite(progress).all():
-            raise NotConverged(
-                f"the values or their gradient stopped converging at iteration {progress.iteration}: a smaller β, "
-                "a lower learning rate or more sweeps may help"
-            )
+    def _saved_starts(self) -> list[WarmStart]:
+        """Return the warm starts, unless they never change or are spread over processes."""
+        keep = self.objective.plan.keeps_warm_starts and len(self.objective.processes) == 1
+        return self.warm_starts if keep else []
 
 
-_NEGLIGIBLE = 2e-5
-"""What may be left out of a rough look, all batches of tasks together, as a share of the objective."""
-_LITTLE = 0.01
-"""Up to which change of what a batch adds, as a share of it, loose rough looks leave out states that did not matter."""
+def _ravel(tree: PyTree) -> tuple[Vector, Callable[[Vector], PyTree]]:
+    """Return the leaves of a tree as one vector, and the inverse: `ravel_pytree` without compiled code."""
+    leaves, structure = jax.tree.flatten(jax.tree.map(np.asarray, tree))
+    ends = np.cumsum([leaf.size for leaf in leaves])[:-1]
+
+    def unravel(x: Vector) -> PyTree:
+        parts = zip(np.split(x, ends), leaves, strict=True)
+        return jax.tree.unflatten(structure, [part.reshape(leaf.shape).astype(leaf.dtype) for part, leaf in parts])
+
+    return np.concatenate([leaf.ravel() for leaf in leaves]), unravel
 
 
-def _tolerances(problem: Problem, optimizer: Optimizer) -> list[float | None]:
-    """The tolerances of the solves, one after the other; None for the solver's own."""
-    dtype = jax.eval_shape(problem.model.probabilities).dtype
-    if problem.solver.tolerance is not None or dtype != np.float64 or problem.model.graph.states < LARGE:
-        return [None]
-    return [optimizer.exactness, float(problem.solver.tolerance_for(dtype))]
+def _check_finite(progress: Progress) -> None:
+    if not np.isfinite(progress).all():
+        raise NotConverged(
+            f"the values or their gradient stopped converging at iteration {progress.iteration}: a smaller β, "
+            "a smaller learning rate or more sweeps may help"
+        )
 
 
-def _reason_to_stop(now: Progress, settled: str, optimizer: Optimizer) -> str:
-    if settled:
-        return f"converged: {settled}"
-    if now.iteration >= optimizer.iterations:
-        return f"stopped after {now.iteration} iterations; the largest gradient is {now.gradient:.2g}"
-    return ""
-
-
-def _check_start(problem: Problem, solved: list[Solved]) -> None:
-    """Values must exist at the start, and every walker must be able to arrive."""
-    if not solved:
+def _check_start(problem: Problem, progress: Progress, solves: list[SolveSummary]) -> None:
+    """Raise unless all moves are possible, values converge, and every visited state can reach its goal."""
+    demos = problem.demonstrations
+    if progress.transitions == -np.inf:
+        move = np.flatnonzero(np.asarray(transition_probabilities(problem.model, demos)) == 0)[0]
+        raise InputError(
+            f"action {int(demos.actions[move])} in state {int(demos.states[move])} led to state "
+            f"{int(demos.next_states[move])}, which the model (what the map knows, say) holds to be impossible",
+            source=f"trajectory {int(demos.trajectory[move]) + 1}",
+        )
+    if not solves:
         return
-    converged, residual, stuck = (
-        np.concatenate([np.asarray(getattr(part, name)) for part in solved])
-        for name in ("converged", "residual", "stuck")
+    converged, residual, unreachable = (
+        np.concatenate([np.asarray(getattr(solve, name)) for solve in solves])
+        for name in ("converged", "residual", "unreachable")
     )
     if not converged.all():
         raise NotConverged(
             f"values did not converge for task(s) {np.flatnonzero(~converged).tolist()} (residual up to "
             f"{residual.max():.2g}): a smaller β, more sweeps or another backup may help"
         )
-    if not stuck.any():
-        return
-    demos = problem.demonstrations
-    task, choice = np.argwhere(stuck)[0]
-    state = choices_of(demos).states[task, choice]
-    move = np.flatnonzero((np.asarray(demos.task) == task) & (np.asarray(demos.states) == state))[0]
-    raise InputError(
-        f"state {int(state)} is visited, but the goal cannot be reached from it",
-        source=f"trajectory {int(demos.trajectory[move]) + 1}",
-    )
+    if unreachable.any():
+        task, choice = np.argwhere(unreachable)[0]
+        state = choices_of(demos).states[task, choice]
+        move = np.flatnonzero((np.asarray(demos.task) == task) & (np.asarray(demos.states) == state))[0]
+        raise InputError(
+            f"state {int(state)} is visited, but the goal cannot be reached from it",
+            source=f"trajectory {int(demos.trajectory[move]) + 1}",
+        )

@@ -1,22 +1,18 @@
-"""The objective of a fit and its gradient, task by task: in batches that fit into memory, over one device or many.
+"""The objective of a fit and its gradient, in batches of tasks on one device or many.
 
-    log L(θ) + log prior(θ),        log L(θ) = κ Σ_tasks Σ_choices log π_θ(a | s)  +  Σ_moves ln T_θ(s, a, s′)
+    log L(θ) + log p(θ),        log L(θ) = κ Σ_tasks Σ_choices log π_θ(a | s)  +  Σ_moves ln T_θ(s, a, s′)
 
-κ, the tempering, is 1 unless the steps of a walk are taken to say less than as many independent ones would. θ is all
-that is learned: of the transition model, and of people what is not known of them.
+κ is the tempering, and θ all that is learned: the parameters of the transition model and of behavior.
 
-The sum over tasks is the only costly part, and tasks have nothing to do with each other. So they are cut into batches
-of equal size, one compiled function serves them all, and with a mesh of devices each device takes its share of a
-batch's tasks and the shares are added up (JAX's SPMD; on several machines, the same on all of them).
+Only the sum over tasks is costly, and its terms are independent. Tasks are cut into batches of equal size for one
+compiled function. With a mesh of devices each device computes its part of a batch, and the parts are added (JAX's
+SPMD). The solves of an evaluation leave warm starts for those of the next one. These stay on the devices of their
+tasks; all other results are in all processes.
 
-What a batch's solves leave behind (values, adjoints, orders) is where those of the next evaluation start. It stays on
-the device whose tasks they are; everything else that an evaluation yields, all processes have.
-
-An evaluation may also save work by what it knows of an earlier one: what a batch adds is known, to first order, to
-change by less than Σ |∂ log L/∂θ · Δθ|. Where the tasks of a batch are elsewhere than the parameters that have changed
-that is nothing, and the part is taken over. Where it is little, only the states are solved that mattered before; if
-others have come to matter (see `process`), the batch is evaluated again, all states solved. These are estimates, so who
-asks for them must look again before relying on them.
+An evaluation may reuse what an earlier one computed. To first order, the contribution of a batch changes by less than Σ
+|∂ log L/∂θ · Δθ|. Where that is negligible, the earlier contribution is reused. Where it is small, only the states that
+mattered before are solved; if others have come to matter (see `DecisionProcess`), the batch is evaluated again with all
+states. These are estimates, so an evaluation that a result relies on must not use them.
 """
 
 from collections.abc import Sequence
@@ -30,7 +26,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from sidestep.errors import InputError
-from sidestep.inference.batching import Batch, batches_of, planned
+from sidestep.inference.batching import Batch, BatchPlan, make_batches, plan_batches
 from sidestep.inference.checkpoints import fingerprint
 from sidestep.inference.priors import Prior
 from sidestep.tabular.behavior_model import BehaviorModel, BehaviorParameters
@@ -48,316 +44,357 @@ from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.solvers.base import Solver, WarmStart, is_reachable
 from sidestep.tabular.tasks import Task
 
-MEMORY = 2.0 * 2**30
-"""How many bytes the arrays of a fit may take on a device, unless more are allowed."""
 AXIS = "tasks"
-"""The name of the axis of a mesh that tasks are spread over."""
+"""The name of a mesh's axis, over which tasks are spread."""
 
 
 class Parameters(NamedTuple):
-    """All that is learned: θ of the transition model, and of people what is not known of them."""
+    """All that is learned: the parameters of the transition model and of behavior."""
 
     model: PyTree
-    people: BehaviorParameters
+    behavior: BehaviorParameters
 
 
 class Problem(eqx.Module):
-    """All that the objective depends on, besides what is learned; arguments as for `fit`."""
+    """All that the objective depends on besides the parameters; arguments as for `fit`."""
 
     model: TransitionModel
-    people: BehaviorModel
+    behavior: BehaviorModel
     demonstrations: Demonstrations
     prior: Prior
     terms: tuple[Term, ...] = eqx.field(static=True)
     options: SolveOptions
-    tempering: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=1.0)
+    tempering: Float[Array, ""] = eqx.field(converter=lambda number: jax.device_put(np.asarray(number)), default=1.0)
 
     @property
     def solver(self) -> Solver:
         """Return the solver of the options."""
-        return self.options.solver_for(self.people.behavior.backup, self.model.graph.states)
+        return self.options.solver_for(self.behavior.behavior.backup, self.model.graph.states)
 
     @property
     def parameters(self) -> Parameters:
-        """What is learned, where it starts."""
-        return Parameters(self.model.parameters, self.people.parameters)
+        """Return the parameters where a fit starts."""
+        return Parameters(self.model.parameters, self.behavior.parameters)
 
 
-class Solved(NamedTuple):
-    """How the solves of some tasks went; `stuck` marks choices made where the goal cannot be reached from."""
+class SolveSummary(NamedTuple):
+    """The solves of some tasks; `unreachable` marks choices in states from which the goal cannot be reached."""
 
     sweeps: Int[Array, " tasks"]
     residual: Float[Array, " tasks"]
     converged: Bool[Array, " tasks"]
-    stuck: Bool[Array, "tasks choices"]
+    unreachable: Bool[Array, "tasks choices"]
 
 
-class Part(NamedTuple):
-    """What the tasks of a batch add to the actions' log-likelihood and to the slope of the loss, and at which θ.
+class BatchResult(NamedTuple):
+    """The actions' log-likelihood over a batch, the gradient of the loss, the next warm starts, and the solves."""
 
-    `everywhere`: whether all states were solved.
+    actions: Array
+    gradient: PyTree
+    warm_starts: WarmStart
+    solves: SolveSummary
+
+
+class Contribution(NamedTuple):
+    """The actions' log-likelihood over a batch and the gradient of the loss at `parameters`.
+
+    `all_states` is false if only the states that mattered before were solved.
     """
 
     parameters: PyTree[np.ndarray]
     actions: float
-    slope: PyTree[np.ndarray]
-    solved: Solved
-    everywhere: bool
+    gradient: PyTree[np.ndarray]
+    solves: SolveSummary
+    all_states: bool
+
+    def change(self, parameters: PyTree[np.ndarray]) -> float:
+        """Return a first-order bound of the change of `actions` up to these parameters; 0 only at the same ones."""
+        steps = jax.tree.map(np.subtract, parameters, self.parameters)
+        if not any(step.any() for step in jax.tree.leaves(steps)):
+            return 0.0
+        changes = jax.tree.map(lambda gradient, step: np.abs(gradient * step).sum(), self.gradient, steps)
+        return max(float(sum(jax.tree.leaves(changes))), np.finfo(np.float64).tiny)
 
 
 class Evaluation(NamedTuple):
-    """The objective and its parts at some θ, the slope of the loss (minus the objective), and how its solves went.
+    """The objective, its three parts, the gradient of the loss (minus the objective), and the solves of each batch.
 
-    `parts` are what the batches added, for a next evaluation to take over; none where it is not to.
+    `contributions` are those of the batches, for the next evaluation to reuse; none where the plan does not reuse.
     """
 
     objective: float
     actions: float
     transitions: float
     prior: float
-    slope: PyTree[np.ndarray]
-    solved: list[Solved]
-    parts: list[Part]
+    gradient: PyTree[np.ndarray]
+    solves: list[SolveSummary]
+    contributions: list[Contribution]
+
+    @property
+    def terms(self) -> tuple[float, float, float, float]:
+        """Return the objective and its parts."""
+        return self[:4]
 
 
 class Objective:
     """The objective of a problem, evaluated batch by batch.
 
-    - `memory`: about how many bytes the arrays may take on a device.
-    - `mesh`: devices to spread tasks over (`tasks_mesh`); None for one device.
-    - `takes_over`: whether evaluations are to take over parts of earlier ones, where that pays (see `planned`).
+    With a mesh over several processes, all must construct it from the same problem and call the same methods with the
+    same arguments.
 
-    With a mesh over several processes, each must make it from the same problem and call the same methods with the same
-    arguments; `InputError` says where they do not.
+    Args:
+        problem: the problem.
+        plan: the size of batches (see `plan_batches`), by default for a single device and 2 GiB.
+        mesh: the devices over which tasks are spread (see `tasks_mesh`); None for one device.
+
+    Raises:
+        InputError: if processes have different problems.
     """
 
-    def __init__(self, problem: Problem, memory: float, mesh: Mesh | None = None, takes_over: bool = False):
+    def __init__(self, problem: Problem, plan: BatchPlan | None = None, mesh: Mesh | None = None):
         self.problem, self.mesh = problem, mesh
-        tasks = len(problem.demonstrations.tasks.terminal)
-        devices = 1 if mesh is None else mesh.size
-        self.planned = planned(problem.model, problem.solver, tasks, memory, devices, takes_over)
-        _check_same(problem, mesh)
-        batches = (
-            batches_of(problem.demonstrations, problem.people, self.planned.together)
-            if "actions" in problem.terms
-            else []
-        )
-        self.batches = [_shared_out(batch, mesh) for batch in batches]
-        # of the data, batches and arrivals are all that is needed
-        self.lasting = eqx.tree_at(
-            lambda problem: (problem.demonstrations, problem.people.person),
+        self.plan = plan or plan_batches(problem.model, problem.solver, len(problem.demonstrations.tasks.terminal))
+        _check_same_problem(problem, mesh)
+        uses_actions = "actions" in problem.terms
+        batches = make_batches(problem.demonstrations, problem.behavior, self.plan.size) if uses_actions else []
+        self.batches = [_shard(batch, mesh) for batch in batches]
+        # batches and arrivals replace the demonstrations
+        self.constants = eqx.tree_at(
+            lambda problem: (problem.demonstrations, problem.behavior.person),
             problem,
             (None, None),
             is_leaf=lambda leaf: leaf is None,
         )
-        self.solving = _on_all(self.lasting, mesh)
+        self.replicated = _replicate(self.constants, mesh)
         self.arrivals = arrivals_of(problem.demonstrations) if "transitions" in problem.terms else None
 
     @property
     def processes(self) -> list[int]:
-        """The processes that tasks are spread over. With several, none has all starts."""
+        """Return the processes over which tasks are spread. With several, none has all warm starts."""
         if self.mesh is None:
             return [jax.process_index()]
         return sorted({device.process_index for device in self.mesh.devices.flat})
 
     def cold_starts(self) -> list[WarmStart]:
-        """Where the solves of each batch start when nothing is known."""
+        """Return the starts of each batch's first solves."""
         if not self.batches:
             return []
-        model, solver = self.problem.model, self.problem.solver
-        one = solver.cold_start(model.graph.states, jax.eval_shape(model.probabilities).dtype)
-        tasks = len(self.batches[0].tasks.terminal)
-        cold = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (tasks, *leaf.shape)), one)
+        model, tasks = self.problem.model, len(self.batches[0].tasks.terminal)
+        start = self.problem.solver.cold_start(model.graph.states, jax.eval_shape(model.probabilities).dtype)
+        cold = jax.tree.map(lambda leaf: jax.device_put(np.broadcast_to(leaf, (tasks, *np.shape(leaf)))), start)
         # arrays do not change, so one serves all batches
-        return self.placed([cold]) * len(self.batches)
+        return self.place([cold]) * len(self.batches)
 
-    def placed(self, starts: list[WarmStart]) -> list[WarmStart]:
-        """Starts of batches on the devices where their tasks are."""
-        return [_shared_out(start, self.mesh) for start in starts]
+    def place(self, starts: list[WarmStart]) -> list[WarmStart]:
+        """Return warm starts on the devices of their tasks."""
+        return [_shard(start, self.mesh) for start in starts]
 
     def evaluate(
         self,
         parameters: Parameters,
-        starts: list[WarmStart],
+        warm_starts: list[WarmStart],
+        *,
         tolerance: float | None = None,
-        known: Sequence[Part] = (),
-        negligible: float = 0.0,
-        little: float = 0.0,
+        known: Sequence[Contribution] = (),
+        reuse_below: float = 0.0,
+        partial_below: float = 0.0,
     ) -> tuple[Evaluation, list[WarmStart]]:
-        """The objective at θ, and where the next evaluation may start.
+        """Evaluate the objective at θ.
 
-        - `tolerance`: that of the solves, where the solver leaves it open. The objective is NaN if a solve failed.
-        - `known`: the parts of an earlier evaluation with the same tolerance. Those at the same θ are taken over if all
-          states were solved (or, with `little`, need not be), and those to which, by their slope, the way from their θ
-          to this one makes a difference below `negligible` (nats).
-        - `little`: only the states that mattered are solved where this way changes a batch's part by less than this
-          share of it.
+        Args:
+            parameters: θ.
+            warm_starts: where the solves start: `cold_starts()`, or the second value of an earlier call.
+            tolerance: that of the solves, where the solver leaves it open.
+            known: the contributions of an earlier evaluation with the same tolerance. Those at the same θ are reused.
+            reuse_below: reuse contributions that change by less than this, to first order (nats).
+            partial_below: solve only the states that mattered where a contribution changes by less than this fraction
+                of it.
+
+        Returns:
+            The evaluation, NaN if a solve failed, and the warm starts for the next one.
         """
-        slope, (transitions, prior) = jax.tree.map(
-            np.asarray, _apart_from_actions(self.lasting, self.arrivals, parameters)
-        )
+        model, behavior = self.constants.model, self.constants.behavior
+        others = _transitions_and_prior(self.problem.prior, model, behavior, self.arrivals, parameters)
+        gradient, (transitions, prior) = jax.tree.map(np.asarray, others)
         here = jax.tree.map(np.asarray, parameters)
-        parameters, tolerance = _on_all((parameters, tolerance), self.mesh)
-        solving = _with_tolerance(self.solving, tolerance)
-        actions, solved, parts, left = 0.0, [], [], []
-        for index, (batch, start) in enumerate(zip(self.batches, starts, strict=True)):
-            change = _changed_by(known[index], here) if known else np.inf
-            if change < negligible or (change == 0 and (known[index].everywhere or little > 0)):
-                part, after = known[index], start
+        parameters, tolerance = _replicate((parameters, tolerance), self.mesh)
+        problem = _with_tolerance(self.replicated, tolerance)
+        contributions, next_starts = [], []
+        for index, (batch, start) in enumerate(zip(self.batches, warm_starts, strict=True)):
+            change = known[index].change(here) if known else np.inf
+            if change < reuse_below or (change == 0 and (known[index].all_states or partial_below > 0)):
+                contribution, next_start = known[index], start
             else:
-                everywhere = not (known and change < little * abs(known[index].actions))
-                (found, by, after, how), everywhere = _evaluated(
-                    solving, parameters, batch, start, everywhere, self.mesh
-                )
-                part = Part(here, float(found), jax.tree.map(np.asarray, by), how, everywhere)
-            actions += part.actions
-            slope = jax.tree.map(np.add, slope, part.slope)
-            solved.append(part.solved)
-            if self.planned.takes_over:
-                parts.append(part)
-            left.append(after)
+                all_states = not (known and change < partial_below * abs(known[index].actions))
+                result, all_states = self._evaluate_until_finite(problem, parameters, batch, start, all_states)
+                by_batch, next_start = jax.tree.map(np.asarray, result.gradient), result.warm_starts
+                contribution = Contribution(here, float(result.actions), by_batch, result.solves, all_states)
+            gradient = jax.tree.map(np.add, gradient, contribution.gradient)
+            contributions.append(contribution)
+            next_starts.append(next_start)
+        actions = sum((contribution.actions for contribution in contributions), 0.0)
         terms = (actions, float(transitions), float(prior))
-        return Evaluation(sum(terms), *terms, slope, solved, parts), left if self.planned.keeps_starts else starts
+        solves = [contribution.solves for contribution in contributions]
+        evaluation = Evaluation(sum(terms), *terms, gradient, solves, contributions if self.plan.reuses else [])
+        return evaluation, next_starts if self.plan.keeps_warm_starts else warm_starts
+
+    def _evaluate_until_finite(
+        self, problem: Problem, parameters: PyTree, batch: Batch, start: WarmStart, all_states: bool
+    ) -> tuple[BatchResult, bool]:
+        """Evaluate a batch; again with all states if those that mattered do not give a gradient."""
+        result = self.evaluate_batch(problem, parameters, batch, start, all_states)
+        numbers = (result.actions, *jax.tree.leaves(result.gradient))
+        if all_states or not np.isfinite(numbers[0]) or all(np.isfinite(leaf).all() for leaf in numbers):
+            return result, all_states
+        adjoint = np.asarray(result.warm_starts.adjoint)
+        adjoint = jax.device_put(np.where(np.isfinite(adjoint), adjoint, np.asarray(start.adjoint)))
+        start = result.warm_starts._replace(adjoint=adjoint)
+        return self.evaluate_batch(problem, parameters, batch, start, True), True
+
+    def evaluate_batch(
+        self, problem: Problem, parameters: PyTree, batch: Batch, start: WarmStart, all_states: bool
+    ) -> BatchResult:
+        """Evaluate the actions' part of a batch; if not `all_states`, solve only the states that mattered before."""
+        if self.mesh is None:
+            return _batch_result(problem, parameters, batch, start, np.asarray(all_states))
+        result = _sharded_batch_result(problem, parameters, batch, start, np.asarray(all_states), self.mesh)
+        sums = (result.actions, result.gradient)
+        # Devices that wait for each other give up after some seconds, and one may have far more to do than the others:
+        # so they finish their work before it is added up.
+        jax.block_until_ready(sums)
+        (actions, gradient), solves = _add_devices(sums, result.solves, self.mesh)
+        return BatchResult(actions, gradient, result.warm_starts, solves)
 
 
 def tasks_mesh(devices: Sequence[Any] | None = None) -> Mesh:
-    """A mesh that spreads tasks over devices, by default over all that there are (of all processes)."""
+    """Return a mesh that spreads tasks over devices.
+
+    Args:
+        devices: JAX devices; by default all devices of all processes.
+
+    Example:
+        >>> tasks_mesh(jax.devices()[:1]).size
+        1
+    """
     return Mesh(np.asarray(jax.devices() if devices is None else devices), (AXIS,))
 
 
-def _changed_by(part: Part, parameters: PyTree[np.ndarray]) -> float:
-    """By how many nats at most, to first order, what a batch adds has changed since; 0 only at the same θ."""
-    moves = jax.tree.map(np.subtract, parameters, part.parameters)
-    if not any(move.any() for move in jax.tree.leaves(moves)):
-        return 0.0
-    changes = jax.tree.map(lambda slope, move: np.abs(slope * move).sum(), part.slope, moves)
-    return max(float(sum(jax.tree.leaves(changes))), np.finfo(np.float64).tiny)
-
-
-def _evaluated(
-    problem: Problem, parameters: PyTree, batch: Batch, starts: WarmStart, everywhere: bool, mesh: Mesh | None
-) -> tuple[tuple[Array, PyTree, WarmStart, Solved], bool]:
-    """`_of_actions`, of all states if without some of them there is no slope; and whether it was of all."""
-    found, slope, left, solved = _of_actions(problem, parameters, batch, starts, everywhere, mesh)
-    if everywhere or not jnp.isfinite(found) or all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(slope)):
-        return (found, slope, left, solved), everywhere
-    kept = jnp.where(jnp.isfinite(left.adjoint), left.adjoint, starts.adjoint)
-    return _of_actions(problem, parameters, batch, left._replace(adjoint=kept), True, mesh), True
-
-
 @eqx.filter_jit
-def _apart_from_actions(
-    problem: Problem, arrivals: Arrivals | None, parameters: Parameters
+def _transitions_and_prior(
+    prior: Prior,
+    model: TransitionModel,
+    behavior: BehaviorModel,
+    arrivals: Arrivals | None,
+    parameters: Parameters,
 ) -> tuple[PyTree, tuple[Array, Array]]:
-    """The slope of the loss's other parts, and the parts: the transitions' log-likelihood and the log prior."""
+    """Return the gradient of the loss without the actions' part, and its terms."""
 
     def loss(parameters: Parameters) -> tuple[Array, tuple[Array, Array]]:
-        prior = problem.prior.log_density(parameters.model)
-        transitions = jnp.zeros_like(prior)
-        prior = prior + problem.people.with_parameters(parameters.people).log_density().astype(prior.dtype)
+        log_density = prior.log_density(parameters.model)
+        transitions = jnp.zeros_like(log_density)
+        log_density += behavior.with_parameters(parameters.behavior).log_density().astype(log_density.dtype)
         if arrivals is not None:
-            model = problem.model.with_parameters(parameters.model)
-            transitions = arrival_log_likelihood(model, arrivals)
-        return -transitions - prior, (transitions, prior)
+            transitions = arrival_log_likelihood(model.with_parameters(parameters.model), arrivals)
+        return -transitions - log_density, (transitions, log_density)
 
     return jax.grad(loss, has_aux=True)(parameters)
 
 
-def _of_actions(
-    problem: Problem, parameters: PyTree, batch: Batch, starts: WarmStart, everywhere: bool, mesh: Mesh | None
-) -> tuple[Array, PyTree, WarmStart, Solved]:
-    """The actions' log-likelihood over the tasks of a batch, the slope of the loss, new starts, how the solves went."""
-    if mesh is None:
-        return _share(problem, parameters, batch, starts, jnp.asarray(everywhere))
-    part, slope, left, solved = _shares(problem, parameters, batch, starts, jnp.asarray(everywhere), mesh)
-    # Devices that wait for each other give up after some seconds, and one may have far more to do than the others: so
-    # they first finish all their work, and only then is it added up.
-    jax.block_until_ready((part, slope))
-    (part, slope), solved = _added_up((part, slope), solved, mesh)
-    return part, slope, left, solved
-
-
 @eqx.filter_jit
-def _share(
-    problem: Problem, parameters: Parameters, batch: Batch, starts: WarmStart, everywhere: Bool[Array, ""]
-) -> tuple[Array, PyTree, WarmStart, Solved]:
-    """`_of_actions` on one device."""
+def _batch_result(
+    problem: Problem, parameters: Parameters, batch: Batch, starts: WarmStart, all_states: Bool[Array | np.ndarray, ""]
+) -> BatchResult:
+    """Evaluate the tasks of a batch that are on one device."""
 
-    def of_one(
+    def of_task(
         model: TransitionModel,
-        people: BehaviorModel,
+        behavior: BehaviorModel,
         task: Task,
         person: Array,
         choices: Choices,
         start: WarmStart,
         region: Array,
-    ) -> tuple[Array, tuple]:
-        value, found = choice_log_likelihood(
+    ) -> tuple[Array, tuple[WarmStart, SolveSummary]]:
+        value, solution = choice_log_likelihood(
             model,
-            people.tasks_of(task),
+            behavior.tasks_of(task),
             choices,
-            people.behavior_of(person),
+            behavior.behavior_of(person),
             start,
             options=problem.options,
             region=region,
         )
-        stuck = (choices.counts > 0) & ~is_reachable(found.values[choices.states])
-        return value, (found.start, Solved(found.sweeps, found.residual, found.converged, stuck))
+        unreachable = (choices.counts > 0) & ~is_reachable(solution.values[choices.states])
+        return value, (
+            solution.start,
+            SolveSummary(solution.sweeps, solution.residual, solution.converged, unreachable),
+        )
 
-    def loss(parameters: Parameters, adjoint: Array) -> tuple[Array, tuple]:
+    def loss(parameters: Parameters, adjoint: Array) -> tuple[Array, tuple[WarmStart, SolveSummary]]:
         model = problem.model.with_parameters(parameters.model)
-        people = problem.people.with_parameters(parameters.people)
-        given = starts._replace(adjoint=adjoint)
-        each = jax.vmap(of_one, in_axes=(None, None, 0, 0, 0, 0, 0))
-        values, left = each(model, people, batch.tasks, batch.person, batch.choices, given, region)
-        return -problem.tempering.astype(values.dtype) * values.sum(), left
+        behavior = problem.behavior.with_parameters(parameters.behavior)
+        over_tasks = jax.vmap(of_task, in_axes=(None, None, 0, 0, 0, 0, 0))
+        values, aux = over_tasks(
+            model, behavior, batch.tasks, batch.person, batch.choices, starts._replace(adjoint=adjoint), region
+        )
+        return -problem.tempering.astype(values.dtype) * values.sum(), aux
 
-    region = starts.region | everywhere
-    # the gradient by the old adjoint is the new one
-    gradient = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
-    (value, (left, solved)), (slope, adjoint) = gradient(parameters, starts.adjoint)
-    return -value, slope, left._replace(adjoint=adjoint), solved
-
-
-@eqx.filter_jit
-def _shares(
-    problem: Problem, parameters: PyTree, batch: Batch, starts: WarmStart, everywhere: Bool[Array, ""], mesh: Mesh
-) -> tuple[Array, PyTree, WarmStart, Solved]:
-    """`_share` of every device; sums over its tasks have an axis of devices in front."""
-    known, settings = eqx.partition((problem, parameters, everywhere), eqx.is_array)
-
-    def share(known: PyTree, batch: Batch, starts: WarmStart) -> tuple[Array, PyTree, WarmStart, Solved]:
-        problem, parameters, everywhere = eqx.combine(known, settings)
-        part, slope, left, solved = _share(problem, parameters, batch, starts, everywhere)
-        part, slope = jax.tree.map(lambda leaf: leaf[None], (part, slope))
-        return part, slope, left, solved
-
-    own = PartitionSpec(AXIS)
-    spread = jax.shard_map(share, mesh=mesh, in_specs=(PartitionSpec(), own, own), out_specs=own, check_vma=False)
-    return spread(known, batch, starts)
+    region = starts.region | all_states
+    # the gradient by the old adjoint is the new adjoint
+    value_and_gradient = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
+    (value, (next_starts, solves)), (gradient, adjoint) = value_and_gradient(parameters, starts.adjoint)
+    return BatchResult(-value, gradient, next_starts._replace(adjoint=adjoint), solves)
 
 
 @eqx.filter_jit
-def _added_up(sums: PyTree, solved: Solved, mesh: Mesh) -> tuple[PyTree, Solved]:
-    """The devices' sums added up, and how all solves went; both on all devices."""
+def _sharded_batch_result(
+    problem: Problem,
+    parameters: PyTree,
+    batch: Batch,
+    starts: WarmStart,
+    all_states: Bool[Array | np.ndarray, ""],
+    mesh: Mesh,
+) -> BatchResult:
+    """Evaluate a batch on all devices; the sums over a device's tasks have a leading axis of devices."""
+    arrays, static = eqx.partition((problem, parameters, all_states), eqx.is_array)
+
+    def on_device(arrays: PyTree, batch: Batch, starts: WarmStart) -> BatchResult:
+        problem, parameters, all_states = eqx.combine(arrays, static)
+        result = _batch_result(problem, parameters, batch, starts, all_states)
+        actions, gradient = jax.tree.map(lambda leaf: leaf[None], (result.actions, result.gradient))
+        return result._replace(actions=actions, gradient=gradient)
+
+    sharded = PartitionSpec(AXIS)
+    evaluate = jax.shard_map(
+        on_device, mesh=mesh, in_specs=(PartitionSpec(), sharded, sharded), out_specs=sharded, check_vma=False
+    )
+    return evaluate(arrays, batch, starts)
+
+
+@eqx.filter_jit
+def _add_devices(sums: PyTree, solves: SolveSummary, mesh: Mesh) -> tuple[PyTree, SolveSummary]:
+    """Add the devices' sums; return them and all solves on all devices."""
     added = jax.tree.map(lambda leaf: leaf.sum(axis=0), sums)
-    return jax.lax.with_sharding_constraint((added, solved), NamedSharding(mesh, PartitionSpec()))
+    return jax.lax.with_sharding_constraint((added, solves), NamedSharding(mesh, PartitionSpec()))
 
 
-def _on_all(tree: PyTree, mesh: Mesh | None) -> PyTree:
-    """Arrays and numbers on each device of a mesh; `InputError` if not all processes have the same ones."""
+def _replicate(tree: PyTree, mesh: Mesh | None) -> PyTree:
+    """Copy arrays and numbers to each device; raise `InputError` if processes have different ones."""
     if mesh is None:
         return tree
     values, rest = eqx.partition(tree, lambda leaf: eqx.is_array(leaf) or isinstance(leaf, float))
     try:
         values = jax.device_put(jax.tree.map(np.asarray, values), NamedSharding(mesh, PartitionSpec()))
-    except AssertionError as error:  # JAX compares what it is given
-        raise InputError(_NOT_THE_SAME) from error
+    except AssertionError as error:  # JAX compares the processes' arrays
+        raise InputError(
+            "expected the same model, demonstrations, settings and checkpoint in all processes, found different ones "
+            "(machines that are not of the same kind may differ in the last bits)"
+        ) from error
     return eqx.combine(values, rest)
 
 
-def _shared_out(tree: PyTree, mesh: Mesh | None) -> PyTree:
-    """Arrays over tasks, each device with its share of them; a process holds the shares of its own devices."""
+def _shard(tree: PyTree, mesh: Mesh | None) -> PyTree:
+    """Spread arrays over tasks over the devices; a process holds the parts of its own devices."""
     if mesh is None:
         return tree
     sharding = NamedSharding(mesh, PartitionSpec(AXIS))
@@ -369,15 +406,9 @@ def _shared_out(tree: PyTree, mesh: Mesh | None) -> PyTree:
     return jax.tree.map(put, tree)
 
 
-_NOT_THE_SAME = """\
-expected the same model, demonstrations, settings and checkpoint in all processes, found different ones (machines that \
-are not of the same kind may differ in the last bits)"""
-
-
-def _check_same(problem: Problem, mesh: Mesh | None) -> None:
-    """Raises `InputError` unless all processes have the same problem."""
+def _check_same_problem(problem: Problem, mesh: Mesh | None) -> None:
     if jax.process_count() > 1:
-        _on_all(np.frombuffer(bytes.fromhex(fingerprint(problem)), np.uint8), mesh)
+        _replicate(np.frombuffer(bytes.fromhex(fingerprint(problem)), np.uint8), mesh)
 
 
 def _with_tolerance(problem: Problem, tolerance: float | Array | None) -> Problem:

@@ -1,233 +1,297 @@
-"""How a fit climbs: L-BFGS with a line search, first-order ascent, or steps that stay off cliffs.
+"""Optimizers of a fit: L-BFGS with a line search, Adam, and a variant of Rprop.
 
-An optimiser is three pure functions over vectors: `init` makes what it carries from step to step, `step` takes one, and
-`settled` says why it has converged, if it has. It is given the loss (minus the objective) as a function, `Evaluate`.
-Its `exactness` says how exact solves have to be until it has converged, `looks_roughly` whether it takes rough looks.
+An optimizer has three pure functions over vectors: `init` returns its first state, `step` the next point and state, and
+`terminate` tells whether it has converged. The loop that calls them is `maximize`. They minimize a `Loss`, which is
+minus the objective. To add an optimizer, subclass `Optimizer`.
 """
 
+import abc
 import warnings
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Float, PyTree
-from scipy.optimize import line_search
 
 Vector = Float[np.ndarray, " parameters"]
 
 
 @runtime_checkable
-class Evaluate(Protocol):
-    """The loss, and its slope."""
+class Loss(Protocol):
+    """A function to minimize."""
 
-    def __call__(self, x: Vector, *, rough: bool = False) -> tuple[float, Vector]:
-        """Both at x; a rough look may leave out what seems to be as it was where the last look was, and costs less."""
+    def __call__(self, x: Vector, *, approximate: bool = False) -> tuple[float, Vector]:
+        """Return the loss and its gradient at x.
+
+        Args:
+            x: the parameters.
+            approximate: allow a cheaper value, which omits what has hardly changed since the last evaluation.
+        """
         ...
 
 
-class LBFGS(eqx.Module):
-    """L-BFGS with a line search for the strong Wolfe conditions; needs the exact gradient.
+class Optimizer(eqx.Module):
+    """An iterative method that minimizes a loss.
 
-    - `iterations`: when to stop at the latest.
-    - `tolerance`: the fit has converged when no component of the gradient is larger (nats per unit of θ).
-    - `memory`: how many steps the curvature is learned from.
+    Attributes:
+        max_iterations: the largest number of steps.
+        tolerance: the fit has converged when `convergence` is at most this.
+        solve_tolerance: the tolerance of the solves of large maps until the optimizer has converged with it.
+        approximates: whether `step` asks for approximate losses.
+        measure: a format for the number that `convergence` returns.
     """
 
-    iterations: int = eqx.field(default=500, static=True)
+    max_iterations: eqx.AbstractVar[int]
+    tolerance: eqx.AbstractVar[float]
+    solve_tolerance: ClassVar[float] = 1e-7
+    approximates: ClassVar[bool] = False
+    measure: ClassVar[str] = "the largest gradient is {:.2g}"
+
+    @property
+    @abc.abstractmethod
+    def key(self) -> str:
+        """Return what an interrupted fit must share with the one that resumes it."""
+
+    @abc.abstractmethod
+    def init(self, x: Vector) -> PyTree:
+        """Return the state before the first step from x."""
+
+    @abc.abstractmethod
+    def step(
+        self, loss: Loss, x: Vector, value: float, gradient: Vector, state: PyTree
+    ) -> tuple[Vector, PyTree] | None:
+        """Return the next point and state, or None if no step decreases the loss.
+
+        Args:
+            loss: the function to minimize.
+            x: the present point.
+            value: the loss at x.
+            gradient: the gradient of the loss at x.
+            state: the state that `init` or the last step returned.
+        """
+
+    def convergence(self, gradient: Vector, state: PyTree) -> float:
+        """Return the number that `terminate` compares with the tolerance: the largest component of the gradient."""
+        del state
+        return float(np.abs(gradient).max())
+
+    def terminate(self, gradient: Vector, state: PyTree) -> bool:
+        """Return whether the optimizer has converged at a point with this gradient."""
+        return self.convergence(gradient, state) <= self.tolerance
+
+
+class LBFGS(Optimizer):
+    """L-BFGS with a line search for the strong Wolfe conditions (Nocedal & Wright 2006, algorithms 7.4 and 3.5).
+
+    It needs the exact gradient. It differs from the textbook in that 1. the best point of a line search counts even if
+    the search fails; 2. where no point is better, the memory is cleared and the search is repeated once.
+
+    Attributes:
+        max_iterations: the largest number of steps.
+        tolerance: the fit has converged when no component of the gradient is larger (nats per unit of θ).
+        memory_size: the number of steps from which the curvature is estimated.
+    """
+
+    max_iterations: int = eqx.field(default=500, static=True)
     tolerance: float = eqx.field(default=1e-4, static=True)
-    memory: int = eqx.field(default=20, static=True)
-    exactness: ClassVar[float] = 1e-7
-    looks_roughly: ClassVar[bool] = False
+    memory_size: int = eqx.field(default=20, static=True)
 
     @property
     def key(self) -> str:
-        """What an interrupted fit must share with the one that resumes it."""
-        return f"L-BFGS {self.memory}"
+        """Return what an interrupted fit must share with the one that resumes it."""
+        return f"L-BFGS {self.memory_size}"
 
-    def init(self, x: Vector) -> PyTree[Array]:
-        """The steps and changes of gradient to learn from: none yet."""
-        return optax.scale_by_lbfgs(self.memory).init(x)
+    def init(self, x: Vector) -> PyTree:
+        """Return an empty memory."""
+        import optax
 
-    def step(
-        self, evaluate: Evaluate, x: Vector, value: float, slope: Vector, state: PyTree[Array]
-    ) -> tuple[Vector, PyTree[Array]] | None:
-        """The next point; None where no step along the direction gains anything."""
-        direction, learned = _lbfgs_direction(self.memory, slope, state, x)
-        found = _best_along(-np.asarray(direction, dtype=x.dtype), evaluate, x, value, slope)
-        if found is not None:
-            return found, learned
-        # what was learned of the curvature may mislead where the objective bends sharply: forget it once
-        direction, learned = _lbfgs_direction(self.memory, slope, self.init(x), x)
-        found = _best_along(-np.asarray(direction, dtype=x.dtype), evaluate, x, value, slope)
-        return None if found is None else (found, learned)
-
-    def settled(self, slope: Vector, state: PyTree[Array]) -> str:
-        """Why it has converged, or nothing."""
-        del state
-        return _why_flat(slope, self.tolerance)
-
-
-class Adam(eqx.Module):
-    """First-order ascent (Adam with a rate that falls to nothing along a cosine), with either gradient.
-
-    - `iterations`: when to stop at the latest, and the length of the cosine.
-    - `learning_rate`: the first rate, in units of θ.
-    - `tolerance`: as for `LBFGS`.
-    """
-
-    iterations: int = eqx.field(default=2000, static=True)
-    learning_rate: float = eqx.field(default=0.2, static=True)
-    tolerance: float = eqx.field(default=1e-2, static=True)
-    exactness: ClassVar[float] = 1e-7
-    looks_roughly: ClassVar[bool] = False
-
-    @property
-    def key(self) -> str:
-        """What an interrupted fit must share with the one that resumes it: here the rate's whole schedule."""
-        return f"ascent {self.learning_rate} {self.iterations}"
-
-    def _adam(self) -> optax.GradientTransformation:
-        return optax.adam(optax.cosine_decay_schedule(self.learning_rate, self.iterations))
-
-    def init(self, x: Vector) -> PyTree[Array]:
-        """The running means of the gradient and its square."""
-        return self._adam().init(x)
+        # optax begins with zeros; shapes alone need no compiled code
+        state = jax.eval_shape(optax.scale_by_lbfgs(self.memory_size).init, x)
+        return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), state)
 
     def step(
-        self, evaluate: Evaluate, x: Vector, value: float, slope: Vector, state: PyTree[Array]
-    ) -> tuple[Vector, PyTree[Array]]:
-        """The next point."""
-        del evaluate, value
-        update, state = self._adam().update(slope, state, x)
-        return x + np.asarray(update, dtype=x.dtype), state
-
-    def settled(self, slope: Vector, state: PyTree[Array]) -> str:
-        """Why it has converged, or nothing."""
-        del state
-        return _why_flat(slope, self.tolerance)
-
-
-class Rprop(eqx.Module):
-    """Ascent with a step of its own for every parameter, that stays off cliffs; needs the exact gradient.
-
-    A gap in a wall that would save people a thousand steps does not tempt them while passing it takes more tries than
-    that. Where it begins to, the objective of people who walked around falls by thousands of nats within a thousandth
-    of a unit of θ. At the optimum hundreds of parameters stand each at such a cliff of its own, which is as good as a
-    kink to a quasi-Newton method.
-
-    So only the gradient's signs give the direction (resilient propagation, Riedmiller and Braun 1993). A step is taken
-    if the objective rises and at most the share 0.15 of what the slope promised is pushed back by parameters whose
-    slope has turned. Otherwise those that push back more than that share of their own stay where they are, with a
-    quarter of their step, and it is tried again without them; where there are none, with all steps a quarter as long,
-    this time. Where a step was taken it grows by 1.4, by 4 if the slope has become steeper on the way, and falls to a
-    quarter where the slope has turned.
-
-    - `iterations`: how many steps are taken at most; each may need several evaluations.
-    - `tolerance`: the fit has converged when its next step promises less than this (nats, all parameters together).
-    - `first`, `longest`: the first and the longest step, in units of θ.
-    """
-
-    iterations: int = eqx.field(default=500, static=True)
-    tolerance: float = eqx.field(default=1.0, static=True)
-    first: float = eqx.field(default=0.7, static=True)
-    longest: float = eqx.field(default=1.5, static=True)
-    exactness: ClassVar[float] = 1e-5
-    looks_roughly: ClassVar[bool] = True
-
-    @property
-    def key(self) -> str:
-        """What an interrupted fit must share with the one that resumes it."""
-        return f"resilient {self.first} {self.longest}"
-
-    def init(self, x: Vector) -> Vector:
-        """The first step of every parameter."""
-        return np.full_like(x, self.first)
-
-    def step(
-        self, evaluate: Evaluate, x: Vector, value: float, slope: Vector, state: Vector
-    ) -> tuple[Vector, Vector] | None:
-        """The next point; None where none that was tried gains anything."""
-        lengths, free, share, rough = state, slope != 0, 1.0, False
-        for _ in range(_TRIALS):
-            step = np.where(free, -share * lengths * np.sign(slope), 0).astype(x.dtype)
-            promised = -slope * step
-            after, new_slope = evaluate(x + step, rough=rough)
-            if rough and _gains(value, promised, after, _pushed_back(step, after, new_slope)):
-                after, new_slope = evaluate(x + step)
-            pushed_back = _pushed_back(step, after, new_slope)
-            if _gains(value, promised, after, pushed_back):
-                growth = np.where(np.abs(new_slope) >= np.abs(slope), _STEEPER, _GROWTH)
-                grown = np.where(free, np.minimum(growth * lengths, self.longest), lengths)
-                return x + step, np.where(pushed_back > 0, _CUT * lengths, grown).astype(x.dtype)
-            too_far = pushed_back > _PUSHED_BACK * promised
-            if too_far.any():
-                lengths, free = np.where(too_far, _CUT * lengths, lengths), free & ~too_far
-            else:
-                share *= _CUT
-            free = free if free.any() else slope != 0
-            # few people have to do with parameters that are put back, and many with a shorter step
-            rough = bool(too_far.any())
+        self, loss: Loss, x: Vector, value: float, gradient: Vector, state: PyTree
+    ) -> tuple[Vector, PyTree] | None:
+        """Return the best point along the L-BFGS direction, or None if no point is better than x."""
+        for memory in (state, self.init(x)):
+            direction, updated = _lbfgs_direction(self.memory_size, gradient, memory, x)
+            best = _line_search(-np.asarray(direction, dtype=x.dtype), loss, x, value, gradient)
+            if best is not None:
+                return best, updated
         return None
 
-    def settled(self, slope: Vector, state: Vector) -> str:
-        """Why it has converged, or nothing."""
-        promised = np.abs(slope) @ state
-        return f"the next step promises {promised:.2g} nats" if promised <= self.tolerance else ""
+
+class Adam(Optimizer):
+    """Adam (Kingma & Ba 2015) with a learning rate that decreases to 0 along a cosine (Loshchilov & Hutter 2017).
+
+    It needs no line search, and so works with the fixed-policy gradient too.
+
+    Attributes:
+        max_iterations: the number of steps, unless it converges before; the length of the cosine.
+        learning_rate: the first learning rate, in units of θ.
+        tolerance: the fit has converged when no component of the gradient is larger (nats per unit of θ).
+    """
+
+    max_iterations: int = eqx.field(default=2000, static=True)
+    learning_rate: float = eqx.field(default=0.2, static=True)
+    tolerance: float = eqx.field(default=1e-2, static=True)
+
+    @property
+    def key(self) -> str:
+        """Return what an interrupted fit must share with the one that resumes it."""
+        return f"Adam {self.learning_rate} {self.max_iterations}"
+
+    def _transformation(self) -> Any:
+        import optax
+
+        return optax.adam(optax.cosine_decay_schedule(self.learning_rate, self.max_iterations))
+
+    def init(self, x: Vector) -> PyTree:
+        """Return the first moments."""
+        return self._transformation().init(x)
+
+    def step(self, loss: Loss, x: Vector, value: float, gradient: Vector, state: PyTree) -> tuple[Vector, PyTree]:
+        """Return the next point and moments."""
+        del loss, value
+        update, state = self._transformation().update(gradient, state, x)
+        return x + np.asarray(update, dtype=x.dtype), state
 
 
-Optimizer = LBFGS | Adam | Rprop
+class Rprop(Optimizer):
+    """A variant of Rprop (Riedmiller & Braun 1993) for objectives with cliffs; it needs the exact gradient.
 
-_GROWTH, _STEEPER, _CUT, _PUSHED_BACK = 1.4, 4.0, 0.25, 0.15
-"""By how much a step grows, grows on a slope that becomes steeper, and falls; which share may be pushed back."""
-_TRIALS = 40
-"""How often a step of `Rprop` is tried, with fewer and fewer parameters or shorter, before it is given up."""
+    A gap in a wall that would save an agent a thousand steps changes its path only where passing it takes fewer
+    attempts. There the objective of agents that walked around falls by thousands of nats within a thousandth of a unit
+    of θ. At the optimum hundreds of parameters are at such a cliff each, which a quasi-Newton method takes for a kink.
+
+    As in Rprop, each parameter has a step size, and only the sign of its gradient gives the direction. It differs:
+
+    1. A step is accepted only if the loss decreases, and if parameters whose gradient has changed sign (overshot) take
+       back at most .15 of the decrease that the gradient predicted.
+    2. Otherwise parameters that take back more than .15 of their own predicted decrease keep their values, their step
+       sizes are multiplied by .25, and the trial is repeated without them. If there are none, all steps of this trial
+       are multiplied by .25.
+    3. After an accepted step, step sizes grow by 1.4 (1.2 in Rprop), or by 4 where the gradient has become steeper, and
+       are multiplied by .25 (.5 in Rprop) where the gradient has changed sign.
+    4. A trial without some parameters is evaluated approximately first, and again if it is acceptable.
+
+    Attributes:
+        max_iterations: the largest number of steps; each may take several evaluations.
+        tolerance: the fit has converged when the gradient predicts a smaller gain of the next step (nats, all
+            parameters together).
+        initial_step: the first step size of each parameter, in units of θ.
+        max_step: the largest step size, in units of θ.
+    """
+
+    max_iterations: int = eqx.field(default=500, static=True)
+    tolerance: float = eqx.field(default=1.0, static=True)
+    initial_step: float = eqx.field(default=0.7, static=True)
+    max_step: float = eqx.field(default=1.5, static=True)
+    solve_tolerance: ClassVar[float] = 1e-5
+    approximates: ClassVar[bool] = True
+    measure: ClassVar[str] = "the next step promises {:.2g} nats"
+
+    @property
+    def key(self) -> str:
+        """Return what an interrupted fit must share with the one that resumes it."""
+        return f"Rprop {self.initial_step} {self.max_step}"
+
+    def init(self, x: Vector) -> Vector:
+        """Return the first step sizes."""
+        return np.full_like(x, self.initial_step)
+
+    def step(
+        self, loss: Loss, x: Vector, value: float, gradient: Vector, state: Vector
+    ) -> tuple[Vector, Vector] | None:
+        """Return the end of the first acceptable step and the new step sizes, or None if no step is acceptable."""
+        sizes, free, scale, approximate = state, gradient != 0, 1.0, False
+        for _ in range(_MAX_TRIALS):
+            step = np.where(free, -scale * sizes * np.sign(gradient), 0).astype(x.dtype)
+            predicted = -gradient * step
+            trial = _Trial(step, *loss(x + step, approximate=approximate))
+            if approximate and trial.is_acceptable(value, predicted):
+                trial = _Trial(step, *loss(x + step))
+            overshoot = trial.overshoot
+            if trial.is_acceptable(value, predicted):
+                growth = np.where(np.abs(trial.gradient) >= np.abs(gradient), _GROWTH_IF_STEEPER, _GROWTH)
+                grown = np.where(free, np.minimum(growth * sizes, self.max_step), sizes)
+                return x + step, np.where(overshoot > 0, _SHRINKAGE * sizes, grown).astype(x.dtype)
+            too_far = overshoot > _MAX_OVERSHOOT * predicted
+            if too_far.any():
+                sizes, free = np.where(too_far, _SHRINKAGE * sizes, sizes), free & ~too_far
+            else:
+                scale *= _SHRINKAGE
+            free = free if free.any() else gradient != 0
+            # parameters that are put back change few tasks; a shorter step changes many
+            approximate = bool(too_far.any())
+        return None
+
+    def convergence(self, gradient: Vector, state: Vector) -> float:
+        """Return the gain in nats that the gradient predicts for the next step."""
+        return float(np.abs(gradient) @ state)
 
 
-def _pushed_back(step: Vector, after: float, new_slope: Vector) -> Vector:
-    """What each parameter pushes back at the end of a step: nothing where the loss still falls, or is not known."""
-    return np.maximum(new_slope * step, 0) if np.isfinite(after) else np.zeros_like(step)
+_GROWTH, _GROWTH_IF_STEEPER, _SHRINKAGE = 1.4, 4.0, 0.25
+_MAX_OVERSHOOT = 0.15
+"""The largest part of the predicted decrease that parameters may take back."""
+_MAX_TRIALS = 40
 
 
-def _gains(value: float, promised: Vector, after: float, pushed_back: Vector) -> bool:
-    """Whether the loss falls along a step, and little of what the slope promised is pushed back at its end."""
-    return bool(after < value and pushed_back.sum() <= _PUSHED_BACK * promised.sum())
+class _Trial(NamedTuple):
+    """A step of `Rprop`, and the loss and its gradient at the step's end."""
 
+    step: Vector
+    value: float
+    gradient: Vector
 
-def _why_flat(slope: Vector, tolerance: float) -> str:
-    """That no component of a slope is larger than a tolerance, in words; nothing if one is."""
-    largest = np.abs(slope).max()
-    return f"the largest gradient is {largest:.2g}" if largest <= tolerance else ""
+    @property
+    def overshoot(self) -> Vector:
+        """What each parameter takes back at the end of the step: 0 where the loss still decreases or is infinite."""
+        return np.maximum(self.gradient * self.step, 0) if np.isfinite(self.value) else np.zeros_like(self.step)
+
+    def is_acceptable(self, value: float, predicted: Vector) -> bool:
+        return bool(self.value < value and self.overshoot.sum() <= _MAX_OVERSHOOT * predicted.sum())
 
 
 @eqx.filter_jit
 def _lbfgs_direction(
-    memory: int,
-    slope: Float[Array | np.ndarray, " parameters"],
-    state: PyTree[Array],
+    memory_size: int,
+    gradient: Float[Array | np.ndarray, " parameters"],
+    state: PyTree,
     x: Float[Array | np.ndarray, " parameters"],
-) -> tuple[Array, PyTree[Array]]:
-    direction, state = optax.scale_by_lbfgs(memory).update(jnp.asarray(slope), state, jnp.asarray(x))
+) -> tuple[Array, PyTree]:
+    import optax
+
+    direction, state = optax.scale_by_lbfgs(memory_size).update(jnp.asarray(gradient), state, jnp.asarray(x))
     return jnp.asarray(direction), state
 
 
-def _best_along(direction: Vector, evaluate: Evaluate, x: Vector, value: float, slope: Vector) -> Vector | None:
-    """The best point that a line search for the strong Wolfe conditions meets; None if none is better than `x`."""
-    tried: dict[float, Vector] = {value: x}
+def _line_search(direction: Vector, loss: Loss, x: Vector, value: float, gradient: Vector) -> Vector | None:
+    """Return the best point of a line search for the strong Wolfe conditions, or None if no point is better than x."""
+    from scipy.optimize import line_search
+
+    points: dict[float, Vector] = {value: x}
 
     # the search computes in 64-bit numbers whatever the parameters are
-    def loss(point: Vector) -> float:
+    def value_at(point: Vector) -> float:
         point = point.astype(x.dtype)
-        found = evaluate(point)[0]
-        tried[found] = point
-        return found
+        value = loss(point)[0]
+        points[value] = point
+        return value
 
     with warnings.catch_warnings():
-        # a search that meets no point with the right curvature says so; its best point may gain all the same
+        # a search without a point of the required curvature warns; its best point may be better than x all the same
         warnings.simplefilter("ignore", RuntimeWarning)
         line_search(
-            loss, lambda point: evaluate(point.astype(x.dtype))[1], x, direction, gfk=slope, old_fval=value, maxiter=20
+            value_at,
+            lambda point: loss(point.astype(x.dtype))[1],
+            x,
+            direction,
+            gfk=gradient,
+            old_fval=value,
+            maxiter=20,
         )
-    best = min(tried)
-    return None if best >= value else tried[best]
+    best = min(points)
+    return None if best >= value else points[best]

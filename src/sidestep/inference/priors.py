@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from sidestep.errors import InputError
 
+Numbers = float | Float[Array | np.ndarray, "..."]
 MIN_PROBABILITY = 1 / 1020
 """The least distance of a sensor's probability from 0 and 1: a quarter of a gray level of an 8-bit image."""
 
@@ -64,9 +65,8 @@ class Normal(Prior):
     mean: Float[Array, "..."]
     variance: Float[Array, "..."]
 
-    def __init__(self, mean: float | Float[Array, "..."] = -2.0, variance: float | Float[Array, "..."] = 2.0):
-        self.mean = jnp.asarray(mean, jnp.result_type(float))
-        self.variance = jnp.asarray(variance, jnp.result_type(float))
+    def __init__(self, mean: Numbers = -2.0, variance: Numbers = 2.0):
+        self.mean, self.variance = _as_floats(mean), _as_floats(variance)
         if not np.isfinite(self.mean).all():
             raise InputError("expected finite numbers", field="prior mean")
         if not (np.isfinite(self.variance).all() and (np.asarray(self.variance) > 0).all()):
@@ -113,9 +113,7 @@ def sensor_prior(
     p = np.clip(np.where(observed, probability, 0.5), MIN_PROBABILITY, 1 - MIN_PROBABILITY)
     mean, spread = (np.broadcast_to(each, p.size) for each in (unobserved.mean, unobserved.variance))
     observed, logit = observed.ravel(), (np.log(p) - np.log1p(-p)).ravel()
-    return Normal(
-        jnp.asarray(np.where(observed, logit, mean)), jnp.asarray(np.where(observed, variances.ravel(), spread))
-    )
+    return Normal(np.where(observed, logit, mean), np.where(observed, variances.ravel(), spread))
 
 
 class GaussianMRF(Prior):
@@ -197,4 +195,9 @@ class FreeCellEvidence(Prior):
 def _checked_strength(strength: float) -> Float[Array, ""]:
     if not (np.isfinite(strength) and strength >= 0):
         raise InputError(f"expected a finite number, at least 0, found {strength}", field="strength")
-    return jnp.asarray(strength, jnp.result_type(float))
+    return _as_floats(strength)
+
+
+def _as_floats(numbers: Numbers) -> Float[Array, "..."]:
+    # `jnp.asarray` would compile a function for each shape
+    return jax.device_put(np.asarray(numbers, jnp.result_type(float)))

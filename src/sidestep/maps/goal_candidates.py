@@ -59,9 +59,9 @@ class GoalPosterior(NamedTuple):
         """Return the numbers of `summary.json`."""
         return {
             "candidates": len(self.candidates),
-            "probabilities": self.fit.shares.tolist(),
+            "probabilities": self.fit.goal_probabilities.tolist(),
             "fraction_certain": float((self.fit.posterior.max(axis=1) > _CERTAIN).mean()),
-            "evidence": list(self.fit.evidence),
+            "evidence": list(self.fit.log_likelihoods),
             "converged": self.fit.converged,
         }
 

@@ -178,7 +178,7 @@ def _fit_walks(
         checkpoint=checkpoint,
         resume=resume,
     )
-    betas = {str(name): float(fit.people.behavior_of(index).beta) for index, name in enumerate(names or ())}
+    betas = {str(name): float(fit.behavior.behavior_of(index).beta) for index, name in enumerate(names or ())}
     return _WalkFit(config, fit, demonstrations, betas, None)
 
 

@@ -68,7 +68,7 @@ class Learning:
 
     def summary(self) -> dict[str, Any]:
         """Return the content of `summary.json`: plain numbers, texts, lists and dictionaries."""
-        final, behavior = self.fit.final, self.fit.people.behavior_of()
+        final, behavior = self.fit.final, self.fit.behavior.behavior_of()
         return {
             "settings": asdict(self.config),
             "sensor": self.sensor.source if self.sensor else None,

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sidestep.errors import ImproperTask, InputError, NotConverged
-from sidestep.inference.calibration import doubtful, effective_sample_ratio, scores
+from sidestep.inference.calibration import Dispersion, dispersion, effective_sample_ratio, score_statistics
 from sidestep.inference.priors import Normal
 from sidestep.io.demonstrations import demonstrations_from_moves
 from sidestep.io.gridding import Moves
@@ -151,7 +151,7 @@ def select_behavior(
     gains = _best(other).log_likelihood - _best(own).log_likelihood if other else None
     trial = (other if gains is not None and _is_worth_it(gains, own[0].moves) else own)[0]
     trial = _raise_beta(trial, attempt_if_proper)
-    below, _ = doubtful(trial.ratio, len(trial.log_likelihood), _STANDARD_ERRORS)
+    below = dispersion(trial.ratio, len(trial.log_likelihood), _STANDARD_ERRORS) is Dispersion.OVERDISPERSED
     behavior = replace(trial.config.behavior, tempering=trial.ratio if below else 1.0)
     selected = replace(trial.config, behavior=behavior)
     return Selection(selected, [*_reasons(selected, trial, gains, config), *passed_over], trials)
@@ -164,7 +164,7 @@ def _with_beta(config: MapConfig, beta: float) -> MapConfig:
 def _raise_beta(trial: Trial, attempt: Callable[[MapConfig], list[Trial]]) -> Trial:
     """Double β for as long as κ is above 1 and held-out walks become more probable."""
     for _ in range(_MAX_DOUBLINGS):
-        if not doubtful(trial.ratio, len(trial.log_likelihood), _STANDARD_ERRORS)[1]:
+        if dispersion(trial.ratio, len(trial.log_likelihood), _STANDARD_ERRORS) is not Dispersion.UNDERDISPERSED:
             break
         doubled = attempt(_with_beta(trial.config, 2 * trial.config.behavior.beta))
         if not doubled or doubled[0].log_likelihood.sum() <= trial.log_likelihood.sum():
@@ -210,8 +210,8 @@ def _cross_validate(
             kind, beta = "goal reward" if config.reward.step_cost is None else "step cost", config.behavior.beta
             notify(f"selecting: {kind}, β = {beta:g}, fold {fold + 1} of {fold_of.max() + 1}")
         fit = fit_map(model, demonstrations.with_only(fold_of != fold), config, cell_prior=cell_prior)
-        held_out, behavior = demonstrations.with_only(fold_of == fold), fit.people.behavior_of()
-        of_fold = scores(fit.model, held_out, behavior, options=SolveOptions(horizon=config.behavior.horizon))
+        held_out, behavior = demonstrations.with_only(fold_of == fold), fit.behavior.behavior_of()
+        of_fold = score_statistics(fit.model, held_out, behavior, options=SolveOptions(horizon=config.behavior.horizon))
         statistics.append(of_fold)
         lapses.append(0.0 if behavior.lapse is None else float(behavior.lapse))
         weights = np.asarray(held_out.weights)
