@@ -17,12 +17,12 @@ from collections.abc import Sequence
 from functools import partial
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
 from sidestep.errors import InputError
 from sidestep.robots.planners import ModelPlanner
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.grid import Cell
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.tasks import Task, reach
@@ -52,7 +52,7 @@ def mark_visited_free(model: ObstacleGrid, visited: Int[np.ndarray, " visits"] |
     known = np.array(model.known).reshape(-1)
     visited = np.asarray(visited, dtype=np.int64)
     known[visited[known[visited] == Cell.UNKNOWN]] = Cell.FREE
-    return eqx.tree_at(lambda model: model.known, model, jnp.asarray(known.reshape(model.known.shape)))
+    return eqx.tree_at(lambda model: model.known, model, to_jax(known.reshape(model.known.shape)))
 
 
 def risk_averse_task(model: ObstacleGrid, goal: int, bump_cost: float = BUMP_COST) -> Task:
@@ -69,7 +69,7 @@ def risk_averse_task(model: ObstacleGrid, goal: int, bump_cost: float = BUMP_COS
     if not (np.isfinite(bump_cost) and bump_cost >= 0):
         raise InputError(f"expected a number of at least 0, found {bump_cost}", field="bump_cost")
     task = reach(model.blank, goal, discount=1.0, step_cost=1.0)
-    states = jnp.arange(model.graph.states)[:, None, None]
-    fails = jnp.sum(jnp.where(model.graph.successors == states, model.probabilities(), 0), axis=-1)
+    probabilities, successors = np.asarray(model.probabilities()), np.asarray(model.graph.successors)
+    fails = np.where(successors == np.arange(len(successors))[:, None, None], probabilities, 0).sum(axis=-1)
     bumps = bump_cost * fails * (1 - fails + _FURTHER_BUMPS * fails)
-    return Task(task.reward - bumps, task.terminal_reward, task.terminal, task.discount)
+    return Task(to_jax(np.asarray(task.reward) - bumps), task.terminal_reward, task.terminal, task.discount)

@@ -5,14 +5,18 @@ A graph lists, for every state s and action a, the states that may follow: `succ
 state (their probabilities add up) and an outcome may be the state itself.
 """
 
+from typing import TYPE_CHECKING
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from scipy.sparse import csr_array
 
 from sidestep.errors import InputError
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.grid import Cell, Grid
+
+if TYPE_CHECKING:
+    import scipy.sparse
 
 
 class Graph(eqx.Module):
@@ -107,7 +111,7 @@ def moves_into(grid: Grid) -> Int[np.ndarray, "states actions 3"]:
     return np.stack([entered, *(np.where(straight, grid.size, side) for side in beside)], axis=-1)
 
 
-def walkable_graph(truth: Grid) -> csr_array:
+def walkable_graph(truth: Grid) -> "scipy.sparse.csr_array":
     """Return the legal moves between free cells of a map, as a sparse matrix of lengths in cell sides (1 or √2).
 
     Entry (s, s′) is the length of the move from state s to s′. Diagonals do not cut corners, and a cell that
@@ -116,6 +120,8 @@ def walkable_graph(truth: Grid) -> csr_array:
     >>> walkable_graph(Grid(np.array([[0, 0, 1]]))).toarray()[0].tolist()
     [0.0, 1.0, 0.0]
     """
+    from scipy.sparse import csr_array
+
     needed = moves_into(truth)
     legal = clear_moves(truth, needed) & free_cells(truth)[:, None]
     state, action = np.nonzero(legal)

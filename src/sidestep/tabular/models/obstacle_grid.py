@@ -10,6 +10,7 @@ are learned. In a **walled grid** it is the border between two cells that may be
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -181,6 +182,7 @@ def blocked_of(logits: Float[Array, " cells"], known: Int[Array, "rows columns"]
     return jnp.where(known == Cell.UNKNOWN, learned, (known == Cell.OCCUPIED).astype(learned.dtype))
 
 
+@partial(jax.jit, static_argnames="actions")
 def chances_of_moves(
     logits: Float[Array, " cells"], known: Int[Array, "rows columns"], actions: int
 ) -> Float[Array, "states actions outcomes"]:
