@@ -53,10 +53,10 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     truth = office(rows=12, columns=20, seed=0)
     blank = truth.forget()
-    people = ss.Behavior(ss.BoltzmannAverage(), beta=20.0)
+    behavior = ss.Behavior(ss.BoltzmannAverage(), beta=20.0)
     mesh = ss.tasks_mesh()
     found = ss.fit(
-        ss.ObstacleGrid(blank, -2.0), walks_in(truth, blank), people, mesh=mesh, optimizer=ss.LBFGS(max_iterations=20)
+        ss.ObstacleGrid(blank, -2.0), walks_in(truth, blank), behavior, mesh=mesh, optimizer=ss.LBFGS(max_iterations=20)
     )
     if jax.process_index() == 0:
         blocked = np.asarray(found.model.blocked).reshape(truth.shape)

@@ -20,8 +20,8 @@ tasks = [ss.reach(blank, goal, discount=1.0, step_cost=1.0) for goal in goals]
 starts = [np.setdiff1d(free, [goal])[::4] for goal in goals]
 demonstrations = ss.gather(ss.simulate(jax.random.key(0), world, tasks, starts), tasks)
 
-people = ss.Behavior(ss.BoltzmannAverage(), beta=3.0)
-found = ss.fit(ss.SlipperyGrid(blank), demonstrations, people, prior=ss.Normal(-2.0, 4.0)).model
+behavior = ss.Behavior(ss.BoltzmannAverage(), beta=3.0)
+found = ss.fit(ss.SlipperyGrid(blank), demonstrations, behavior, prior=ss.Normal(-2.0, 4.0)).model
 
 print(f"moves slip with probability {found.slip[0]:.2f}; the cells more probably blocked than not:")
 for row in np.asarray(found.blocked) > 0.5:

@@ -23,8 +23,8 @@ task = ss.reach(world.graph, goal=3, discount=0.9)
 walk = ss.Trajectory(states=np.arange(PLACES), actions=np.full(PLACES - 1, WALK), task=0)
 demonstrations = ss.gather([walk] * 20, [task])
 
-people = ss.Behavior(ss.BoltzmannAverage(), beta=10.0)
-fit = ss.fit(world, demonstrations, people, prior=ss.Normal(0.0, 2.0))
+behavior = ss.Behavior(ss.BoltzmannAverage(), beta=10.0)
+fit = ss.fit(world, demonstrations, behavior, prior=ss.Normal(0.0, 2.0))
 
 works = fit.model.probabilities()[:, :, 0]
 print(fit.message)

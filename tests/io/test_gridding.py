@@ -22,7 +22,7 @@ def cells_along(grid, *line, **options):
     """The cells of one walk, as (column, row from the bottom)."""
     moves = grid_walks(walk_along(line, **options), grid)
     np.testing.assert_array_equal(moves.next_states[:-1], moves.states[1:])
-    centers = grid.to_cell_units(grid.centres(np.append(moves.states[:1], moves.next_states)))
+    centers = grid.to_cell_units(grid.centers(np.append(moves.states[:1], moves.next_states)))
     return [tuple(cell) for cell in np.floor(centers).astype(int).tolist()]
 
 

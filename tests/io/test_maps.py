@@ -68,8 +68,8 @@ def test_read_map_of_color_png_uses_the_mean_of_channels(tmp_path):
 
 
 def test_read_map_transparent_pixels_are_unknown(tmp_path):
-    colour = np.array([[[0, 0, 0, 0], [0, 0, 0, 255], [255, 255, 255, 255]]], dtype=np.uint8)
-    assert read_map(make_map(tmp_path, colour, image="map.png")).known.tolist() == [[UNKNOWN, OCCUPIED, FREE]]
+    color = np.array([[[0, 0, 0, 0], [0, 0, 0, 255], [255, 255, 255, 255]]], dtype=np.uint8)
+    assert read_map(make_map(tmp_path, color, image="map.png")).known.tolist() == [[UNKNOWN, OCCUPIED, FREE]]
     two = Image.fromarray(np.array([[[0, 0], [0, 255], [255, 255]]], dtype=np.uint8), "LA")
     assert read_map(make_map(tmp_path, two, image="map.png")).known.tolist() == [[UNKNOWN, OCCUPIED, FREE]]
 

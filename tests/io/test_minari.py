@@ -119,20 +119,20 @@ def test_write_demonstrations_is_readable_by_minari():
 # A frozen lake
 
 
-def lake_policy(world, people):
-    return np.asarray(plan(world.model, world.task, people).policy)
+def lake_policy(world, behavior):
+    return np.asarray(plan(world.model, world.task, behavior).policy)
 
 
 def test_fit_of_stored_demonstrations_is_the_same():
-    env, people = gymnasium.make("FrozenLake-v1"), Behavior(BoltzmannAverage(), 30.0)
+    env, behavior = gymnasium.make("FrozenLake-v1"), Behavior(BoltzmannAverage(), 30.0)
     world = from_gymnasium(env, DISCOUNT)
-    policy = lake_policy(world, people)
+    policy = lake_policy(world, behavior)
     walked = collect(env, world, lambda state, random: random.choice(4, p=policy[state]), 50, seed=0)
     demonstrations, dataset = gather(walked, [world.task]), fresh("lake/people")
     write_demonstrations(dataset, demonstrations, world.model.graph)
     again = read_demonstrations(dataset, world.model.graph)
     first, second = (
-        fit(slippery(world, -3.0), each, people, prior=Normal(0.0, 5.0)) for each in (demonstrations, again)
+        fit(slippery(world, -3.0), each, behavior, prior=Normal(0.0, 5.0)) for each in (demonstrations, again)
     )
     assert first.final.objective == second.final.objective
     assert first.converged

@@ -39,7 +39,7 @@ def test_goals_that_walks_do_not_name_are_found_among_candidates(office, tmp_pat
     pyarrow.csv.write_csv(left, tmp_path / "walks.csv")
     own = np.unique(goals, axis=0)
     grid = read_map(office / "true.yaml")
-    nobody = grid.centres(np.setdiff1d(np.flatnonzero(grid.known.ravel() == 0), grid.states(own))[:1])
+    nobody = grid.centers(np.setdiff1d(np.flatnonzero(grid.known.ravel() == 0), grid.states(own))[:1])
     columns = dict(zip(("goal_x", "goal_y"), np.concatenate([own, nobody]).T, strict=True))
     pyarrow.csv.write_csv(pa.table(columns), tmp_path / "goals.csv")
 

@@ -113,8 +113,8 @@ def transitions_only(grid, demonstrations):
     """Where the transitions alone lead, and where walks begin."""
     begun = np.bincount(demonstrations.states[demonstrations.first_moves()], minlength=grid.size)
     prior = FreeCellEvidence(Normal(0.5, 4.0), jnp.asarray(np.where(grid.known.ravel() == -1, begun, 0.0)))
-    people = Behavior(LogSumExp(), 5.0)
-    return fit(ObstacleGrid(grid, 0.5), demonstrations, people, prior=prior, terms=("transitions",)).final
+    behavior = Behavior(LogSumExp(), 5.0)
+    return fit(ObstacleGrid(grid, 0.5), demonstrations, behavior, prior=prior, terms=("transitions",)).final
 
 
 @pytest.mark.usefixtures("everything_is_large")

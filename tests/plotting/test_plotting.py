@@ -178,7 +178,7 @@ def test_figure_environments_shows_true_maps_without_a_color_bar():
     assert [axes.get_title() for axes in figure.axes] == ["block", "wall"]  # and no colour bar
     for axes, world in zip(figure.axes, worlds, strict=True):
         np.testing.assert_array_equal(axes.images[0].get_array(), world.truth.known)
-        np.testing.assert_allclose(points(axes, "goal"), world.truth.centres(np.array(world.goals)))
+        np.testing.assert_allclose(points(axes, "goal"), world.truth.centers(np.array(world.goals)))
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["start", "goal"]
 
 

@@ -24,7 +24,7 @@ SOLVER = GaussSeidel(tolerance=1e-11)
 
 
 @eqx.filter_jit
-def values_and_slopes(model, wanted, people, start=None, solver=SOLVER):
+def values_and_slopes(model, wanted, agent, start=None, solver=SOLVER):
     """A solution, and the gradients of a sum over its values by the parameters and by the adjoint to start from."""
     if start is None:
         start = solver.cold_start(model.graph.states, model.probabilities().dtype)
@@ -32,7 +32,7 @@ def values_and_slopes(model, wanted, people, start=None, solver=SOLVER):
     def total(parameters, adjoint):
         begin = start._replace(adjoint=adjoint)
         found = solve(
-            model.with_parameters(parameters), wanted, people, options=SolveOptions(solver=solver), start=begin
+            model.with_parameters(parameters), wanted, agent, options=SolveOptions(solver=solver), start=begin
         )
         weights = jnp.cos(jnp.arange(found.values.size)).astype(found.values.dtype)
         return jnp.sum(weights * found.values), found
@@ -41,7 +41,7 @@ def values_and_slopes(model, wanted, people, start=None, solver=SOLVER):
     return found, *slopes
 
 
-def people(name, beta=5.0):
+def agent(name, beta=5.0):
     return Behavior(BACKUPS[name], beta)
 
 
@@ -53,9 +53,9 @@ def test_any_start_gives_the_same(name):
     """From a model nearby, from a wrong order, from values of no meaning, from what failed: as from nothing."""
     model, rng = some_map(), np.random.default_rng(1)
     wanted = reach(model.graph, 5, discount=1.0, step_cost=1.0)
-    cold, slope, adjoint = values_and_slopes(model, wanted, people(name))
+    cold, slope, adjoint = values_and_slopes(model, wanted, agent(name))
     moved = model.with_parameters(model.parameters + 0.1 * rng.normal(size=model.parameters.shape))
-    near, _, near_adjoint = values_and_slopes(moved, wanted, people(name))
+    near, _, near_adjoint = values_and_slopes(moved, wanted, agent(name))
     left = near.start._replace(adjoint=near_adjoint)
     noise = jnp.asarray(rng.normal(-10, 10, 420))
     starts = {
@@ -68,13 +68,13 @@ def test_any_start_gives_the_same(name):
         "the solution": cold.start._replace(adjoint=adjoint),
     }
     for label, start in starts.items():
-        found, its_slope, its_adjoint = values_and_slopes(model, wanted, people(name), start)
+        found, its_slope, its_adjoint = values_and_slopes(model, wanted, agent(name), start)
         assert found.converged, label
         assert relative_error(found.values, cold.values) < 1e-8, label
         assert relative_error(its_slope, slope) < 1e-7, label
         assert relative_error(its_adjoint, adjoint) < 1e-7, label
         assert sorted(found.start.order.tolist()) == list(range(420)), label
-    again, _, _ = values_and_slopes(model, wanted, people(name), starts["the solution"])
+    again, _, _ = values_and_slopes(model, wanted, agent(name), starts["the solution"])
     assert again.sweeps <= 2
 
 
@@ -87,7 +87,7 @@ def test_the_adjoint_solves_its_equation(name, first):
     everywhere = jnp.linspace(-1.0, 1.0, 12)
     adjoints = {"none": jnp.zeros(12), "all": everywhere, "few": jnp.zeros(12).at[jnp.asarray([3, 8])].set(2.0)}
     start = SOLVER.cold_start(12, jnp.dtype(jnp.float64))._replace(adjoint=adjoints[first])
-    found, _, adjoint = values_and_slopes(problem.model, wanted, people(name), start)
+    found, _, adjoint = values_and_slopes(problem.model, wanted, agent(name), start)
     weights = np.asarray(jax.vmap(jax.grad(BACKUPS[name].value), (0, None))(found.action_values, jnp.asarray(5.0)))
     transitions = np.asarray(problem.dense(problem.model.parameters))
     matrix = 0.95 * np.einsum("sa,sat->st", weights, transitions) * ~np.asarray(wanted.terminal)[:, None]
@@ -98,7 +98,7 @@ def test_the_adjoint_solves_its_equation(name, first):
 def test_a_start_that_another_solver_left():
     """Jacobi leaves no order."""
     model = some_map(4, 5)
-    wanted, behavior = reach(model.graph, 5), people("Boltzmann")
+    wanted, behavior = reach(model.graph, 5), agent("Boltzmann")
     start = solve(model, wanted, behavior, options=SolveOptions(solver=Jacobi())).start
     found = solve(model, wanted, behavior, options=SolveOptions(solver=SOLVER), start=start)
     assert found.converged
@@ -108,7 +108,7 @@ def test_a_start_that_another_solver_left():
 def test_traces_of_an_earlier_adjoint_are_forgotten():
     """Else states that do not matter any more would count as ones that do."""
     model = some_map()
-    wanted, behavior = reach(model.graph, 5, discount=0.9, step_cost=1.0), people("hard max")
+    wanted, behavior = reach(model.graph, 5, discount=0.9, step_cost=1.0), agent("hard max")
     start = SOLVER.cold_start(420, jnp.dtype(jnp.float64))
 
     def of_one_state(adjoint):
@@ -128,8 +128,8 @@ def test_traces_of_an_earlier_adjoint_are_forgotten():
 def test_states_are_counted_from_either_end_and_there_are_no_others(solver):
     model, wanted = some_map(), reach(Grid.unknown(20, 21), 5, discount=0.99)
     visited = jnp.asarray([3, -1, -420, 419, 1_000])
-    found = solve(model, wanted, people("Boltzmann"), options=SolveOptions(solver=solver), visited=visited)
-    every = solve(model, wanted, people("Boltzmann"), options=SolveOptions(solver=solver))
+    found = solve(model, wanted, agent("Boltzmann"), options=SolveOptions(solver=solver), visited=visited)
+    every = solve(model, wanted, agent("Boltzmann"), options=SolveOptions(solver=solver))
     np.testing.assert_array_equal(found.action_values, every.action_values[jnp.asarray([3, 419, 0, 419, 419])])
 
 
@@ -176,7 +176,7 @@ def test_nested_batches_and_loops():
 @pytest.mark.parametrize("name", ["hard max", "Boltzmann"])
 def test_32_bit_numbers_stay(name):
     problem = random_problem()
-    given = (problem.model, generic_task(problem, 0.9), people(name))
+    given = (problem.model, generic_task(problem, 0.9), agent(name))
     exact, exact_slope, _ = values_and_slopes(*given)
     narrow = jax.tree.map(lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, given)
     found, slope, adjoint = values_and_slopes(*narrow, solver=GaussSeidel())
@@ -195,7 +195,7 @@ def test_a_solve_that_was_stopped_says_so(name, most):
     model = some_map()
     wanted = reach(model.graph, 5, discount=0.999)
     solver = GaussSeidel(max_sweeps=most, tolerance=1e-14)
-    found, slope, _ = values_and_slopes(model, wanted, people(name, 0.5), solver=solver)
+    found, slope, _ = values_and_slopes(model, wanted, agent(name, 0.5), solver=solver)
     assert not found.converged
     assert jnp.isnan(slope).all()
 
@@ -204,13 +204,13 @@ def test_a_solve_that_was_stopped_says_so(name, most):
 @pytest.mark.parametrize("where", ["parameters", "reward", "beta"])
 def test_what_is_no_number_is_never_a_solution(name, where):
     model = some_map(4, 5)
-    wanted, behavior = reach(model.graph, 5), people(name)
+    wanted, behavior = reach(model.graph, 5), agent(name)
     if where == "parameters":
         model = model.with_parameters(model.parameters.at[3].set(jnp.nan))
     elif where == "reward":
         wanted = eqx.tree_at(lambda task: task.reward, wanted, jnp.full((1, 1), jnp.nan))
     else:
-        behavior = eqx.tree_at(lambda people: people.beta, behavior, jnp.asarray(jnp.nan))
+        behavior = eqx.tree_at(lambda agent: agent.beta, behavior, jnp.asarray(jnp.nan))
     found, slope, _ = values_and_slopes(model, wanted, behavior)
     assert not found.converged
     assert jnp.isnan(slope).all()
@@ -272,11 +272,11 @@ def test_a_start_nearby_is_not_given_up_though_it_takes_many_rounds():
 def test_a_start_is_trusted_for_a_while_even_if_no_tolerance_is_left():
     model = some_map()
     goal = reach(model.graph, 5, discount=0.99)
-    first = solve(model, goal, people("Boltzmann"), options=SolveOptions(solver=SOLVER))
+    first = solve(model, goal, agent("Boltzmann"), options=SolveOptions(solver=SOLVER))
     again = solve(
         model,
         goal,
-        people("Boltzmann"),
+        agent("Boltzmann"),
         options=SolveOptions(solver=GaussSeidel(tolerance=0.0, max_sweeps=50)),
         start=first.start,
     )

@@ -165,13 +165,13 @@ def test_log_likelihood_of_every_family_three_ways(family, name):
 
 
 def check_log_likelihood(graph, name, horizon):
-    model, demos, people = EVERY[graph].model, demonstrated(graph), Behavior(BACKUPS[name], BETA)
+    model, demos, behavior = EVERY[graph].model, demonstrated(graph), Behavior(BACKUPS[name], BETA)
 
     @jax.jit
     @jax.value_and_grad
     def ours(parameters):
         return log_likelihood(
-            model.with_parameters(parameters), demos, people, options=SolveOptions(horizon=horizon)
+            model.with_parameters(parameters), demos, behavior, options=SolveOptions(horizon=horizon)
         ).total
 
     plain = partial(unrolled_log_likelihood(graph), NAMES.index(name), horizon or ENOUGH)
@@ -226,13 +226,13 @@ def forward_programme(name: str, dense, parameters, task: Task, horizon):
 @cache
 def fixed_policy_jacobian(graph: str, name: str, horizon):
     """A compiled function of θ and a task: (dV/dθ, dQ/dθ), row by row by the custom VJP."""
-    model, people = PROBLEMS[graph].model, Behavior(BACKUPS[name], BETA)
+    model, behavior = PROBLEMS[graph].model, Behavior(BACKUPS[name], BETA)
 
     def values(parameters, task):
         found = solve(
             model.with_parameters(parameters),
             task,
-            people,
+            behavior,
             options=SolveOptions(horizon=horizon, gradient="fixed_policy"),
         )
         return found.values, found.action_values

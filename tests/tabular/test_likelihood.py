@@ -84,16 +84,16 @@ def test_outcomes_that_lead_to_the_same_state_add_up():
 def test_each_trajectory_is_judged_by_its_own_task():
     grid = Grid.unknown(1, 3)
     tasks = [reach(grid, 0, discount=0.5), reach(grid, 2, discount=0.5)]
-    model, people = ObstacleGrid(grid, -1.0), Behavior(HardMax(), BETA)
+    model, behavior = ObstacleGrid(grid, -1.0), Behavior(HardMax(), BETA)
     right = Trajectory(np.array([1, 2]), np.array([3]), 1)
     left = Trajectory(np.array([1, 0]), np.array([2]), 0)
     wrong_way = Trajectory(np.array([1, 2]), np.array([3]), 0)
     split_by_person = [
-        float(log_likelihood(model, gather([each], tasks), people).total) for each in (left, right, wrong_way)
+        float(log_likelihood(model, gather([each], tasks), behavior).total) for each in (left, right, wrong_way)
     ]
     assert split_by_person[0] == pytest.approx(split_by_person[1], rel=1e-12)
     assert split_by_person[2] < split_by_person[1]
-    together = log_likelihood(model, gather([left, wrong_way, right], tasks), people)
+    together = log_likelihood(model, gather([left, wrong_way, right], tasks), behavior)
     assert float(together.total) == pytest.approx(sum(split_by_person), rel=1e-12)
 
 

@@ -31,15 +31,15 @@ def test_cells_lie_where_the_design_says():
     grid = Grid(np.full((3, 4), U), resolution=0.5, origin=(10.0, -2.0, 0.0))
     for row in range(3):
         for column in range(4):
-            centre = np.array([[10 + (column + 0.5) * 0.5, -2 + (2 - row + 0.5) * 0.5]])
-            assert grid.states(centre).tolist() == [row * 4 + column]
-            np.testing.assert_allclose(grid.centres(np.array([row * 4 + column])), centre)
+            center = np.array([[10 + (column + 0.5) * 0.5, -2 + (2 - row + 0.5) * 0.5]])
+            assert grid.states(center).tolist() == [row * 4 + column]
+            np.testing.assert_allclose(grid.centers(np.array([row * 4 + column])), center)
 
 
 def test_a_turned_map():
     """A quarter turn: the map's columns run up, its rows (from the bottom) to the left."""
     grid = Grid(np.full((2, 3), U), origin=(1.0, 1.0, np.pi / 2))
-    np.testing.assert_allclose(grid.centres(np.array([3, 5, 0])), [[0.5, 1.5], [0.5, 3.5], [-0.5, 1.5]])
+    np.testing.assert_allclose(grid.centers(np.array([3, 5, 0])), [[0.5, 1.5], [0.5, 3.5], [-0.5, 1.5]])
     assert grid.contains(np.array([[0.5, 3.9], [1.5, 1.5]])).tolist() == [True, False]
 
 
@@ -48,7 +48,7 @@ def test_centres_and_states_are_inverse(seed, yaw, resolution):
     rng = np.random.default_rng(seed)
     grid = Grid(np.full(rng.integers(1, 9, 2), U), resolution, (*rng.normal(0, 20, 2).tolist(), yaw))
     states = np.arange(grid.size)
-    assert (grid.states(grid.centres(states)) == states).all()
+    assert (grid.states(grid.centers(states)) == states).all()
     inside = rng.uniform(0, 1, (20, 2)) * grid.shape[::-1]
     np.testing.assert_allclose(grid.to_cell_units(grid.to_metres(inside)), inside, atol=1e-8)
     assert grid.contains(grid.to_metres(inside)).all()

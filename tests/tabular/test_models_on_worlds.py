@@ -188,11 +188,11 @@ def test_a_closed_link_is_found_from_trips_around_it():
 def test_who_pays_by_length_does_not_try_turns_that_are_not_there():
     """Link 0 leads onto three links, link 1 onto the goal alone: its other two actions are no turns."""
     model = road_network(np.array([[0, 1], [0, 2], [0, 3], [1, 3], [2, 0]]), np.array([3.0, 1.0, 5.0, 0.5]), -20.0)
-    people = Behavior(BoltzmannAverage(), 2.0)
-    found = solve(model, reach(model.graph, 3, discount=1.0, step_cost=1.0), people)
+    behavior = Behavior(BoltzmannAverage(), 2.0)
+    found = solve(model, reach(model.graph, 3, discount=1.0, step_cost=1.0), behavior)
     assert found.converged
     np.testing.assert_allclose(found.values[1], -0.5, atol=1e-6)
-    np.testing.assert_allclose(np.exp(people.log_policy(found.action_values[1]))[1:], 0, atol=1e-6)
+    np.testing.assert_allclose(np.exp(behavior.log_policy(found.action_values[1]))[1:], 0, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -244,8 +244,8 @@ def learned_with_slips(flat, slips, terrain, goals):
     tasks = [reach(flat.forget(), goal, discount=1.0, step_cost=1.0) for goal in goals]
     starts = [random.choice(np.setdiff1d(free, [goal]), 10) for goal in goals]
     demos = gather(simulate(jax.random.key(0), world, tasks, starts), tasks)
-    people = Behavior(BoltzmannAverage(), 3.0)
-    found = fit(SlipperyGrid(flat.forget(), terrain=terrain), demos, people, prior=Normal(-2.0, 4.0))
+    behavior = Behavior(BoltzmannAverage(), 3.0)
+    found = fit(SlipperyGrid(flat.forget(), terrain=terrain), demos, behavior, prior=Normal(-2.0, 4.0))
     assert found.converged
     blocked, wall = np.asarray(found.model.blocked), flat.known == Cell.OCCUPIED
     assert blocked[wall].min() > 0.8

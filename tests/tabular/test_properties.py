@@ -69,11 +69,11 @@ def test_relabelling_states_changes_nothing(name, seed):
     new_name = np.argsort(order)
     renamed = TabularModel(graph(new_name[np.asarray(model.graph.successors)[order]]), model.parameters[order])
     reward, terminal = rng.normal(-1, 0.2, (7, 3)), np.arange(7) == 0
-    gamma, people = jnp.asarray(0.95), Behavior(BACKUPS[name], 5.0)
+    gamma, behavior = jnp.asarray(0.95), Behavior(BACKUPS[name], 5.0)
     old = Task(jnp.asarray(reward), jnp.ones(7), jnp.asarray(terminal), gamma)
     new = Task(jnp.asarray(reward[order]), jnp.ones(7), jnp.asarray(terminal[order]), gamma)
-    expected = solve_jit(model, old, people).values[order]
-    np.testing.assert_allclose(solve_jit(renamed, new, people).values, expected, rtol=1e-7)
+    expected = solve_jit(model, old, behavior).values[order]
+    np.testing.assert_allclose(solve_jit(renamed, new, behavior).values, expected, rtol=1e-7)
 
 
 @given(seed=seeds, connectivity=connectivities, form=forms)
@@ -105,12 +105,12 @@ def random_demonstrations(rng, copies: int) -> Demonstrations:
 
 @each_backup
 def test_copies_of_tasks_and_trajectories_double_the_likelihood(name):
-    model, people = random_problem(states=7).model, Behavior(BACKUPS[name], 5.0)
+    model, behavior = random_problem(states=7).model, Behavior(BACKUPS[name], 5.0)
 
     @jax.jit
     @partial(jax.value_and_grad, has_aux=True)
     def likelihood(parameters, demos):
-        found = log_likelihood(model.with_parameters(parameters), demos, people)
+        found = log_likelihood(model.with_parameters(parameters), demos, behavior)
         return found.total, found
 
     once, twice = (

@@ -36,13 +36,13 @@ def task():
 
 
 @eqx.filter_jit
-def likelihood_like(model, people, visited, start, region, solver: Solver = SOLVER):
+def likelihood_like(model, behavior, visited, start, region, solver: Solver = SOLVER):
     """A sum over the visited states' action values: (sum, solution), its gradient by the parameters, and λ."""
 
     def total(parameters, adjoint):
         begin = start._replace(adjoint=adjoint)
         varied, options = model.with_parameters(parameters), SolveOptions(solver=solver)
-        found = solve(varied, task(), people, options=options, start=begin, region=region)
+        found = solve(varied, task(), behavior, options=options, start=begin, region=region)
         wanted = found.action_values[visited]
         return jnp.sum(jnp.cos(jnp.arange(wanted.size)) * wanted.ravel()), found
 
@@ -53,10 +53,10 @@ def all_states():
     return jnp.ones(TRUTH.size, dtype=bool)
 
 
-def solved_nearby(people, visited):
+def solved_nearby(behavior, visited):
     """What a solve of the model nearby left to start from."""
     cold = SOLVER.cold_start(TRUTH.size, jnp.dtype(jnp.float64))
-    (_, found), (_, adjoint) = likelihood_like(NEARBY, people, visited, cold, all_states())
+    (_, found), (_, adjoint) = likelihood_like(NEARBY, behavior, visited, cold, all_states())
     return found.start._replace(adjoint=adjoint)
 
 
@@ -72,12 +72,12 @@ def test_where_nothing_is_known_all_states_matter():
 
 @pytest.mark.parametrize("name", [name for name in BACKUPS if name != "hard max"])
 def test_states_that_do_not_matter_are_not_solved_and_make_no_difference(name):
-    people, visited = Behavior(BACKUPS[name], 5.0), near_the_goal()
-    start = solved_nearby(people, visited)
+    behavior, visited = Behavior(BACKUPS[name], 5.0), near_the_goal()
+    start = solved_nearby(behavior, visited)
     region = np.asarray(start.region)
     assert 0 < region.mean() < 0.7
-    (whole, solved), (slope, adjoint) = likelihood_like(MODEL, people, visited, start, all_states())
-    (part, found), (its_slope, its_adjoint) = likelihood_like(MODEL, people, visited, start, start.region)
+    (whole, solved), (slope, adjoint) = likelihood_like(MODEL, behavior, visited, start, all_states())
+    (part, found), (its_slope, its_adjoint) = likelihood_like(MODEL, behavior, visited, start, start.region)
     assert found.converged
     assert part == pytest.approx(float(whole), rel=1e-8)
     assert relative_error(its_slope, slope) < 1e-6
@@ -86,27 +86,27 @@ def test_states_that_do_not_matter_are_not_solved_and_make_no_difference(name):
     # the others have moved along, but one sweep is not enough
     behind, before = (jnp.abs(values - solved.values)[~region].mean() for values in (found.values, start.values))
     assert behind < before / 3
-    equations = people.backup.value(found.action_values, people.beta) - found.values
+    equations = behavior.backup.value(found.action_values, behavior.beta) - found.values
     assert jnp.abs(equations)[~region].max() > 1e-6
 
 
 def test_from_values_of_no_use_all_states_are_solved():
-    people, visited = Behavior(BACKUPS["Boltzmann"], 5.0), near_the_goal()
+    behavior, visited = Behavior(BACKUPS["Boltzmann"], 5.0), near_the_goal()
     cold = SOLVER.cold_start(TRUTH.size, jnp.dtype(jnp.float64))
-    (whole, solved), (slope, _) = likelihood_like(MODEL, people, visited, cold, all_states())
-    for label, region in {"some": solved_nearby(people, visited).region, "none": ~all_states()}.items():
-        (part, found), (its_slope, _) = likelihood_like(MODEL, people, visited, cold, region)
+    (whole, solved), (slope, _) = likelihood_like(MODEL, behavior, visited, cold, all_states())
+    for label, region in {"some": solved_nearby(behavior, visited).region, "none": ~all_states()}.items():
+        (part, found), (its_slope, _) = likelihood_like(MODEL, behavior, visited, cold, region)
         np.testing.assert_array_equal(found.values, solved.values, err_msg=label)
         assert part == whole, label
         assert relative_error(its_slope, slope) < 1e-9, label
 
 
 def test_sweeps_over_all_states_at_once_leave_none_out():
-    people, visited = Behavior(BACKUPS["Boltzmann"], 5.0), near_the_goal()
-    start = solved_nearby(people, visited)._replace(order=jnp.zeros(0, jnp.int32))
+    behavior, visited = Behavior(BACKUPS["Boltzmann"], 5.0), near_the_goal()
+    start = solved_nearby(behavior, visited)._replace(order=jnp.zeros(0, jnp.int32))
     solver = Jacobi(tolerance=1e-9)
-    (whole, _), (slope, _) = likelihood_like(MODEL, people, visited, start, all_states(), solver)
-    (part, _), (its_slope, _) = likelihood_like(MODEL, people, visited, start, start.region, solver)
+    (whole, _), (slope, _) = likelihood_like(MODEL, behavior, visited, start, all_states(), solver)
+    (part, _), (its_slope, _) = likelihood_like(MODEL, behavior, visited, start, start.region, solver)
     assert part == whole
     np.testing.assert_array_equal(its_slope, slope)
 
@@ -151,12 +151,12 @@ def test_what_leaving_a_state_out_costs(name):
 
 
 def test_solve_gradient_after_too_many_sweeps_with_a_region_is_nan():
-    people, visited = Behavior(BACKUPS["Boltzmann"], 5.0), near_the_goal()
-    start = solved_nearby(people, visited)._replace(adjoint=jnp.zeros(TRUTH.size))
+    behavior, visited = Behavior(BACKUPS["Boltzmann"], 5.0), near_the_goal()
+    start = solved_nearby(behavior, visited)._replace(adjoint=jnp.zeros(TRUTH.size))
     all_but_one = all_states().at[int(FREE[-1])].set(False)
     for most, region, given_up in ((100, all_but_one, False), (1, all_but_one, True), (1, all_states(), False)):
         solver = GaussSeidel(tolerance=1e-9, max_region_sweeps=most)
-        (_, found), (slope, _) = likelihood_like(MODEL, people, visited, start, region, solver)
+        (_, found), (slope, _) = likelihood_like(MODEL, behavior, visited, start, region, solver)
         assert found.converged
         assert bool(jnp.isnan(slope).all()) == given_up
 
@@ -165,7 +165,7 @@ def test_solve_gradient_after_too_many_sweeps_with_a_region_is_nan():
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_tasks_of_a_batch_have_regions_of_their_own(gradient, dtype):
     """As each by itself; also with a discount below 1."""
-    grid, people = TRUTH.forget(), Behavior(BACKUPS["log-sum-exp"], 5.0)
+    grid, behavior = TRUTH.forget(), Behavior(BACKUPS["log-sum-exp"], 5.0)
     model = MODEL.with_parameters(MODEL.parameters.astype(dtype))
     tasks = stack_tasks(
         [reach(grid, int(FREE[0]), discount=1.0, step_cost=1.0), reach(grid, int(FREE[-1]), discount=0.9)]
@@ -176,12 +176,12 @@ def test_tasks_of_a_batch_have_regions_of_their_own(gradient, dtype):
 
     def total(adjoint, tasks, visited, start, region):
         begin = start._replace(adjoint=adjoint)
-        solution = solve(model, tasks, people, options=options, start=begin, visited=visited, region=region)
+        solution = solve(model, tasks, behavior, options=options, start=begin, visited=visited, region=region)
         return jnp.sum(solution.action_values)
 
     cold = solver.cold_start(TRUTH.size, jnp.dtype(dtype))
     start = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), cold)
-    start = solve(model, tasks, people, options=options, start=start).start
+    start = solve(model, tasks, behavior, options=options, start=start).start
     adjoint = jax.grad(total)(start.adjoint, tasks, visited, start, jnp.ones_like(start.region))
     start = start._replace(adjoint=adjoint)
     assert 0 < start.region[0].mean() < 0.7

@@ -29,7 +29,7 @@ from sidestep.tabular.tasks import Task, reach, stack_tasks, task, with_state_co
 each_backup = pytest.mark.parametrize("name", BACKUPS)
 
 
-def people(name: str, beta: float = 10.0) -> Behavior:
+def agent(name: str, beta: float = 10.0) -> Behavior:
     return Behavior(BACKUPS[name], beta)
 
 
@@ -50,7 +50,7 @@ def corridor(cells: int, logits) -> ObstacleGrid:
 def test_corridor_with_a_goal_that_pays(blocked, gamma, cells):
     """V = (γ(1−p)/(1−γp))^d."""
     model = corridor(cells, logit(blocked))
-    found = solve_jit(model, reach(model_grid(cells), 0, discount=gamma), people("hard max"))
+    found = solve_jit(model, reach(model_grid(cells), 0, discount=gamma), agent("hard max"))
     distance = np.arange(cells)
     assert found.converged
     np.testing.assert_allclose(found.values, (gamma * (1 - blocked) / (1 - gamma * blocked)) ** distance, rtol=1e-8)
@@ -65,7 +65,7 @@ def model_grid(cells: int) -> Grid:
 def test_corridor_with_a_step_cost(blocked, cells, beta):
     """V = −d/(1−p) at discount 1."""
     model = corridor(cells, logit(blocked))
-    found = solve_jit(model, reach(model_grid(cells), 0, discount=1.0, step_cost=1.0), people("hard max", beta))
+    found = solve_jit(model, reach(model_grid(cells), 0, discount=1.0, step_cost=1.0), agent("hard max", beta))
     assert found.converged
     np.testing.assert_allclose(found.values, -np.arange(cells) / (1 - blocked), rtol=1e-8)
 
@@ -77,7 +77,7 @@ def test_equal_actions(name):
     successors = np.tile([1, 0], (2, n, 1))
     logits = jnp.tile(jnp.log(jnp.asarray([1 - p, p])), (2, n, 1))
     ends = Task(jnp.full((1, 1), r), jnp.asarray([0.0, final]), jnp.asarray([False, True]), jnp.asarray(gamma))
-    found = solve_jit(TabularModel(graph(successors), logits), ends, people(name, beta))
+    found = solve_jit(TabularModel(graph(successors), logits), ends, agent(name, beta))
     bonus = np.log(n) / beta if name == "log-sum-exp" else 0
     assert float(found.values[0]) == pytest.approx((r + gamma * (1 - p) * final + bonus) / (1 - gamma * p), rel=1e-9)
 
@@ -95,7 +95,7 @@ def test_leaving_or_staying(name):
     """One action reaches the goal, the other stays for good: V = B(γ, γV), a scalar equation."""
     gamma, beta = 0.9, 4.0
     model = TabularModel(graph(np.array([[[1], [0]], [[1], [1]]])), jnp.zeros((2, 2, 1)))
-    found = solve_jit(model, reach(model.graph, 1, discount=gamma), people(name, beta))
+    found = solve_jit(model, reach(model.graph, 1, discount=gamma), agent(name, beta))
     expected = brentq(lambda v: ESCAPE_OR_STAY[name](gamma, gamma * v, beta) - v, 0, 5, xtol=1e-14)
     assert float(found.values[0]) == pytest.approx(expected, rel=1e-9)
 
@@ -120,7 +120,7 @@ def test_hard_max_is_the_best_of_all_policies(rows, columns, gamma, cost):
     pay = np.full(grid.size, -cost if cost else 0.0)
     pay[0] = 0 if cost else 1
     values = np.linalg.solve(matrix[ends], np.broadcast_to(pay, (ends.sum(), grid.size))[..., None])[..., 0]
-    np.testing.assert_allclose(solve(model, goal, people("hard max")).values, values.max(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(solve(model, goal, agent("hard max")).values, values.max(axis=0), rtol=1e-9)
 
 
 def test_log_sum_exp_sums_over_paths():
@@ -128,7 +128,7 @@ def test_log_sum_exp_sums_over_paths():
     grid = Grid(np.zeros((2, 3), dtype=np.int64))
     beta, cost = 8.0, 1.0
     wanted = reach(grid, 5, discount=1.0, step_cost=cost)
-    found = solve_jit(true_model(grid), wanted, people("log-sum-exp", beta))
+    found = solve_jit(true_model(grid), wanted, agent("log-sum-exp", beta))
     successors = np.asarray(true_model(grid).graph.successors)[:, :, 0]
 
     def weight(state: int, left: int) -> float:
@@ -142,7 +142,7 @@ def test_log_sum_exp_sums_over_paths():
     sums = np.array([weight(state, 8) for state in range(6)])
     np.testing.assert_allclose(found.values, np.log(sums) / beta, rtol=1e-9, atol=1e-12)
     along = [(0, 3), (1, 3), (2, 1)]  # right, right, down
-    log_policy = people("log-sum-exp", beta).log_policy(found.action_values)
+    log_policy = agent("log-sum-exp", beta).log_policy(found.action_values)
     chance = sum(float(log_policy[s, a]) for s, a in along)
     assert chance == pytest.approx(-3 * beta * cost - np.log(sums[0]), rel=1e-9)
 
@@ -154,7 +154,7 @@ def test_finite_horizon_sums_over_action_sequences():
     reward = np.random.default_rng(2).normal(size=(4, 4))
     wanted = task(reward, gamma, np.arange(4) == 3)
     successors = np.asarray(true_model(grid).graph.successors)[:, :, 0]
-    found = solve_jit(true_model(grid), wanted, people("hard max", beta), options=SolveOptions(horizon=horizon))
+    found = solve_jit(true_model(grid), wanted, agent("hard max", beta), options=SolveOptions(horizon=horizon))
 
     def best(state: int) -> float:
         returns = []
@@ -180,10 +180,10 @@ def test_extremes_are_finite_and_solve_the_bellman_equation(name, beta, spread, 
     grid = Grid.unknown(5, 5)
     theta = jnp.asarray(np.random.default_rng(4).uniform(-spread, spread, grid.size))
     wanted = reach(grid, 12, discount=gamma, step_cost=cost)
-    values, slope = value_and_gradient(ObstacleGrid(grid), theta, wanted, people(name, beta))
+    values, slope = value_and_gradient(ObstacleGrid(grid), theta, wanted, agent(name, beta))
     assert np.isfinite(values).all()
     assert np.isfinite(slope).all()
-    found = solve_jit(ObstacleGrid(grid, theta), wanted, people(name, beta))
+    found = solve_jit(ObstacleGrid(grid, theta), wanted, agent(name, beta))
     assert found.converged
     assert residual(name, found, wanted, beta) < 1e-8
 
@@ -198,7 +198,7 @@ def test_walls_of_logit_40_are_walls(name, beta):
     grid = Grid.unknown(5, 5)
     theta = jnp.where(WALLS.reshape(-1) == 1, 40.0, -40.0)
     wanted = reach(grid, 0, discount=1.0, step_cost=1.0)
-    values, slope = value_and_gradient(ObstacleGrid(grid), theta, wanted, people(name, beta))
+    values, slope = value_and_gradient(ObstacleGrid(grid), theta, wanted, agent(name, beta))
     free = WALLS == 0
     steps = shortest_paths(free)
     np.testing.assert_allclose(-values.reshape(5, 5)[free], steps[free], atol=np.log(4) / beta * 20)
@@ -239,7 +239,7 @@ def test_nearly_blocked_corridor():
     """P(free) = 1e−9: each of 20 cells takes 1e9 tries; dV/dθ = −P(blocked)/P(free)."""
     theta = jnp.full(20, logit(1 - 1e-9))
     wanted = reach(model_grid(20), 0, discount=1.0, step_cost=1.0)
-    values, slope = value_and_gradient(corridor(20, 0.0), theta, wanted, people("hard max"))
+    values, slope = value_and_gradient(corridor(20, 0.0), theta, wanted, agent("hard max"))
     tries = 1 + np.exp(float(theta[0]))
     np.testing.assert_allclose(values, -np.arange(20) * tries, rtol=1e-9)
     np.testing.assert_allclose(slope, -(tries - 1) * np.arange(19, -1, -1), rtol=1e-8)
@@ -250,7 +250,7 @@ def test_nearly_blocked_corridor():
 def test_nearly_blocked_grid_takes_few_sweeps(name, theta):
     """The longest path has 18 steps; plain sweeps would need thousands."""
     grid = Grid.unknown(10, 10)
-    found = solve_jit(ObstacleGrid(grid, theta), reach(grid, 0, discount=1.0, step_cost=1.0), people(name))
+    found = solve_jit(ObstacleGrid(grid, theta), reach(grid, 0, discount=1.0, step_cost=1.0), agent(name))
     assert found.converged
     assert found.sweeps <= 40
 
@@ -265,11 +265,11 @@ def test_a_solve_that_did_not_converge_is_never_used(solver):
     @jax.value_and_grad
     def likelihood(theta):
         return log_likelihood(
-            ObstacleGrid(grid, theta), demos, people("Boltzmann"), options=SolveOptions(solver=solver)
+            ObstacleGrid(grid, theta), demos, agent("Boltzmann"), options=SolveOptions(solver=solver)
         ).total
 
     value, slope = likelihood(jnp.zeros(12))
-    found = solve_jit(ObstacleGrid(grid, 0.0), demos.tasks, people("Boltzmann"), options=SolveOptions(solver=solver))
+    found = solve_jit(ObstacleGrid(grid, 0.0), demos.tasks, agent("Boltzmann"), options=SolveOptions(solver=solver))
     stopped = solver is not None
     assert bool(found.converged.all()) is not stopped
     assert bool(jnp.isnan(value)) is stopped
@@ -284,7 +284,7 @@ def test_an_adjoint_that_did_not_converge_gives_nan():
     @jax.jit
     @partial(jax.grad, has_aux=True)
     def slope_and_converged(theta):
-        found = solve(corridor(12, theta), wanted, people("hard max"), options=SolveOptions(solver=solver))
+        found = solve(corridor(12, theta), wanted, agent("hard max"), options=SolveOptions(solver=solver))
         return found.values.sum(), found.converged
 
     slope, converged = slope_and_converged(jnp.zeros(12))
@@ -301,7 +301,7 @@ def test_enclosed_cells_at_discount_1(name):
     enclosed, walls = np.array([0, 1, 5, 6]), np.flatnonzero(known == Cell.OCCUPIED)
     wanted = reach(grid, 19, discount=1.0, step_cost=1.0)
     theta = jnp.zeros(grid.size)
-    values, slope = value_and_gradient(ObstacleGrid(grid), theta, wanted, people(name))
+    values, slope = value_and_gradient(ObstacleGrid(grid), theta, wanted, agent(name))
     assert (values[enclosed] <= 0.9 * neg_inf(jnp.dtype(jnp.float64))).all()
     others = np.setdiff1d(np.arange(grid.size), [*enclosed, *walls])
     assert (values[others] > -100).all()
@@ -316,9 +316,9 @@ def test_numbers_keep_their_precision(name, dtype):
     """A model, a task and people in 32-bit numbers give good 32-bit values, 64-bit switched on."""
     problem = random_problem()
     wanted = reach(problem.model.graph, 0)
-    exact = solve_jit(problem.model, wanted, people(name))
+    exact = solve_jit(problem.model, wanted, agent(name))
     inputs = jax.tree.map(
-        lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, (problem.model, wanted, people(name))
+        lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, (problem.model, wanted, agent(name))
     )
     found = solve_jit(*inputs)
     assert found.values.dtype == found.action_values.dtype == found.residual.dtype == dtype
@@ -338,7 +338,7 @@ def test_numbers_keep_their_precision(name, dtype):
 ])  # fmt: skip
 def test_improper_soft_tasks(name, cost, refused):
     """log(4)/β = 1 is what a choice among four is worth; a stack is refused for one such task in it."""
-    behavior = people(name, float(np.log(4)))
+    behavior = agent(name, float(np.log(4)))
     grid = Grid.unknown(2, 2)
     tasks = [reach(grid, 0), reach(grid, 0, discount=1.0, step_cost=cost)]
     for each in (tasks[1], stack_tasks(tasks)):
@@ -354,16 +354,16 @@ def test_improper_soft_tasks(name, cost, refused):
 def test_discount_1_needs_an_end_and_a_cost():
     nowhere = task(np.full(3, -1.0), 1.0, np.zeros(3, dtype=bool))
     with pytest.raises(ImproperTask, match="terminal"):
-        check_proper(nowhere, people("hard max"), actions=2)
+        check_proper(nowhere, agent("hard max"), actions=2)
     one_free = task(np.array([[-1.0, 0.0], [-1.0, -1.0], [0.0, 0.0]]), 1.0, np.arange(3) == 2)
     with pytest.raises(ImproperTask, match="cost"):
-        check_proper(one_free, people("hard max"), actions=2)
+        check_proper(one_free, agent("hard max"), actions=2)
 
 
 def test_horizon_must_be_an_action_at_least():
     grid = Grid.unknown(2, 2)
     with pytest.raises(InputError, match="horizon"):
-        solve(ObstacleGrid(grid), reach(grid, 0), people("hard max"), options=SolveOptions(horizon=0))
+        solve(ObstacleGrid(grid), reach(grid, 0), agent("hard max"), options=SolveOptions(horizon=0))
 
 
 # Any model
@@ -384,7 +384,7 @@ def test_values_solve_the_bellman_equation(name, seed, cost, kind):
         model = ObstacleGrid(world, jnp.asarray(rng.normal(0, 4, 12).clip(max=5)))
     gamma = float(rng.uniform(0.5, 0.99))
     wanted = reach(world, goal, discount=1.0 if cost else gamma, step_cost=1.0 if cost else None)
-    found = solve_jit(model, wanted, people(name, beta))
+    found = solve_jit(model, wanted, agent(name, beta))
     assert found.converged
     assert residual(name, found, wanted, beta) < 1e-8
 
@@ -398,9 +398,7 @@ def test_values_that_swing_come_to_rest(dtype, close):
     wanted = reach(grid, goal, discount=1.0, step_cost=1.0)
 
     def total(logits, solver):
-        found = solve(
-            ObstacleGrid(grid, logits), wanted, people("Boltzmann", beta), options=SolveOptions(solver=solver)
-        )
+        found = solve(ObstacleGrid(grid, logits), wanted, agent("Boltzmann", beta), options=SolveOptions(solver=solver))
         return found.values.sum(), found
 
     (_, found), slope = jax.value_and_grad(total, has_aux=True)(logits, Jacobi())
@@ -418,7 +416,7 @@ def test_a_long_way_takes_no_more_sweeps_than_steps(name):
     found = solve(
         ObstacleGrid(grid),
         reach(grid, 0, discount=1.0, step_cost=1.0),
-        people(name, 5.0),
+        agent(name, 5.0),
         options=SolveOptions(solver=Jacobi()),
     )
     assert found.converged
@@ -434,8 +432,8 @@ def test_values_that_were_far_too_high_come_down(name, solver):
     cheap, dear = (
         with_state_costs(reach(grid, 0), share * costs, model.graph.successors[..., 0]) for share in (0.2, 0.8)
     )
-    before = solve(model, cheap, people(name, 7.0), options=SolveOptions(solver=solver))
-    warm = solve(model, dear, people(name, 7.0), options=SolveOptions(solver=solver), start=before.start)
-    cold = solve(model, dear, people(name, 7.0), options=SolveOptions(solver=solver))
+    before = solve(model, cheap, agent(name, 7.0), options=SolveOptions(solver=solver))
+    warm = solve(model, dear, agent(name, 7.0), options=SolveOptions(solver=solver), start=before.start)
+    cold = solve(model, dear, agent(name, 7.0), options=SolveOptions(solver=solver))
     assert warm.converged
     np.testing.assert_allclose(warm.values, cold.values, rtol=1e-6, atol=1e-8)

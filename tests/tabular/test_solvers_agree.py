@@ -25,13 +25,13 @@ each_backup = pytest.mark.parametrize("name", BACKUPS)
 
 
 @eqx.filter_jit
-def solved(model, tasks, people, solver, gradient: Gradient = "exact"):
+def solved(model, tasks, agent, solver, gradient: Gradient = "exact"):
     """A stack of tasks solved, and each task's gradient of a weighted sum of its values, by everything."""
 
     def total(inputs, terminal):
         parameters, reward, final, discount, beta = inputs
         wanted = Task(reward, final, terminal, discount)
-        behavior = Behavior(people.backup, beta)
+        behavior = Behavior(agent.backup, beta)
         found = solve(
             model.with_parameters(parameters), wanted, behavior, options=SolveOptions(solver=solver, gradient=gradient)
         )
@@ -39,16 +39,16 @@ def solved(model, tasks, people, solver, gradient: Gradient = "exact"):
         return jnp.sum(weights * jnp.where(found.values > -1e100, found.values, 0)), found
 
     def one(task):
-        inputs = (model.parameters, task.reward, task.terminal_reward, task.discount, people.beta)
+        inputs = (model.parameters, task.reward, task.terminal_reward, task.discount, agent.beta)
         slopes, found = jax.grad(total, has_aux=True)(inputs, task.terminal)
         return found, dict(zip(("parameters", "reward", "final", "discount", "beta"), slopes, strict=True))
 
     return jax.vmap(one)(tasks)
 
 
-def agree(model, tasks, people, close, gradient: Gradient = "exact"):
+def agree(model, tasks, agent, close, gradient: Gradient = "exact"):
     """Checks that both converge to the same values and gradients; returns the solution in the order of distance."""
-    (expected, slopes), (found, ours) = (solved(model, tasks, people, solver, gradient) for solver in SOLVERS)
+    (expected, slopes), (found, ours) = (solved(model, tasks, agent, solver, gradient) for solver in SOLVERS)
     assert expected.converged.all()
     assert found.converged.all()
     lost = np.asarray(expected.values) < -1e100

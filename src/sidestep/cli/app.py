@@ -18,7 +18,7 @@ from sidestep.cli.simulate import simulate
 from sidestep.errors import SidestepError
 
 app = typer.Typer(
-    help="Learn obstacles that no walk touched from the walks of people who know them.",
+    help="Learn obstacles that no walk touched from walks of people that know them.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
@@ -96,7 +96,7 @@ def main(arguments: list[str] | None = None) -> int:
     except SidestepError as error:
         message = f"error: {error}"
     except Exception as error:
-        # a defect of the program: one line, and the details for those who ask
+        # a defect of the program: one line, and the details on request
         if os.environ.get("SIDESTEP_DEBUG"):
             raise
         message = (

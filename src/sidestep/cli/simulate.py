@@ -48,7 +48,7 @@ def simulate(
         "walks": str(out),
         "settings": {**asdict(config), "connectivity": grid.connectivity},
         "moves": moves,
-        "goals": grid.centres(np.array(states)).tolist(),
+        "goals": grid.centers(np.array(states)).tolist(),
     }
     write_json(out.with_suffix(".summary.json"), summary)
     print_lines(f"{walks} walks, {moves} moves, in {out}")

@@ -103,7 +103,7 @@ class _World(eqx.Module):
 
 @eqx.filter_jit
 def _simulate(world: _World, starts: Array, keys: Key[Array, " agents"], moves: int) -> tuple[Array, Array, Array]:
-    """Return states, choices, and whether the task had not ended, of all agents at all moves."""
+    """Return states, choices, and whether the task had not ended, of every agent at every move."""
 
     def move(carry: tuple[Array, Array], key: PRNGKeyArray) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:
         state, over = carry

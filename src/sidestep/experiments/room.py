@@ -125,7 +125,7 @@ def fit_field(
 def blocked_map(dynamics: ObstacleMotion, world: Room) -> Float[np.ndarray, "rows columns"]:
     """Return P(blocked) at the center of every small cell."""
     cells = world.cells
-    places = jnp.asarray(cells.centres(np.arange(cells.size)))
+    places = jnp.asarray(cells.centers(np.arange(cells.size)))
     return np.asarray(jax.vmap(dynamics.blocked)(places)).reshape(cells.shape)
 
 

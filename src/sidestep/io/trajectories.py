@@ -27,7 +27,7 @@ def walks_from_trajectories(trajectories: Sequence[Trajectory], goals: Sequence[
     # the action before each row; -1 for the first row of a walk
     actions = np.concatenate([np.append(-1, trajectory.actions) for trajectory in trajectories])
     failed = (actions >= 0) & (states == np.append(-1, states[:-1]))
-    center, goal_center = grid.centres(states), grid.centres(goal)
+    center, goal_center = grid.centers(states), grid.centers(goal)
     row_down, column = grid.steps[actions].T
     intended = grid.to_metres(grid.to_cell_units(center) + np.stack([column, -row_down], axis=-1))
     columns = {

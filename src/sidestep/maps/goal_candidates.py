@@ -152,7 +152,7 @@ def write_goal_posterior(path: Path, posterior: GoalPosterior, grid: Grid) -> No
 
     from sidestep.io.tables import write_table
 
-    count, positions = len(posterior.candidates), grid.centres(posterior.candidates)
+    count, positions = len(posterior.candidates), grid.centers(posterior.candidates)
     goal_x, goal_y = np.tile(positions, (len(posterior.walks), 1)).T
     labels = [label for label in posterior.labels for _ in range(count)]
     probability = posterior.fit.posterior.ravel()

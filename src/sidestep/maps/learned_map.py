@@ -109,7 +109,7 @@ class LearnedMap:
         states = self.robot(bump_cost).plan_to(last).paths_from(np.array([first]))[0]
         if states[-1] != last:
             raise InputError(f"expected a path from {start} to {goal} in the learned map, found none", field="goal")
-        positions = self.grid.centres(states)
+        positions = self.grid.centers(states)
         length = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
         return PlannedPath(states, positions, self.blocked.reshape(-1)[states], length)
 
@@ -140,7 +140,7 @@ class LearnedMap:
         return {"connectivity": self.grid.connectivity, **summary}
 
     def save(self, folder: str | Path, **entries: Any) -> None:
-        """Write the map to a folder, each file whole or not at all, `summary.json` last.
+        """Write the map to a folder, each file whole, `summary.json` last.
 
         A learned probability is never written as exactly 0 or 1: that would say that the cell had been known.
 

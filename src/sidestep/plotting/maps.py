@@ -129,7 +129,7 @@ def draw_walks(axes: Axes, paths: Sequence[Places], grid: Grid, label: str = "wa
 
 def draw_path(axes: Axes, states: Integer[np.ndarray, " steps"], grid: Grid) -> None:
     """Draw one path (states) as a bold line from a square at its start to a star at its end."""
-    x, y = grid.centres(states).T
+    x, y = grid.centers(states).T
     width = _width(grid, 1.6, 2.4)
     axes.plot(x, y, color=palette.PATH, linewidth=width, path_effects=_halo(width), zorder=4, label="path")
     _draw_markers(axes, states[:1], grid, "s", palette.START, "start")
@@ -272,7 +272,7 @@ def _draw_markers(
 
 def _metres(places: Places, grid: Grid) -> Float[np.ndarray, "places 2"]:
     """Return the positions of places."""
-    return places if places.ndim == 2 else grid.centres(places)
+    return places if places.ndim == 2 else grid.centers(places)
 
 
 def _halo(width: float) -> list[Stroke | Normal]:

@@ -76,7 +76,7 @@ def draw_policy(axes: Axes, panel: PolicyPanel) -> None:
     """Draw an arrow where a robot moves, a ring where it stays, and a cross on every wall that it bumps into."""
     if panel.starts is None or panel.intended is None or panel.stays is None:
         return
-    here, there = panel.truth.centres(panel.starts), panel.truth.centres(panel.intended)
+    here, there = panel.truth.centers(panel.starts), panel.truth.centers(panel.intended)
     moves = ~panel.stays
     shape = {"arrowstyle": "->", "linewidth": 0.9, "shrinkA": 0, "shrinkB": 0, "path_effects": _HALO}
     for place, step in zip(here[moves], 0.4 * (there - here)[moves], strict=True):
@@ -84,7 +84,7 @@ def draw_policy(axes: Axes, panel: PolicyPanel) -> None:
     axes.plot(*here[panel.stays].T, "o", markerfacecolor="white", markeredgecolor="black", markersize=3.5)
     targets = np.unique(panel.intended[moves])
     walls = targets[panel.truth.known.ravel()[targets] == Cell.OCCUPIED]
-    axes.plot(*panel.truth.centres(walls).T, "X", color="white", markeredgecolor="black", markersize=6.5, zorder=5)
+    axes.plot(*panel.truth.centers(walls).T, "X", color="white", markeredgecolor="black", markersize=6.5, zorder=5)
 
 
 def _draw_panel(figure: SubFigure, axes: Axes, panel: PolicyPanel) -> None:

@@ -149,7 +149,7 @@ def behavior_model(
     reward_weight_std: float = 1.0,
     aimed_at: Int[np.ndarray, "states actions"] | None = None,
 ) -> BehaviorModel:
-    """Return a model of agents who behave as `behavior` describes, except for what is learned.
+    """Return a model of agents that behave as `behavior` describes, except for what is learned.
 
     Args:
         behavior: the known behavior, and the start of a learned β and lapse (.05 if it has no lapse).

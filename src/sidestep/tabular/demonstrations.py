@@ -116,7 +116,7 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
 def split_by_person(
     demonstrations: Demonstrations[Task], person: Int[np.ndarray, " trajectories"]
 ) -> tuple[Demonstrations[Task], Int[np.ndarray, " tasks"]]:
-    """Return the same moves with a separate task for every person who pursues it, and the person of each task.
+    """Return the same moves with a separate task for every person that pursues it, and the person of each task.
 
     Args:
         demonstrations: the moves of all persons.

@@ -1,6 +1,6 @@
 """The paper's dynamic program for the gradients of values (eq. 7 with eq. 8, 9 or 10): a reference implementation.
 
-`solve` differentiates values by the adjoint equation, whose cost does not grow with the number of parameters. This
+`solve` differentiates values by the adjoint equation, at a cost that does not grow with the number of parameters. This
 module computes the same gradients as the paper describes them, by a forward iteration that carries ∂V/∂θ for every
 state and every parameter. It costs about as many value solves as there are parameters, so it serves tests,
 benchmarks and readers of the paper.
@@ -71,7 +71,7 @@ def forward_gradient(
 
     Example:
         >>> import sidestep as ss
-        >>> grid = ss.Grid.unknown(rows=1, columns=3)  # a corridor, whose right end is the goal
+        >>> grid = ss.Grid.unknown(rows=1, columns=3)  # a corridor; its right end is the goal
         >>> model = ss.ObstacleGrid(grid, -2.0)
         >>> task = ss.reach(grid, 2, discount=0.9)
         >>> result = forward_gradient(model, task, ss.Behavior(ss.HardMax()))

@@ -124,7 +124,7 @@ class Grid:
         """Return the state of the cell at one position (metres); raise `InputError` outside the grid."""
         return int(self.states(np.array([position], dtype=np.float64))[0])
 
-    def centres(self, states: Integer[np.ndarray, " points"]) -> Float[np.ndarray, "points 2"]:
+    def centers(self, states: Integer[np.ndarray, " points"]) -> Float[np.ndarray, "points 2"]:
         """Return the position (metres) of the center of each state's cell."""
         rows, columns = self.shape
         row, column = np.divmod(np.asarray(states), columns)

@@ -57,7 +57,7 @@ def log_likelihood(
     terms: tuple[Term, ...] = ALL_TERMS,
     options: SolveOptions | None = None,
 ) -> LogLikelihood:
-    """Return log L(θ) of demonstrations by agents who act as `behavior` describes and know `model`.
+    """Return log L(θ) of demonstrations by agents that act as `behavior` describes and know `model`.
 
     Args:
         model: the transition model; differentiable in its parameters θ.

@@ -76,7 +76,7 @@ def followed(
 def plan(
     model: TransitionModel, task: Task, behavior: Behavior | None = None, *, options: SolveOptions | None = None
 ) -> Plan:
-    """Return the optimal plan for a task under a model, or with `behavior` the plan of an agent who behaves like that.
+    """Return the optimal plan for a task under a model, or with `behavior` the plan of an agent that behaves like that.
 
     Args:
         model: the transition model.

@@ -26,7 +26,7 @@ def simulate(
     behavior: Behavior | None = None,
     max_moves: int | None = None,
 ) -> list[Trajectory]:
-    """Return trajectories of agents who know a world and pursue tasks in it.
+    """Return trajectories of agents that know a world and pursue tasks in it.
 
     Args:
         key: of the random choices.

@@ -114,7 +114,7 @@ def solve(
     visited: Int[Array, "*tasks visited"] | None = None,
     region: Bool[Array, "*tasks states"] | None = None,
 ) -> Solution:
-    """Return the values of one task, or of a stack of tasks, for agents who behave as `behavior` describes.
+    """Return the values of one task, or of a stack of tasks, for agents that behave as `behavior` describes.
 
     Usable under `jit`, `vmap` and `grad`. The numbers have the dtype of the model's probabilities.
 

@@ -43,7 +43,7 @@ class Room(NamedTuple):
         """The room as a map of small cells."""
         count = round(SIDE / RESOLUTION)
         blank = Grid(np.zeros((count, count), dtype=np.int64), resolution=RESOLUTION)
-        inside = self.inside(blank.centres(np.arange(blank.size)))
+        inside = self.inside(blank.centers(np.arange(blank.size)))
         return Grid(np.where(inside, Cell.OCCUPIED, Cell.FREE).reshape(blank.shape).astype(np.int64), RESOLUTION)
 
     def inside(self, places: Float[np.ndarray, "places 2"]) -> Bool[np.ndarray, " places"]:

@@ -28,7 +28,7 @@ from sidestep.tabular.models.categorical import FIXED, IMPOSSIBLE, TiedModel, lo
 
 
 class ObstacleGrid(TransitionModel):
-    """A grid whose cells may be blocked; moves into a blocked cell stay.
+    """A grid with cells that may be blocked; moves into a blocked cell stay.
 
     Attributes:
         graph: outcomes are the cell moved into, and staying.
@@ -67,7 +67,7 @@ class ObstacleGrid(TransitionModel):
 
 
 class FeaturedGrid(TransitionModel):
-    """A grid whose cells are blocked with a probability that is a function of their features.
+    """A grid with cells that are blocked with a probability that is a function of their features.
 
     Features may be a floor type, a color in an image of the site or a sensor's reading. What is learned of one cell
     holds for all with the same features.
@@ -111,9 +111,9 @@ class FeaturedGrid(TransitionModel):
         self.parameters, self.network = eqx.partition(network, eqx.is_inexact_array)
         if not jax.tree.leaves(self.parameters):
             raise InputError("expected parameters to learn, found none", field="network")
-        found = jax.eval_shape(network, features[0]).shape
-        if found != ():
-            raise InputError(f"expected one number for each cell, found shape {found}", field="network")
+        shape = jax.eval_shape(network, features[0]).shape
+        if shape != ():
+            raise InputError(f"expected one number for each cell, found shape {shape}", field="network")
 
     @property
     def logits(self) -> Float[Array, " cells"]:

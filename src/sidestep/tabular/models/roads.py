@@ -2,7 +2,7 @@
 
 A turn from link l onto link m succeeds unless m (or the turn itself) is closed, with P(closed) = σ(θ); otherwise the
 agent stays on l. Links have different numbers of turns; a missing turn stays on the link and is as long as all links
-together, so that agents who pay by length do not take it.
+together, so that agents that pay by length do not take it.
 """
 
 import jax

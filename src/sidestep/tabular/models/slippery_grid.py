@@ -27,7 +27,7 @@ _DIRECTIONS = np.array([[STEPS.tolist().index(way) for way in ([i, j], [j, -i], 
 
 
 class SlipperyGrid(TransitionModel):
-    """A grid whose cells may be blocked and on which moves slip sideways, by the terrain.
+    """A grid with cells that may be blocked, and on which moves slip sideways, by the terrain.
 
     Attributes:
         graph: outcomes are going ahead, to one side, to the other side, and staying.

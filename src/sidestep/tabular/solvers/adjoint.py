@@ -32,7 +32,7 @@ _FINER = 0.1
 """The factor between the thresholds of one sweep and the next."""
 
 
-def pull_back(
+def vjp_of_process(
     kind: int,
     tie: float,
     exact: bool,
@@ -97,7 +97,7 @@ def pull_back(
     def pull_back_range(begin: int, end: int) -> HostCotangents:
         sums = [np.zeros_like(part) if len(np.atleast_1d(part)) == 1 else part for part in by[1:]]
         own = HostCotangents(by.probabilities, *sums)
-        kernels.pull_back(begin, end, host_process, problem, *solution, result.values, own)
+        kernels.vjp_of_process(begin, end, host_process, problem, *solution, result.values, own)
         return own
 
     for own in map_ranges(pull_back_range, len(order)):

@@ -102,7 +102,7 @@ class AdjointKernels(NamedTuple):
     fill_rows: NativeFunction
     push: NativeFunction
     omission_cost: NativeFunction
-    pull_back: NativeFunction
+    vjp_of_process: NativeFunction
 
 
 @inlined()
@@ -249,7 +249,7 @@ def kernels_for(actions: int, outcomes: int, width: int) -> AdjointKernels:
         return cost
 
     @compiled()
-    def pull_back(begin, end, process, problem, solution, row, weights, beta, adjoint, by):  # pragma: no cover
+    def vjp_of_process(begin, end, process, problem, solution, row, weights, beta, adjoint, by):  # pragma: no cover
         """Fill in λᵀ ∂F/∂φ for a range of positions, and λ with the states' own numbers.
 
         `solution` is λ by position; `row`, `weights` and `beta` are as in `AdjointState`. Gradients by numbers that
@@ -276,4 +276,4 @@ def kernels_for(actions: int, outcomes: int, width: int) -> AdjointKernels:
                         difference = values[after] - values[state]
                         by.probabilities[state, a, k] += by_action * process.discount * difference
 
-    return AdjointKernels(fill_rows, push, omission_cost, pull_back)
+    return AdjointKernels(fill_rows, push, omission_cost, vjp_of_process)

@@ -14,7 +14,7 @@ Newton step on it is
 
 The *repeat-action value*, max_a c(a)/l(a), is the best that one action repeated for ever can give. It bounds the root:
 from above for backups that never exceed the best action, from below for the log-sum-exp. Steps start and end on the
-root's side of it; otherwise a state whose value is too high would seem best off with an action that never leaves. A
+root's side of it; otherwise a state with too high a value would seem best off with an action that never leaves. A
 state without a value yet starts from its repeat-action value. 1 − γp is summed as (1 − γ) + γ Σ_{elsewhere} P, so that
 nothing cancels in a trapped state.
 

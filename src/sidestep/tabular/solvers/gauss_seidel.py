@@ -7,7 +7,7 @@ states and replaces one value after another by its backup. This one differs:
    start brings its order along.
 2. Each state's own equation is solved by a Newton step instead of a backup, so that actions that mostly fail do not
    slow the sweeps down (`base`).
-3. Values of farther states are shifted along with those they depend on, and states whose neighbors have not changed are
+3. Values of farther states are shifted along with those they depend on, and states with unchanged neighbors are
    skipped (`value_kernels`).
 4. Sweeps go block by block, each until it has converged (`sweep_loop`).
 5. The gradient is that of the fixed point, by the adjoint equation; this is solved in the reverse order (`adjoint`).
@@ -134,9 +134,9 @@ def _solve_values(*arguments: Any) -> None:
 
 
 def _pull_back(*arguments: Any) -> None:
-    from sidestep.tabular.solvers.adjoint import pull_back
+    from sidestep.tabular.solvers.adjoint import vjp_of_process
 
-    pull_back(*arguments)
+    vjp_of_process(*arguments)
 
 
 def _take_rows(into: np.ndarray, probabilities: np.ndarray, states: np.ndarray) -> None:
