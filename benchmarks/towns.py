@@ -206,9 +206,9 @@ class Town(NamedTuple):
     def demonstrations(self, trips: Sequence[Trip], costs: Array | None = None) -> Demonstrations:
         """Return trips as demonstrations of drivers with some costs of features."""
         demos = demonstrations_from_trips(trips, self.model.graph)
-        return demos if costs is None else self.with_costs(demos, costs)
+        return demos if costs is None else self.adding_costs(demos, costs)
 
-    def with_costs(self, demos: Demonstrations, costs: Array) -> Demonstrations:
+    def adding_costs(self, demos: Demonstrations, costs: Array) -> Demonstrations:
         """Return the demonstrations with costs of features; a turn that does not exist costs its link's length."""
         reward = jnp.where(self.features[..., 1] == 1, -(self.features @ costs), -self.model.graph.lengths)
         rewards = jnp.broadcast_to(reward, (len(demos.tasks.terminal), *reward.shape))
@@ -247,7 +247,9 @@ def fit_costs(town: Town, trips: Sequence[Trip], behavior: Behavior, turn_costs:
     @eqx.filter_jit
     @eqx.filter_value_and_grad
     def loss(costs: Array, demos: Demonstrations) -> Array:
-        return -log_likelihood(model, town.with_costs(demos, costs), behavior, terms=("actions",)).actions / len(demos)
+        return -log_likelihood(model, town.adding_costs(demos, costs), behavior, terms=("actions",)).actions / len(
+            demos
+        )
 
     def loss_and_slope(costs: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = loss(jnp.asarray(costs), demos)
@@ -405,13 +407,13 @@ def draw(records: Sequence[Record], options: Options) -> Figure:
 
 def street_figure(roads: Roads, added: np.ndarray, records: Sequence[Record]) -> Figure:
     """Return the town as learned from the first record's trips, beside precision and recall by the number of trips."""
-    firsts = [own[0] for _, own in groups(records, "trips")]
+    first_records = [own[0] for _, own in groups(records, "trips")]
     picture = Figure(figsize=(10.4, 7.4), layout="constrained")
-    grid = picture.add_gridspec(len(firsts), 2, width_ratios=[5.6, 4.6])
+    grid = picture.add_gridspec(len(first_records), 2, width_ratios=[5.6, 4.6])
     town = picture.add_subplot(grid[:, 0])
     label = "rank by P(closed) among unused links (1: most surely closed)"
-    picture.colorbar(_draw_town(town, roads, added, firsts[0]), ax=town, shrink=0.5, pad=0.01, label=label)
-    for row, record in enumerate(firsts):
+    picture.colorbar(_draw_town(town, roads, added, first_records[0]), ax=town, shrink=0.5, pad=0.01, label=label)
+    for row, record in enumerate(first_records):
         axes, fraction = picture.add_subplot(grid[row, 1]), record["closed_fraction"]
         unused, open_links = np.asarray(record["uses"]) == 0, max(1 - fraction, 0.01)
         for (name, ranks), style in zip(record["rankings"].items(), ("-", "--", ":"), strict=True):
@@ -421,8 +423,8 @@ def street_figure(roads: Roads, added: np.ndarray, records: Sequence[Record]) ->
         axes.set(ylim=(1 - 1.3 * open_links, 1 + 0.03 * open_links), ylabel="precision")
         axes.set(title=f"unused links, {record['trips']} trips")
         axes.spines[["top", "right"]].set_visible(False)
-        axes.set_xlabel("recall of closed links" if record is firsts[-1] else "")
-        if record is firsts[0]:
+        axes.set_xlabel("recall of closed links" if record is first_records[-1] else "")
+        if record is first_records[0]:
             axes.legend(fontsize="small", frameon=False, loc="lower left", bbox_to_anchor=(0.0, 0.2))
     return picture
 

@@ -29,7 +29,7 @@ def learn(office, walks, out, *options):
 
 
 def test_goals_that_walks_do_not_name_are_found_among_candidates(office, tmp_path):
-    """The walks' own three goals and one that nobody had; each walk stops a step before its goal."""
+    """The walks' own three goals and one that elsewhere had; each walk stops a step before its goal."""
     table = walked(office, "named", "--walks", 40, "--seed", 2)
     goals = np.stack([table["goal_x"], table["goal_y"]], axis=1)
     arrived = np.isclose(np.stack([table["x"], table["y"]], axis=1), goals).all(axis=1)
@@ -39,15 +39,15 @@ def test_goals_that_walks_do_not_name_are_found_among_candidates(office, tmp_pat
     pyarrow.csv.write_csv(left, tmp_path / "walks.csv")
     own = np.unique(goals, axis=0)
     grid = read_map(office / "true.yaml")
-    nobody = grid.centers(np.setdiff1d(np.flatnonzero(grid.known.ravel() == 0), grid.states(own))[:1])
-    columns = dict(zip(("goal_x", "goal_y"), np.concatenate([own, nobody]).T, strict=True))
+    elsewhere = grid.centers(np.setdiff1d(np.flatnonzero(grid.known.ravel() == 0), grid.states(own))[:1])
+    columns = dict(zip(("goal_x", "goal_y"), np.concatenate([own, elsewhere]).T, strict=True))
     pyarrow.csv.write_csv(pa.table(columns), tmp_path / "goals.csv")
 
     assert learn(office, tmp_path / "walks.csv", tmp_path / "out", "--goal-candidates", tmp_path / "goals.csv") == 0
     told = summary(tmp_path / "out")["behavior"]["goals"]
     assert told["converged"]
     assert told["candidates"] == 4
-    assert told["probabilities"][3] < 0.1  # nobody had it
+    assert told["probabilities"][3] < 0.1  # elsewhere had it
     assert all(later >= before - 1e-6 for before, later in zip(told["evidence"], told["evidence"][1:], strict=False))
     found = pyarrow.csv.read_csv(tmp_path / "out" / "posterior.csv")
     chances = found["probability"].to_numpy().reshape(-1, 4)

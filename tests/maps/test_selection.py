@@ -77,10 +77,10 @@ def test_where_walks_are_long_people_pay_for_steps(tmp_path):
 def test_people_of_whom_no_values_are_found_are_passed_over(office, tmp_path, monkeypatch):
     """As it happens now and then to Boltzmann averages of people who pay for steps."""
 
-    def not_of_those_who_pay(model, shown, people, *, options):
+    def not_of_those_who_pay(model, shown, agent, *, options):
         if float(shown.tasks.discount[0]) == 1:
             raise NotConverged("the values of a task were not found")
-        return calibration.score_statistics(model, shown, people, options=options)
+        return calibration.score_statistics(model, shown, agent, options=options)
 
     monkeypatch.setattr(behavior, "score_statistics", not_of_those_who_pay)
     told = chosen(office, walked(office, "some", "--walks", 12), tmp_path)

@@ -47,7 +47,7 @@ class Comparison:
         selection = self.learned.learning.selection if self.learned and self.learned.learning else None
         return selection.reasons if selection else []
 
-    def scores(self) -> dict[str, dict[str, Any]]:
+    def method_scores(self) -> dict[str, dict[str, Any]]:
         """Return the scores of each method by name."""
         return {record.method: {k: v for k, v in record.to_dict().items() if k != "problem"} for record in self.records}
 
@@ -64,7 +64,7 @@ class Comparison:
                 "heldout_walks": heldout.trajectories if heldout else 0,
                 "heldout_moves": len(heldout) if heldout else 0,
             },
-            "methods": self.scores(),
+            "methods": self.method_scores(),
         }
 
 

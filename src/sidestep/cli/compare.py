@@ -60,7 +60,7 @@ def compare(
         "seconds": "seconds",
     }
     print_lines(*comparison.reasons)
-    rows = comparison.scores()
+    rows = comparison.method_scores()
     print_table(rows, columns)
     for name, scores in rows.items():
         if scores["failure"] is not None:

@@ -15,15 +15,15 @@ from typing import BinaryIO, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import PyTree
 
 from sidestep._files import read_whole, write_whole
+from sidestep._typing import Tree
 from sidestep.errors import InputError
 
 History = Sequence[Sequence[int | float]]
 
 
-def fingerprint(problem: PyTree) -> str:
+def fingerprint(problem: Tree) -> str:
     """Return a digest of everything in a pytree: structure, static settings, numbers, types and shapes."""
     leaves, structure = jax.tree.flatten(problem)
     digest = hashlib.sha256(str(structure).encode())
@@ -34,8 +34,8 @@ def fingerprint(problem: PyTree) -> str:
     return digest.hexdigest()
 
 
-def save_checkpoint(path: Path, key: str, state: PyTree, history: History, optional: PyTree = ()) -> None:
-    """Write a checkpoint, completely or not at all.
+def save_checkpoint(path: Path, key: str, state: Tree, history: History, optional: Tree = ()) -> None:
+    """Write a checkpoint as a whole.
 
     Args:
         path: the file.
@@ -53,7 +53,7 @@ def save_checkpoint(path: Path, key: str, state: PyTree, history: History, optio
     write_whole(path, write)
 
 
-def load_checkpoint(path: Path, key: str, like: PyTree, optional: PyTree = ()) -> tuple[PyTree, History, PyTree]:
+def load_checkpoint(path: Path, key: str, like: Tree, optional: Tree = ()) -> tuple[Tree, History, Tree]:
     """Read a checkpoint.
 
     Args:
@@ -88,7 +88,7 @@ def load_checkpoint(path: Path, key: str, like: PyTree, optional: PyTree = ()) -
         raise InputError("not a checkpoint: the arrays cannot be read", source=path) from error
 
 
-def _shapes(arrays: PyTree) -> list[str]:
+def _shapes(arrays: Tree) -> list[str]:
     return [f"{leaf.dtype}{leaf.shape}" for leaf in jax.tree.leaves(arrays)]
 
 
@@ -118,7 +118,7 @@ class Saver:
         self.checkpoint = Checkpoint(checkpoint) if isinstance(checkpoint, str | Path) else checkpoint
         self.key, self.next = key, 0.0
 
-    def load(self, like: PyTree, optional: PyTree = ()) -> tuple[PyTree, History, PyTree]:
+    def load(self, like: Tree, optional: Tree = ()) -> tuple[Tree, History, Tree]:
         """Return the state, the history and the optional arrays; those of the arguments if there is no file yet.
 
         Raises:
@@ -129,7 +129,7 @@ class Saver:
         path = Path(self.checkpoint.path)
         return load_checkpoint(path, self.key, like, optional) if path.exists() else (like, [], optional)
 
-    def save(self, state: PyTree, history: History, optional: PyTree = ()) -> None:
+    def save(self, state: Tree, history: History, optional: Tree = ()) -> None:
         """Write the checkpoint, unless the last save is too recent."""
         if self.checkpoint is None or time.monotonic() < self.next:
             return

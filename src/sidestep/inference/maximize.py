@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import PyTree
 
+from sidestep._typing import Tree
 from sidestep.errors import InputError, NotConverged
 from sidestep.inference.batching import LARGE_MAP
 from sidestep.inference.checkpoints import Saver
@@ -241,12 +241,12 @@ class _Evaluator:
     def _forget(self) -> None:
         self.last, self.contributions = self.last._replace(x=np.full_like(self.start, np.nan)), []
 
-    def save(self, saver: Saver, x: Vector, state: PyTree, history: list[Progress]) -> None:
+    def save(self, saver: Saver, x: Vector, state: Tree, history: list[Progress]) -> None:
         """Save all that the rest of the optimization depends on."""
         if jax.process_index() == self.objective.processes[0]:
             saver.save(self._saved(x, state), history, self._saved_starts())
 
-    def load(self, saver: Saver, x: Vector, state: PyTree) -> tuple[Vector, PyTree, list[Progress]]:
+    def load(self, saver: Saver, x: Vector, state: Tree) -> tuple[Vector, Tree, list[Progress]]:
         """Return the point, the optimizer's state and the history of a checkpoint."""
         saved, rows, starts = saver.load(self._saved(x, state), self._saved_starts())
         x, state, self.last, remaining = saved
@@ -255,7 +255,7 @@ class _Evaluator:
         self.tolerances = self.tolerances[len(self.tolerances) - int(remaining) :]
         return x, state, [Progress(int(row[0]), *row[1:]) for row in rows]
 
-    def _saved(self, x: Vector, state: PyTree) -> PyTree:
+    def _saved(self, x: Vector, state: Tree) -> Tree:
         return x, state, self.last, np.asarray(len(self.tolerances))
 
     def _saved_starts(self) -> list[WarmStart]:
@@ -264,12 +264,12 @@ class _Evaluator:
         return self.warm_starts if keep else []
 
 
-def _ravel(tree: PyTree) -> tuple[Vector, Callable[[Vector], PyTree]]:
+def _ravel(tree: Tree) -> tuple[Vector, Callable[[Vector], Tree]]:
     """Return the leaves of a tree as one vector, and the inverse: `ravel_pytree` without compiled code."""
     leaves, structure = jax.tree.flatten(jax.tree.map(np.asarray, tree))
     ends = np.cumsum([leaf.size for leaf in leaves])[:-1]
 
-    def unravel(x: Vector) -> PyTree:
+    def unravel(x: Vector) -> Tree:
         parts = zip(np.split(x, ends), leaves, strict=True)
         return jax.tree.unflatten(structure, [part.reshape(leaf.shape).astype(leaf.dtype) for part, leaf in parts])
 

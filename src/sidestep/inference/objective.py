@@ -23,8 +23,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 
+from sidestep._typing import Tree
 from sidestep.errors import InputError
 from sidestep.inference.batching import Batch, BatchPlan, make_batches, plan_batches
 from sidestep.inference.checkpoints import fingerprint
@@ -51,7 +52,7 @@ AXIS = "tasks"
 class Parameters(NamedTuple):
     """All that is learned: the parameters of the transition model and of behavior."""
 
-    model: PyTree
+    model: Tree
     behavior: BehaviorParameters
 
 
@@ -90,7 +91,7 @@ class BatchResult(NamedTuple):
     """The actions' log-likelihood over a batch, the gradient of the loss, the next warm starts, and the solves."""
 
     actions: Array
-    gradient: PyTree
+    gradient: Tree
     warm_starts: WarmStart
     solves: SolveSummary
 
@@ -101,13 +102,13 @@ class Contribution(NamedTuple):
     `all_states` is false if only the states that mattered before were solved.
     """
 
-    parameters: PyTree[np.ndarray]
+    parameters: Tree
     actions: float
-    gradient: PyTree[np.ndarray]
+    gradient: Tree
     solves: SolveSummary
     all_states: bool
 
-    def change(self, parameters: PyTree[np.ndarray]) -> float:
+    def change(self, parameters: Tree) -> float:
         """Return a first-order bound of the change of `actions` up to these parameters; 0 only at the same ones."""
         steps = jax.tree.map(np.subtract, parameters, self.parameters)
         if not any(step.any() for step in jax.tree.leaves(steps)):
@@ -126,7 +127,7 @@ class Evaluation(NamedTuple):
     actions: float
     transitions: float
     prior: float
-    gradient: PyTree[np.ndarray]
+    gradient: Tree
     solves: list[SolveSummary]
     contributions: list[Contribution]
 
@@ -239,7 +240,7 @@ class Objective:
         return evaluation, next_starts if self.plan.keeps_warm_starts else warm_starts
 
     def _evaluate_until_finite(
-        self, problem: Problem, parameters: PyTree, batch: Batch, start: WarmStart, all_states: bool
+        self, problem: Problem, parameters: Tree, batch: Batch, start: WarmStart, all_states: bool
     ) -> tuple[BatchResult, bool]:
         """Evaluate a batch; again with all states if those that mattered do not give a gradient."""
         result = self.evaluate_batch(problem, parameters, batch, start, all_states)
@@ -252,7 +253,7 @@ class Objective:
         return self.evaluate_batch(problem, parameters, batch, start, True), True
 
     def evaluate_batch(
-        self, problem: Problem, parameters: PyTree, batch: Batch, start: WarmStart, all_states: bool
+        self, problem: Problem, parameters: Tree, batch: Batch, start: WarmStart, all_states: bool
     ) -> BatchResult:
         """Evaluate the actions' part of a batch; if not `all_states`, solve only the states that mattered before."""
         if self.mesh is None:
@@ -286,7 +287,7 @@ def _transitions_and_prior(
     behavior: BehaviorModel,
     arrivals: Arrivals | None,
     parameters: Parameters,
-) -> tuple[PyTree, tuple[Array, Array]]:
+) -> tuple[Tree, tuple[Array, Array]]:
     """Return the gradient of the loss without the actions' part, and its terms."""
 
     def loss(parameters: Parameters) -> tuple[Array, tuple[Array, Array]]:
@@ -349,7 +350,7 @@ def _batch_result(
 @eqx.filter_jit
 def _sharded_batch_result(
     problem: Problem,
-    parameters: PyTree,
+    parameters: Tree,
     batch: Batch,
     starts: WarmStart,
     all_states: Bool[Array | np.ndarray, ""],
@@ -358,7 +359,7 @@ def _sharded_batch_result(
     """Evaluate a batch on all devices; the sums over a device's tasks have a leading axis of devices."""
     arrays, static = eqx.partition((problem, parameters, all_states), eqx.is_array)
 
-    def on_device(arrays: PyTree, batch: Batch, starts: WarmStart) -> BatchResult:
+    def on_device(arrays: Tree, batch: Batch, starts: WarmStart) -> BatchResult:
         problem, parameters, all_states = eqx.combine(arrays, static)
         result = _batch_result(problem, parameters, batch, starts, all_states)
         actions, gradient = jax.tree.map(lambda leaf: leaf[None], (result.actions, result.gradient))
@@ -372,13 +373,13 @@ def _sharded_batch_result(
 
 
 @eqx.filter_jit
-def _add_devices(sums: PyTree, solves: SolveSummary, mesh: Mesh) -> tuple[PyTree, SolveSummary]:
+def _add_devices(sums: Tree, solves: SolveSummary, mesh: Mesh) -> tuple[Tree, SolveSummary]:
     """Add the devices' sums; return them and all solves on all devices."""
     added = jax.tree.map(lambda leaf: leaf.sum(axis=0), sums)
     return jax.lax.with_sharding_constraint((added, solves), NamedSharding(mesh, PartitionSpec()))
 
 
-def _replicate(tree: PyTree, mesh: Mesh | None) -> PyTree:
+def _replicate(tree: Tree, mesh: Mesh | None) -> Tree:
     """Copy arrays and numbers to each device; raise `InputError` if processes have different ones."""
     if mesh is None:
         return tree
@@ -393,7 +394,7 @@ def _replicate(tree: PyTree, mesh: Mesh | None) -> PyTree:
     return eqx.combine(values, rest)
 
 
-def _shard(tree: PyTree, mesh: Mesh | None) -> PyTree:
+def _shard(tree: Tree, mesh: Mesh | None) -> Tree:
     """Spread arrays over tasks over the devices; a process holds the parts of its own devices."""
     if mesh is None:
         return tree

@@ -13,7 +13,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
+
+from sidestep._typing import Tree
 
 Vector = Float[np.ndarray, " parameters"]
 
@@ -55,13 +57,11 @@ class Optimizer(eqx.Module):
         """Return what an interrupted fit must share with the one that resumes it."""
 
     @abc.abstractmethod
-    def init(self, x: Vector) -> PyTree:
+    def init(self, x: Vector) -> Tree:
         """Return the state before the first step from x."""
 
     @abc.abstractmethod
-    def step(
-        self, loss: Loss, x: Vector, value: float, gradient: Vector, state: PyTree
-    ) -> tuple[Vector, PyTree] | None:
+    def step(self, loss: Loss, x: Vector, value: float, gradient: Vector, state: Tree) -> tuple[Vector, Tree] | None:
         """Return the next point and state, or None if no step decreases the loss.
 
         Args:
@@ -72,12 +72,12 @@ class Optimizer(eqx.Module):
             state: the state that `init` or the last step returned.
         """
 
-    def convergence(self, gradient: Vector, state: PyTree) -> float:
+    def convergence(self, gradient: Vector, state: Tree) -> float:
         """Return the number that `terminate` compares with the tolerance: the largest component of the gradient."""
         del state
         return float(np.abs(gradient).max())
 
-    def terminate(self, gradient: Vector, state: PyTree) -> bool:
+    def terminate(self, gradient: Vector, state: Tree) -> bool:
         """Return whether the optimizer has converged at a point with this gradient."""
         return self.convergence(gradient, state) <= self.tolerance
 
@@ -103,7 +103,7 @@ class LBFGS(Optimizer):
         """Return what an interrupted fit must share with the one that resumes it."""
         return f"L-BFGS {self.memory_size}"
 
-    def init(self, x: Vector) -> PyTree:
+    def init(self, x: Vector) -> Tree:
         """Return an empty memory."""
         import optax
 
@@ -111,9 +111,7 @@ class LBFGS(Optimizer):
         state = jax.eval_shape(optax.scale_by_lbfgs(self.memory_size).init, x)
         return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), state)
 
-    def step(
-        self, loss: Loss, x: Vector, value: float, gradient: Vector, state: PyTree
-    ) -> tuple[Vector, PyTree] | None:
+    def step(self, loss: Loss, x: Vector, value: float, gradient: Vector, state: Tree) -> tuple[Vector, Tree] | None:
         """Return the best point along the L-BFGS direction, or None if no point is better than x."""
         for memory in (state, self.init(x)):
             direction, updated = _lbfgs_direction(self.memory_size, gradient, memory, x)
@@ -148,11 +146,11 @@ class Adam(Optimizer):
 
         return optax.adam(optax.cosine_decay_schedule(self.learning_rate, self.max_iterations))
 
-    def init(self, x: Vector) -> PyTree:
+    def init(self, x: Vector) -> Tree:
         """Return the first moments."""
         return self._transformation().init(x)
 
-    def step(self, loss: Loss, x: Vector, value: float, gradient: Vector, state: PyTree) -> tuple[Vector, PyTree]:
+    def step(self, loss: Loss, x: Vector, value: float, gradient: Vector, state: Tree) -> tuple[Vector, Tree]:
         """Return the next point and moments."""
         del loss, value
         update, state = self._transformation().update(gradient, state, x)
@@ -168,7 +166,7 @@ class Rprop(Optimizer):
 
     As in Rprop, each parameter has a step size, and only the sign of its gradient gives the direction. It differs:
 
-    1. A step is accepted only if the loss decreases, and if parameters whose gradient has changed sign (overshot) take
+    1. A step is accepted only if the loss decreases, and if parameters that overshot (a new sign of the gradient) take
        back at most .15 of the decrease that the gradient predicted.
     2. Otherwise parameters that take back more than .15 of their own predicted decrease keep their values, their step
        sizes are multiplied by .25, and the trial is repeated without them. If there are none, all steps of this trial
@@ -259,9 +257,9 @@ class _Trial(NamedTuple):
 def _lbfgs_direction(
     memory_size: int,
     gradient: Float[Array | np.ndarray, " parameters"],
-    state: PyTree,
+    state: Tree,
     x: Float[Array | np.ndarray, " parameters"],
-) -> tuple[Array, PyTree]:
+) -> tuple[Array, Tree]:
     import optax
 
     direction, state = optax.scale_by_lbfgs(memory_size).update(jnp.asarray(gradient), state, jnp.asarray(x))

@@ -18,8 +18,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, Int
 
+from sidestep._typing import FloatTree
 from sidestep.errors import InputError
 
 Numbers = float | Float[Array | np.ndarray, "..."]
@@ -34,7 +35,7 @@ class Prior(eqx.Module):
     """
 
     @abc.abstractmethod
-    def log_density(self, parameters: PyTree[Float[Array, "..."]]) -> Float[Array, ""]:
+    def log_density(self, parameters: FloatTree) -> Float[Array, ""]:
         """Return the logarithm of the density of θ.
 
         Args:
@@ -72,7 +73,7 @@ class Normal(Prior):
         if not (np.isfinite(self.variance).all() and (np.asarray(self.variance) > 0).all()):
             raise InputError("expected numbers above 0", field="prior variance")
 
-    def log_density(self, parameters: PyTree[Float[Array, "..."]]) -> Float[Array, ""]:
+    def log_density(self, parameters: FloatTree) -> Float[Array, ""]:
         """Return −Σ (θ − b)²/(2σ²) over all parameters."""
         penalties = [
             jnp.sum((leaf - self.mean.astype(leaf.dtype)) ** 2 / (2 * self.variance.astype(leaf.dtype)))

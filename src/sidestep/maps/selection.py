@@ -204,7 +204,7 @@ def _cross_validate(
     if count < 2:
         raise InputError(f"expected at least 2 walks to select by, found {count}", field="select_behavior")
     fold_of = np.random.default_rng(config.seed).permutation(count) % min(FOLDS, count)
-    actions, transitions, statistics, lapses = np.zeros(count), np.zeros(count), [], []
+    actions, transitions, statistics, lapse_values = np.zeros(count), np.zeros(count), [], []
     for fold in range(fold_of.max() + 1):
         if notify:
             kind, beta = "goal reward" if config.reward.step_cost is None else "step cost", config.behavior.beta
@@ -213,13 +213,13 @@ def _cross_validate(
         held_out, behavior = demonstrations.with_only(fold_of == fold), fit.behavior.behavior_of()
         of_fold = score_statistics(fit.model, held_out, behavior, options=SolveOptions(horizon=config.behavior.horizon))
         statistics.append(of_fold)
-        lapses.append(0.0 if behavior.lapse is None else float(behavior.lapse))
+        lapse_values.append(0.0 if behavior.lapse is None else float(behavior.lapse))
         weights = np.asarray(held_out.weights)
         log_transitions = np.log(np.asarray(transition_probabilities(fit.model, held_out)))[weights > 0]
         actions += np.bincount(of_fold.trajectory, of_fold.log_policy, minlength=count)
         transitions += np.bincount(of_fold.trajectory, log_transitions, minlength=count)
     ratio, moves = effective_sample_ratio(statistics), len(demonstrations)
-    return Trial(config, actions, transitions, moves, ratio, float(np.mean(lapses)))
+    return Trial(config, actions, transitions, moves, ratio, float(np.mean(lapse_values)))
 
 
 def _reward_name(reward: Reward) -> str:
