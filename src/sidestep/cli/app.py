@@ -33,6 +33,8 @@ _EXAMPLES: dict[Callable[..., None], str] = {
     experiments.reproduce: "sidestep reproduce --out figures",
     experiments.experiment: "sidestep experiment room --out room",
 }
+_DRAWING = (learn, plan)
+"""The commands that draw a single map."""
 _INTERRUPTED = 130
 """The exit code that typer gives a keyboard interrupt."""
 
@@ -42,6 +44,10 @@ def _prepared(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def run(**values: Any) -> None:
+        if command in _DRAWING:
+            from sidestep.cli.drawing import prepare_drawing
+
+            prepare_drawing()
         import jax
 
         from sidestep._cache import keep_compiled_code

@@ -53,13 +53,13 @@ def save_learned(learned: "LearnedMap", folder: "Path", **entries: object) -> No
     """Draw a learned map and write it to a folder, with more entries of `summary.json`."""
     import numpy as np
 
+    from sidestep.cli.drawing import draw
     from sidestep.maps.sensors import seen_cells
-    from sidestep.plotting.maps import figure_fit, save
 
     learning = learned.learning
     assert learning is not None
     objective = np.array([progress.objective for progress in learning.fit.history])
     seen = None if learning.sensor is None else seen_cells(learning.sensor, learned.grid)
-    figure = figure_fit(learned.grid, learning.demonstrations.paths(), learned.blocked, objective, seen)
-    save(figure, folder / "learned.png")
+    paths = learning.demonstrations.paths()
+    draw("figure_fit", folder / "learned.png", learned.grid, paths, learned.blocked, objective, seen)
     learned.save(folder, **entries)

@@ -20,9 +20,9 @@ def plan(
     import pyarrow as pa
 
     from sidestep.cli.display import print_lines
+    from sidestep.cli.drawing import draw
     from sidestep.io.tables import write_table
     from sidestep.maps.learned_map import add_to_summary, load_map
-    from sidestep.plotting.maps import figure_plan, save
 
     out = out or folder / "plan"
     first, last = position_of(start, "--start"), position_of(goal, "--goal")
@@ -31,7 +31,7 @@ def plan(
     x, y = path.positions.T
     steps = np.arange(len(path.states))
     write_table(out / "path.csv", pa.table({"step": steps, "x": x, "y": y, "blocked": path.blocked}))
-    save(figure_plan(learned.grid, learned.blocked, path.states), out / "path.png")
+    draw("figure_plan", out / "path.png", learned.grid, learned.blocked, path.states)
     summary = {
         "command": "plan",
         "start": first,
