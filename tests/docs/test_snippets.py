@@ -45,7 +45,8 @@ def commands():
 
 def programs():
     for page, blocks in groupby(snippets("python"), lambda snippet: snippet.page):
-        yield pytest.param(page, list(blocks), id=page.name)
+        slow = [pytest.mark.slow] if page.name == "continuous.md" else []  # a fit by rollouts
+        yield pytest.param(page, list(blocks), id=page.name, marks=slow)
 
 
 @pytest.fixture(scope="module")
