@@ -14,6 +14,9 @@ _UNREADABLE = "Error reading persistent compilation cache entry for '"
 """The beginning of JAX's warning of a damaged entry."""
 
 
+_folder: Path | None = None
+
+
 def cache_folder() -> Path | None:
     """Return the folder for compiled code; None where it is turned off or cannot be written."""
     setting = os.environ.get("SIDESTEP_CACHE")
@@ -32,12 +35,18 @@ def cache_folder() -> Path | None:
     return folder if os.access(folder, os.W_OK) else None
 
 
+def kept_in() -> Path | None:
+    """Return the folder in which this process keeps compiled code; None where it does not."""
+    return _folder
+
+
 def keep_compiled_code() -> None:
     """Make JAX keep compiled code in `cache_folder`, for the command line; a library leaves JAX's settings alone.
 
     JAX recompiles a damaged entry but does not replace it. So its warning removes the entry, and JAX writes it anew.
     """
-    folder = cache_folder()
+    global _folder  # noqa: PLW0603
+    _folder = folder = cache_folder()
     if folder is None:
         return
     import jax

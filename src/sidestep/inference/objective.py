@@ -25,6 +25,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
+from sidestep._traces import keep_trace
 from sidestep._typing import Tree
 from sidestep.errors import InputError
 from sidestep.inference.batching import Batch, BatchPlan, make_batches, plan_batches
@@ -280,7 +281,7 @@ def tasks_mesh(devices: Sequence[Any] | None = None) -> Mesh:
     return Mesh(np.asarray(jax.devices() if devices is None else devices), (AXIS,))
 
 
-@eqx.filter_jit
+@keep_trace
 def _transitions_and_prior(
     prior: Prior,
     model: TransitionModel,
@@ -301,7 +302,7 @@ def _transitions_and_prior(
     return jax.grad(loss, has_aux=True)(parameters)
 
 
-@eqx.filter_jit
+@keep_trace
 def _batch_result(
     problem: Problem, parameters: Parameters, batch: Batch, starts: WarmStart, all_states: Bool[Array | np.ndarray, ""]
 ) -> BatchResult:
