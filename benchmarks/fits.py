@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import SHARED_DATA, Record, changed, described, flat, option, peak_bytes, print_table
-from benchmarks.behavior import Maze, learn_by
+from benchmarks.people import Maze, learn_by
 from sidestep.evaluation.relevance import relevant_obstacles
 from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map

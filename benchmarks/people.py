@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import SHARED_DATA, Record, changed, described, flat, groups, mean_over, note, option, print_table, warn
-from sidestep.baselines.comparison import BASELINES
+from sidestep.baselines import BASELINES
 from sidestep.baselines.interface import ModelResult, model_result
 from sidestep.errors import InputError
 from sidestep.evaluation.study import Problem, run_method

@@ -42,7 +42,7 @@ from scipy.stats import rankdata
 from sklearn.metrics import average_precision_score, precision_recall_curve, roc_auc_score
 
 from benchmarks import SHARED_DATA, Record, changed, described, flat, groups, mean_over, note, option, print_table, warn
-from benchmarks.behavior import CELLS, draws, learn_by, read_mazes, show_means
+from benchmarks.people import CELLS, draws, learn_by, read_mazes, show_means
 from sidestep.errors import InputError, NotConverged
 from sidestep.inference.fit import Fit, fit
 from sidestep.inference.optimizers import LBFGS, Rprop

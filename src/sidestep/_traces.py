@@ -41,11 +41,12 @@ def keep_trace(function: _Function) -> _Function:
             return compiled(*arguments)
         import jax
         import numpy as np
+        from jax.core import Tracer
 
         dynamic, static = eqx.partition(arguments, lambda leaf: eqx.is_array(leaf) or isinstance(leaf, np.ndarray))
         leaves, structure = jax.tree.flatten(dynamic)
         others = f"{structure} {jax.tree.flatten(static)}"
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves) or " at 0x" in others:
+        if any(isinstance(leaf, Tracer) for leaf in leaves) or " at 0x" in others:
             return compiled(*arguments)
         types = [(leaf.shape, str(leaf.dtype), bool(getattr(leaf, "weak_type", False))) for leaf in leaves]
         key = hashlib.sha256(f"{_package()} {function.__qualname__} {others} {types}".encode()).hexdigest()
