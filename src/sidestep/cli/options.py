@@ -8,14 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
 
-from sidestep.maps.config import (
-    BackupName,
-    BehaviorConfig,
-    FitConfig,
-    MapConfig,
-    PriorConfig,
-    Terms,
-)
+from sidestep.maps.config import BackupName, BehaviorConfig, FitConfig, MapConfig, PriorConfig, Terms
 from sidestep.tabular.reward import Reward
 
 if TYPE_CHECKING:

@@ -12,14 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 
-from sidestep.evaluation.metrics import (
-    MapScores,
-    PathScores,
-    path_lengths,
-    score_lengths,
-    score_map,
-    shortest_lengths,
-)
+from sidestep.evaluation.metrics import MapScores, PathScores, path_lengths, score_lengths, score_map, shortest_lengths
 from sidestep.evaluation.relevance import relevant_obstacles
 from sidestep.robots.planners import Planner
 from sidestep.robots.replanning import grid_environment

@@ -119,9 +119,7 @@ def ranking_scores(
 
 
 def score_paths(
-    paths: Sequence[Integer[np.ndarray, " _"]],
-    goals: Sequence[int] | Integer[np.ndarray, " paths"],
-    truth: Grid,
+    paths: Sequence[Integer[np.ndarray, " _"]], goals: Sequence[int] | Integer[np.ndarray, " paths"], truth: Grid
 ) -> PathScores:
     """Score planned paths against the true map.
 

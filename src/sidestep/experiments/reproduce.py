@@ -52,11 +52,7 @@ VARIANTS: Mapping[str, Variant] = {
     "actions_only": Variant("actions only", ("actions",), "fixed_policy", Adam()),
     "transitions_only": Variant("transitions only", ("transitions",), "exact", LBFGS()),
 }
-FIGURES = {
-    "figure2.png": ("bam", "bam_exact"),
-    "figure3.png": ("actions_only",),
-    "figure4.png": ("transitions_only",),
-}
+FIGURES = {"figure2.png": ("bam", "bam_exact"), "figure3.png": ("actions_only",), "figure4.png": ("transitions_only",)}
 
 
 @dataclass(frozen=True)

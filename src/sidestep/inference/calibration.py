@@ -51,11 +51,7 @@ class ScoreStatistics(NamedTuple):
 
 
 def score_statistics(
-    model: TransitionModel,
-    demonstrations: Demonstrations,
-    behavior: Behavior,
-    *,
-    options: SolveOptions | None = None,
+    model: TransitionModel, demonstrations: Demonstrations, behavior: Behavior, *, options: SolveOptions | None = None
 ) -> ScoreStatistics:
     """Return the scores of moves under a model that was learned from other trajectories.
 

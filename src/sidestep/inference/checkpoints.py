@@ -76,8 +76,7 @@ def load_checkpoint(path: Path, key: str, like: Tree, optional: Tree = ()) -> tu
         raise InputError("not a checkpoint", source=path) from error
     if saved_key != key:
         raise InputError(
-            "belongs to a fit of other data or with other settings; start without resuming to replace it",
-            source=path,
+            "belongs to a fit of other data or with other settings; start without resuming to replace it", source=path
         )
     try:
         if header.get("optional") != _shapes(optional):

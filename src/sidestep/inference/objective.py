@@ -283,11 +283,7 @@ def tasks_mesh(devices: Sequence[Any] | None = None) -> Mesh:
 
 @keep_trace
 def _transitions_and_prior(
-    prior: Prior,
-    model: TransitionModel,
-    behavior: BehaviorModel,
-    arrivals: Arrivals | None,
-    parameters: Parameters,
+    prior: Prior, model: TransitionModel, behavior: BehaviorModel, arrivals: Arrivals | None, parameters: Parameters
 ) -> tuple[Tree, tuple[Array, Array]]:
     """Return the gradient of the loss without the actions' part, and its terms."""
 

@@ -144,10 +144,7 @@ def select_behavior(
 
     own = [attempt(config), *attempt_if_proper(_with_beta(config, _BETA_FACTOR * config.behavior.beta))]
     kind = _other_reward(config)
-    other = [
-        *attempt_if_proper(kind),
-        *attempt_if_proper(_with_beta(kind, _BETA_FACTOR * kind.behavior.beta)),
-    ]
+    other = [*attempt_if_proper(kind), *attempt_if_proper(_with_beta(kind, _BETA_FACTOR * kind.behavior.beta))]
     gains = _best(other).log_likelihood - _best(own).log_likelihood if other else None
     trial = (other if gains is not None and _is_worth_it(gains, own[0].moves) else own)[0]
     trial = _raise_beta(trial, attempt_if_proper)

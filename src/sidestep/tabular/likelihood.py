@@ -107,11 +107,7 @@ def _log_likelihood(
 
 
 def log_policies(
-    model: TransitionModel,
-    demonstrations: Demonstrations,
-    behavior: Behavior,
-    *,
-    options: SolveOptions | None = None,
+    model: TransitionModel, demonstrations: Demonstrations, behavior: Behavior, *, options: SolveOptions | None = None
 ) -> Float[Array, " moves"]:
     """Return log π_θ(a | s) of every move; NaN if the values of a task did not converge.
 

@@ -29,9 +29,7 @@ class Reward:
     step_cost: float | None = None
 
     def reach(
-        self,
-        world: sidestep.tabular.grid.Grid | sidestep.tabular.graph.Graph,
-        goal: int | tuple[float, float],
+        self, world: sidestep.tabular.grid.Grid | sidestep.tabular.graph.Graph, goal: int | tuple[float, float]
     ) -> sidestep.tabular.tasks.Task:
         """Return the task of reaching a goal with this reward.
 

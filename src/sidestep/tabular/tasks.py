@@ -70,11 +70,7 @@ def task(
 
 
 def reach(
-    world: Grid | Graph,
-    goal: int | tuple[float, float],
-    *,
-    discount: float = 0.95,
-    step_cost: float | None = None,
+    world: Grid | Graph, goal: int | tuple[float, float], *, discount: float = 0.95, step_cost: float | None = None
 ) -> Task:
     """Return the task of reaching a goal.
 
