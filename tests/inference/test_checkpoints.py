@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 
 from sidestep.errors import InputError
-from sidestep.inference.checkpoints import fingerprint, load_checkpoint, save_checkpoint
+from sidestep.inference.checkpoints import Saver, fingerprint
 
 STATE = (np.array([0.1, -1e-300, np.pi]), jnp.arange(4), jnp.asarray(2.5, jnp.float32))
 LIKE = (np.zeros(3), jnp.zeros(4, int), jnp.zeros((), jnp.float32))
 HISTORY = [[0, -1.1, 0.1], [1, -1 / 3, 2e-9]]
 
 
-def test_load_checkpoint_returns_what_was_saved(tmp_path):
+def test_saver_load_returns_what_was_saved(tmp_path):
     path = tmp_path / "fit.checkpoint"
-    save_checkpoint(path, "key", STATE, HISTORY)
-    state, history, _ = load_checkpoint(path, "key", LIKE)
+    Saver(path, "key").save(STATE, HISTORY)
+    state, history, _ = Saver(path, "key").load(LIKE)
     assert history == HISTORY
     for loaded, expected in zip(state, STATE, strict=True):
         assert loaded.dtype == expected.dtype
@@ -39,27 +39,27 @@ GARBAGE = {
 
 
 @pytest.mark.parametrize("name", GARBAGE)
-def test_load_checkpoint_of_another_file_raises(tmp_path, name):
+def test_saver_load_of_another_file_raises(tmp_path, name):
     path = tmp_path / "fit.checkpoint"
     path.write_bytes(GARBAGE[name])
     with pytest.raises(InputError, match=r"fit\.checkpoint: (not a checkpoint|the file is empty)"):
-        load_checkpoint(path, "key", LIKE)
+        Saver(path, "key").load(LIKE)
 
 
 @pytest.mark.parametrize("missing", [1, 100])
-def test_load_checkpoint_of_a_truncated_file_raises(tmp_path, missing):
+def test_saver_load_of_a_truncated_file_raises(tmp_path, missing):
     path = tmp_path / "fit.checkpoint"
-    save_checkpoint(path, "key", STATE, HISTORY)
+    Saver(path, "key").save(STATE, HISTORY)
     path.write_bytes(path.read_bytes()[:-missing])
     with pytest.raises(InputError, match=r"fit\.checkpoint: not a checkpoint"):
-        load_checkpoint(path, "key", LIKE)
+        Saver(path, "key").load(LIKE)
 
 
-def test_load_checkpoint_of_another_fit_raises(tmp_path):
+def test_saver_load_of_another_fit_raises(tmp_path):
     path = tmp_path / "fit.checkpoint"
-    save_checkpoint(path, "key", STATE, HISTORY)
+    Saver(path, "key").save(STATE, HISTORY)
     with pytest.raises(InputError, match=r"fit\.checkpoint: belongs to a fit of other data"):
-        load_checkpoint(path, "another key", LIKE)
+        Saver(path, "another key").load(LIKE)
 
 
 class Pair(NamedTuple):
@@ -84,12 +84,12 @@ def test_fingerprint_differs_between_problems(other, same):
     assert (fingerprint(PROBLEM) == fingerprint(other)) == same
 
 
-def test_load_checkpoint_with_other_shapes_keeps_the_optional_arrays(tmp_path):
+def test_saver_load_with_other_shapes_keeps_the_optional_arrays(tmp_path):
     path = tmp_path / "fit.checkpoint"
-    save_checkpoint(path, "key", STATE, HISTORY, [np.arange(6.0)])
-    np.testing.assert_array_equal(load_checkpoint(path, "key", LIKE, [np.zeros(6)])[2][0], np.arange(6.0))
+    Saver(path, "key").save(STATE, HISTORY, [np.arange(6.0)])
+    np.testing.assert_array_equal(Saver(path, "key").load(LIKE, [np.zeros(6)])[2][0], np.arange(6.0))
     for optional in ([], [np.zeros(3)], [np.zeros(6, np.float32)], [np.zeros(6)] * 2):
-        state, history, loaded = load_checkpoint(path, "key", LIKE, optional)
+        state, history, loaded = Saver(path, "key").load(LIKE, optional)
         assert history == HISTORY
         np.testing.assert_array_equal(state[0], STATE[0])
         assert loaded is optional

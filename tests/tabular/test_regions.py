@@ -10,7 +10,7 @@ from helpers.problems import BACKUPS, generic_task, obstacle_problem, relative_e
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.solve import SolveOptions, solve
-from sidestep.tabular.solvers.base import DecisionProcess, Solver, WarmStart
+from sidestep.tabular.solvers.base import BellmanEquation, DecisionProcess, Solver, WarmStart
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import reach, stack_tasks
@@ -145,7 +145,7 @@ def test_what_leaving_a_state_out_costs(name):
     for tolerance, others, converged in ((1.01, left, True), (0.99, left, False), (0.99, (left + 1) % 12, True)):
         region = jnp.arange(12) != others
         solver = GaussSeidel(tolerance=tolerance * share)
-        by, found = solver.vjp(process, backup, beta, "exact", values, weights, start, region)
+        by, found = solver.vjp(BellmanEquation(process, backup, beta), "exact", weights, start, region)
         assert bool(found.converged) == converged
         assert all(bool(jnp.isfinite(part).all()) == converged for part in (*by, found.values))
 

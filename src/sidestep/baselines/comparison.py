@@ -107,22 +107,12 @@ def compare_methods(
     walks, config = sample_walks(walks, config), replace(config, max_walks=None)
     train, test = _split(walks, hold_out, config.seed)
     notify("behavior learns")
+    options: dict[str, Any] = {"notify": notify, "checkpoint": checkpoint, "resume": resume}
+    learned, failure = None, None
     try:
-        learned, failure = (
-            learn_map(
-                grid,
-                train,
-                config,
-                sensor=sensor,
-                annotations=annotations,
-                notify=notify,
-                checkpoint=checkpoint,
-                resume=resume,
-            ),
-            None,
-        )
+        learned = learn_map(grid, train, config, sensor=sensor, annotations=annotations, **options)
     except (ImproperTask, NotConverged) as error:
-        learned, failure = None, str(error)
+        failure = str(error)
     learning = learned.learning if learned else None
     moves = learning.goals.moves if learning and learning.goals else grid_walks(train, grid)
     config = learning.config if learning else config

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 if TYPE_CHECKING:
-    from rich.progress import TaskID
+    from rich.progress import Progress, TaskID
 
     from sidestep.inference.maximize import Progress as FitProgress
 
@@ -37,31 +37,21 @@ def working(text: str) -> Iterator[Callable[[str], None]]:
         yield status.update
 
 
+def _bar(*before_remaining: str, left: str) -> "Progress":
+    from rich import progress
+
+    done = "{task.description}", progress.BarColumn(), progress.MofNCompleteColumn(), progress.TimeElapsedColumn()
+    columns = *done, *before_remaining, progress.TimeRemainingColumn(), left
+    return progress.Progress(*columns, console=_errors, transient=True, speed_estimate_period=600)
+
+
 @contextmanager
 def fit_progress(iterations: int) -> "Iterator[tuple[FitCallback, Callable[[str], None]]]":
     """Show a progress bar on a terminal for a fit of at most `iterations`; the results report to it.
 
     When a fit converges cannot be known. So the time is the longest that is left, at the pace of the last ten minutes.
     """
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (
-        TextColumn("learning"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("at most"),
-        TimeRemainingColumn(),
-        TextColumn("left; {task.fields[state]}"),
-    )
-    with Progress(*columns, console=_errors, transient=True, speed_estimate_period=600) as bar:
+    with _bar("at most", left="left; {task.fields[state]}") as bar:
         task = bar.add_task("learning", total=iterations, state="compiling")
 
         def report(progress: "FitProgress") -> None:
@@ -77,24 +67,7 @@ def stage_progress() -> Iterator[Callable[[str, int, int], None]]:
 
     The size of a later stage is known when it begins, so there is no time for the whole.
     """
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("left"),
-    )
-    with Progress(*columns, console=_errors, transient=True, speed_estimate_period=600) as bar:
+    with _bar(left="left") as bar:
         tasks: "dict[str, TaskID]" = {}
 
         def report(stage: str, done: int, total: int) -> None:

@@ -78,13 +78,9 @@ def score_map(
         raise InputError("expected finite numbers", field="blocked")
     obstacle = scored & (truth.known == Cell.OCCUPIED)
     free = scored & (truth.known == Cell.FREE)
-    auc, average_precision = ranking_scores(blocked[obstacle], blocked[free])
-    auc_relevant, average_precision_relevant = ranking_scores(blocked[obstacle & relevant], blocked[free])
     return MapScores(
-        auc=auc,
-        average_precision=average_precision,
-        auc_relevant=auc_relevant,
-        average_precision_relevant=average_precision_relevant,
+        *ranking_scores(blocked[obstacle], blocked[free]),
+        *ranking_scores(blocked[obstacle & relevant], blocked[free]),
         recall=_mean(blocked[obstacle] >= 0.5),
         mean_obstacle=_mean(blocked[obstacle]),
         mean_free=_mean(blocked[free]),

@@ -34,59 +34,6 @@ def fingerprint(problem: Tree) -> str:
     return digest.hexdigest()
 
 
-def save_checkpoint(path: Path, key: str, state: Tree, history: History, optional: Tree = ()) -> None:
-    """Write a checkpoint as a whole.
-
-    Args:
-        path: the file.
-        key: the fingerprint of the problem.
-        state: the arrays from which the fit is resumed.
-        history: a row of numbers per iteration.
-        optional: arrays that a resumed fit can do without.
-    """
-
-    def write(file: BinaryIO) -> None:
-        header = {"fit": key, "history": list(history), "optional": _shapes(optional)}
-        file.write(json.dumps(header).encode() + b"\n")
-        eqx.tree_serialise_leaves(file, (state, optional))
-
-    write_whole(path, write)
-
-
-def load_checkpoint(path: Path, key: str, like: Tree, optional: Tree = ()) -> tuple[Tree, History, Tree]:
-    """Read a checkpoint.
-
-    Args:
-        path: the file.
-        key: the fingerprint of the problem.
-        like: arrays of the structure, types and shapes of the state.
-        optional: likewise, of the optional arrays.
-
-    Returns:
-        The state, the history, and the optional arrays: `optional` itself if those of the file have other shapes.
-
-    Raises:
-        InputError: for a file that is not a checkpoint, or one of a fit of other data or with other settings.
-    """
-    file = io.BytesIO(read_whole(path))
-    try:
-        header = json.loads(file.readline())
-        saved_key, history = header["fit"], header["history"]
-    except (ValueError, TypeError, KeyError) as error:
-        raise InputError("not a checkpoint", source=path) from error
-    if saved_key != key:
-        raise InputError(
-            "belongs to a fit of other data or with other settings; start without resuming to replace it", source=path
-        )
-    try:
-        if header.get("optional") != _shapes(optional):
-            return eqx.tree_deserialise_leaves(file, like), history, optional
-        state, optional = eqx.tree_deserialise_leaves(file, (like, optional))
-        return state, history, optional
-    except Exception as error:  # what is not an array raises errors of many kinds
-        raise InputError("not a checkpoint: the arrays cannot be read", source=path) from error
-
-
 def _shapes(arrays: Tree) -> list[str]:
     return [f"{leaf.dtype}{leaf.shape}" for leaf in jax.tree.leaves(arrays)]
 
@@ -118,22 +65,62 @@ class Saver:
         self.key, self.next = key, 0.0
 
     def load(self, like: Tree, optional: Tree = ()) -> tuple[Tree, History, Tree]:
-        """Return the state, the history and the optional arrays; those of the arguments if there is no file yet.
+        """Read the checkpoint.
+
+        Args:
+            like: arrays of the structure, types and shapes of the state.
+            optional: likewise, of the arrays that a resumed fit can do without.
+
+        Returns:
+            The state, the history, and the optional arrays: `optional` itself if those of the file have other shapes,
+            and the arguments if there is no file yet.
 
         Raises:
-            InputError: without a checkpoint, and for a file that `load_checkpoint` refuses.
+            InputError: without a checkpoint, for a file that is not one, or one of a fit of other data or with other
+                settings.
         """
         if self.checkpoint is None:
             raise InputError("expected a checkpoint to resume from", field="resume")
         path = Path(self.checkpoint.path)
-        return load_checkpoint(path, self.key, like, optional) if path.exists() else (like, [], optional)
+        if not path.exists():
+            return like, [], optional
+        file = io.BytesIO(read_whole(path))
+        try:
+            header = json.loads(file.readline())
+            saved_key, history = header["fit"], header["history"]
+        except (ValueError, TypeError, KeyError) as error:
+            raise InputError("not a checkpoint", source=path) from error
+        if saved_key != self.key:
+            raise InputError(
+                "belongs to a fit of other data or with other settings; start without resuming to replace it",
+                source=path,
+            )
+        try:
+            if header.get("optional") != _shapes(optional):
+                return eqx.tree_deserialise_leaves(file, like), history, optional
+            state, optional = eqx.tree_deserialise_leaves(file, (like, optional))
+            return state, history, optional
+        except Exception as error:  # what is not an array raises errors of many kinds
+            raise InputError("not a checkpoint: the arrays cannot be read", source=path) from error
 
     def save(self, state: Tree, history: History, optional: Tree = ()) -> None:
-        """Write the checkpoint, unless the last save is too recent."""
+        """Write the checkpoint as a whole, unless the last save is too recent.
+
+        Args:
+            state: the arrays from which the fit is resumed.
+            history: a row of numbers per iteration.
+            optional: arrays that a resumed fit can do without.
+        """
+
+        def write(file: BinaryIO) -> None:
+            header = {"fit": self.key, "history": list(history), "optional": _shapes(optional)}
+            file.write(json.dumps(header).encode() + b"\n")
+            eqx.tree_serialise_leaves(file, (state, optional))
+
         if self.checkpoint is None or time.monotonic() < self.next:
             return
         started = time.monotonic()
-        save_checkpoint(Path(self.checkpoint.path), self.key, state, history, optional)
+        write_whole(Path(self.checkpoint.path), write)
         ended = time.monotonic()
         self.next = ended + self.pause(ended - started)
 

@@ -26,7 +26,7 @@ from jaxtyping import Float
 from sidestep.errors import InputError, NotConverged, check_count
 from sidestep.inference.fit import Fit, Model
 from sidestep.tabular.backups import Behavior
-from sidestep.tabular.demonstrations import Demonstrations, Trajectory, flat_moves, gather
+from sidestep.tabular.demonstrations import Demonstrations, Trajectory, flatten, gather
 from sidestep.tabular.likelihood import log_policies
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.tasks import Task, stack_tasks
@@ -139,24 +139,14 @@ def weighted_demonstrations(
     pairs = np.argwhere(posterior > 0)
     demos = gather([trajectories[index]._replace(task=int(candidate)) for index, candidate in pairs], candidates)
     weights = np.repeat(posterior[posterior > 0], [len(trajectories[index].actions) for index, _ in pairs])
-    return Demonstrations(
-        demos.states, demos.actions, demos.next_states, demos.task, demos.trajectory, demos.tasks, jnp.asarray(weights)
-    )
+    return eqx.tree_at(lambda demos: demos.weights, demos, jnp.asarray(weights))
 
 
 def _trajectory_log_likelihoods(
     task: Task, model: TransitionModel, trajectories: Sequence[Trajectory], behavior: Behavior
 ) -> Float[np.ndarray, " trajectories"]:
     """Return Σ_t log π(a_t | s_t) of each trajectory for a task; −∞ if it continues after a terminal state."""
-    lengths = np.array([len(trajectory.actions) for trajectory in trajectories])
-    moves = Demonstrations(
-        flat_moves([trajectory.states[:-1] for trajectory in trajectories]),
-        flat_moves([trajectory.actions for trajectory in trajectories]),
-        flat_moves([trajectory.states[1:] for trajectory in trajectories]),
-        jnp.asarray(np.zeros(lengths.sum(), np.int32)),
-        jnp.asarray(np.repeat(np.arange(len(trajectories)), lengths), jnp.int32),
-        stack_tasks([task]),
-    )
+    moves = flatten([trajectory._replace(task=0) for trajectory in trajectories], stack_tasks([task]))
     log_policy = np.asarray(log_policies(model, moves, behavior))
     if np.isnan(log_policy).any():
         raise NotConverged("the values of a candidate's task did not converge: a smaller β may help")

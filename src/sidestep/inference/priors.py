@@ -28,6 +28,17 @@ MIN_PROBABILITY = 1 / 1020
 """The least distance of a sensor's probability from 0 and 1: a quarter of a gray level of an 8-bit image."""
 
 
+def _as_floats(numbers: Numbers) -> Float[Array, "..."]:
+    # `jnp.asarray` would compile a function for each shape
+    return jax.device_put(np.asarray(numbers, jnp.result_type(float)))
+
+
+def _checked_strength(strength: float) -> Float[Array, ""]:
+    if not (np.isfinite(strength) and strength >= 0):
+        raise InputError(f"expected a finite number, at least 0, found {strength}", field="strength")
+    return _as_floats(strength)
+
+
 class Prior(eqx.Module):
     """A density over parameters, up to a constant.
 
@@ -130,11 +141,8 @@ class GaussianMRF(Prior):
     """
 
     independent: Normal
-    pairs: Int[Array, "pairs 2"]
-    strength: Float[Array, ""]
-
-    def __init__(self, independent: Normal, pairs: Int[Array | np.ndarray, "pairs 2"], strength: float):
-        self.independent, self.pairs, self.strength = independent, jnp.asarray(pairs), _checked_strength(strength)
+    pairs: Int[Array, "pairs 2"] = eqx.field(converter=jnp.asarray)
+    strength: Float[Array, ""] = eqx.field(converter=_checked_strength)
 
     def log_density(self, parameters: Float[Array, " parameters"]) -> Float[Array, ""]:
         """Return the independent prior's log density − s Σ (θ_i − θ_j)²."""
@@ -156,11 +164,8 @@ class WallPrior(Prior):
     """
 
     independent: Normal
-    known: Int[Array, "rows columns"]
-    strength: Float[Array, ""]
-
-    def __init__(self, independent: Normal, known: Int[Array | np.ndarray, "rows columns"], strength: float):
-        self.independent, self.known, self.strength = independent, jnp.asarray(known), _checked_strength(strength)
+    known: Int[Array, "rows columns"] = eqx.field(converter=jnp.asarray)
+    strength: Float[Array, ""] = eqx.field(converter=_checked_strength)
 
     def log_density(self, parameters: Float[Array, " cells"]) -> Float[Array, ""]:
         """Return the independent prior's log density + s Σ p [1 − (1 − p_left p_right)(1 − p_up p_down)].
@@ -191,14 +196,3 @@ class FreeCellEvidence(Prior):
         """Return the prior's log density + Σ n ln(1 − p)."""
         log_free = jax.nn.log_sigmoid(-parameters)
         return self.prior.log_density(parameters) + self.counts.astype(log_free.dtype) @ log_free
-
-
-def _checked_strength(strength: float) -> Float[Array, ""]:
-    if not (np.isfinite(strength) and strength >= 0):
-        raise InputError(f"expected a finite number, at least 0, found {strength}", field="strength")
-    return _as_floats(strength)
-
-
-def _as_floats(numbers: Numbers) -> Float[Array, "..."]:
-    # `jnp.asarray` would compile a function for each shape
-    return jax.device_put(np.asarray(numbers, jnp.result_type(float)))

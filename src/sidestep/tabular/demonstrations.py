@@ -58,21 +58,11 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
     task: Int[Array, " moves"]
     trajectory: Int[Array, " moves"]
     tasks: Tasks
-    weights: Float[Array, " moves"]
+    weights: Float[Array, " moves"] = eqx.field(default=None)
 
-    def __init__(
-        self,
-        states: Shaped[Array, "moves *state"],
-        actions: Shaped[Array, "moves *action"],
-        next_states: Shaped[Array, "moves *state"],
-        task: Int[Array, " moves"],
-        trajectory: Int[Array, " moves"],
-        tasks: Tasks,
-        weights: Float[Array, " moves"] | None = None,
-    ):
-        self.states, self.actions, self.next_states = states, actions, next_states
-        self.task, self.trajectory, self.tasks = task, trajectory, tasks
-        self.weights = to_jax(np.ones(len(states))) if weights is None else weights
+    def __post_init__(self) -> None:
+        if self.weights is None:
+            self.weights = to_jax(np.ones(len(self.states)))
 
     def __len__(self) -> int:
         """Return the number of moves."""
@@ -163,6 +153,11 @@ def gather(trajectories: Sequence[Trajectory], tasks: Sequence[Task]) -> Demonst
         else:
             continue
         raise InputError(message, source="trajectory", row=row)
+    return flatten(trajectories, stacked)
+
+
+def flatten(trajectories: Sequence[Trajectory], tasks: Task) -> Demonstrations[Task]:
+    """Return the moves of trajectories, one after another, without checks."""
     lengths = [len(trajectory.actions) for trajectory in trajectories]
     return Demonstrations(
         states=flat_moves([trajectory.states[:-1] for trajectory in trajectories]),
@@ -170,7 +165,7 @@ def gather(trajectories: Sequence[Trajectory], tasks: Sequence[Task]) -> Demonst
         next_states=flat_moves([trajectory.states[1:] for trajectory in trajectories]),
         task=flat_moves([np.repeat([trajectory.task for trajectory in trajectories], lengths)]),
         trajectory=flat_moves([np.repeat(np.arange(len(lengths)), lengths)]),
-        tasks=stacked,
+        tasks=tasks,
     )
 
 
@@ -188,9 +183,8 @@ def pad_to_power_of_two(demonstrations: Demonstrations[Task]) -> Demonstrations[
     """
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(demonstrations)):
         return demonstrations
-    moves, tasks = len(demonstrations), len(demonstrations.tasks.terminal)
-    padded_moves = next_power_of_two(max(moves, _MIN_MOVES))
-    padded_tasks = next_power_of_two(max(tasks, _MIN_TASKS))
+    padded_moves = next_power_of_two(max(len(demonstrations), _MIN_MOVES))
+    padded_tasks = next_power_of_two(max(len(demonstrations.tasks.terminal), _MIN_TASKS))
 
     def repeated(leaf: Array, count: int) -> Array:
         array = np.asarray(leaf)
@@ -200,17 +194,13 @@ def pad_to_power_of_two(demonstrations: Demonstrations[Task]) -> Demonstrations[
         return to_jax(np.concatenate([leaf, np.full((count - len(leaf), *leaf.shape[1:]), fill, leaf.dtype)]))
 
     own, pursued = demonstrations, demonstrations.tasks
+    moves = own.states, own.actions, own.next_states, own.task, own.trajectory
+    reward, terminal_reward, discount = (
+        repeated(leaf, padded_tasks) for leaf in (pursued.reward, pursued.terminal_reward, pursued.discount)
+    )
     return Demonstrations(
-        *(
-            repeated(leaf, padded_moves)
-            for leaf in (own.states, own.actions, own.next_states, own.task, own.trajectory)
-        ),
-        tasks=Task(
-            repeated(pursued.reward, padded_tasks),
-            repeated(pursued.terminal_reward, padded_tasks),
-            extended(pursued.terminal, padded_tasks, fill=True),
-            repeated(pursued.discount, padded_tasks),
-        ),
+        *(repeated(leaf, padded_moves) for leaf in moves),
+        tasks=Task(reward, terminal_reward, extended(pursued.terminal, padded_tasks, fill=True), discount),
         weights=extended(own.weights, padded_moves, fill=0.0),
     )
 

@@ -23,15 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sidestep.errors import ImproperTask, InputError
 from sidestep.tabular.backups import Backup, Behavior, Gradient, LogSumExp
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.solvers.base import (
-    DecisionProcess,
-    Region,
-    Solver,
-    SolveResult,
-    WarmStart,
-    action_values,
-    finite_horizon,
-)
+from sidestep.tabular.solvers import base
 from sidestep.tabular.solvers.gauss_seidel import KERNELS, GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import Task
@@ -40,7 +32,7 @@ SMALL_PROBLEM = 400
 """The number of states below which `Jacobi` is at least as fast as `GaussSeidel` on a CPU (`benchmarks/scaling.py`)."""
 
 
-def default_solver(backup: Backup, states: int) -> Solver:
+def default_solver(backup: Backup, states: int) -> base.Solver:
     """Return `GaussSeidel` for larger problems on a CPU with a backup that has machine code, `Jacobi` otherwise."""
     if jax.default_backend() == "cpu" and states >= SMALL_PROBLEM and type(backup) in KERNELS:
         return GaussSeidel()
@@ -66,7 +58,7 @@ class SolveOptions(eqx.Module):
 
     gradient: Gradient = eqx.field(static=True, default="exact")
     horizon: int | None = eqx.field(static=True, default=None, converter=lambda n: None if n is None else int(n))
-    solver: Solver | None = None
+    solver: base.Solver | None = None
 
     def __check_init__(self) -> None:
         if self.gradient not in ("exact", "fixed_policy"):
@@ -74,7 +66,7 @@ class SolveOptions(eqx.Module):
         if self.horizon is not None and self.horizon < 1:
             raise InputError(f"expected at least one action, found {self.horizon}", field="horizon")
 
-    def solver_for(self, backup: Backup, states: int) -> Solver:
+    def solver_for(self, backup: Backup, states: int) -> base.Solver:
         """Return `solver`, or without one the default for a problem of that many states.
 
         Args:
@@ -101,7 +93,7 @@ class Solution(eqx.Module):
     sweeps: Int[Array, "*tasks"]
     residual: Float[Array, "*tasks"]
     converged: Bool[Array, "*tasks"]
-    start: WarmStart
+    start: base.WarmStart
 
 
 def solve(
@@ -110,7 +102,7 @@ def solve(
     behavior: Behavior,
     *,
     options: SolveOptions | None = None,
-    start: WarmStart | None = None,
+    start: base.WarmStart | None = None,
     visited: Int[Array, "*tasks visited"] | None = None,
     region: Bool[Array, "*tasks states"] | None = None,
 ) -> Solution:
@@ -159,7 +151,7 @@ def _solve(
     task: Task,
     behavior: Behavior,
     options: SolveOptions,
-    start: WarmStart | None,
+    start: base.WarmStart | None,
     visited: Int[Array, "*tasks visited"] | None,
     region: Bool[Array, "*tasks states"] | None,
 ) -> Solution:
@@ -171,8 +163,8 @@ def _solve(
     begin = start or _cold_start(solver, model.graph.states, dtype, task.terminal.shape[:-1])
     everywhere = jnp.ones(task.terminal.shape, dtype=bool) if region is None else region
 
-    def one(task: Task, start: WarmStart, visited: Array | None, region: Array) -> Solution:
-        process = DecisionProcess(
+    def one(task: Task, start: base.WarmStart, visited: Array | None, region: Array) -> Solution:
+        process = base.DecisionProcess(
             model.graph.successors,
             probabilities,
             task.reward.astype(dtype),
@@ -182,11 +174,12 @@ def _solve(
         )
         some = jnp.zeros(0, jnp.int32) if visited is None else visited
         if options.horizon is None:
-            result, rows = _solve_fixed_point(process, behavior, options.gradient, solver, start, some, region)
+            equation = base.BellmanEquation(process, behavior.backup, behavior.beta)
+            result, rows = _solve_fixed_point(equation, options.gradient, solver, start, some, region)
         else:
-            values = finite_horizon(process, behavior.backup, behavior.beta, options.horizon, options.gradient)
+            values = base.finite_horizon(process, behavior.backup, behavior.beta, options.horizon, options.gradient)
             sweeps, residual = jnp.asarray(options.horizon), jnp.asarray(0, values.dtype)
-            result = SolveResult(values, start.order, sweeps, residual, jnp.isfinite(values).all())
+            result = base.SolveResult(values, start.order, sweeps, residual, jnp.isfinite(values).all())
             rows = probabilities[some]
         values = result.values
         if visited is None:
@@ -194,15 +187,15 @@ def _solve(
         else:
             reward = process.reward[visited] if len(process.reward) > 1 else process.reward
             after = values[process.successors[visited]]
-            q = action_values(values[visited], after, rows, reward, process.discount)
-        next_start = WarmStart(jax.lax.stop_gradient(values), start.adjoint, result.order)
+            q = base.action_values(values[visited], after, rows, reward, process.discount)
+        next_start = base.WarmStart(jax.lax.stop_gradient(values), start.adjoint, result.order)
         return Solution(values, q, result.sweeps, result.residual, result.converged, next_start)
 
     arguments = task, begin, visited, everywhere
     return jax.vmap(one)(*arguments) if task.terminal.ndim == 2 else one(*arguments)
 
 
-def _cold_start(solver: Solver, states: int, dtype: jnp.dtype, tasks: tuple[int, ...]) -> WarmStart:
+def _cold_start(solver: base.Solver, states: int, dtype: jnp.dtype, tasks: tuple[int, ...]) -> base.WarmStart:
     cold = solver.cold_start(states, dtype)
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*tasks, *leaf.shape)), cold)
 
@@ -249,26 +242,18 @@ def check_proper(task: Task, behavior: Behavior, actions: int, horizon: int | No
 
 
 def _solve_fixed_point(
-    process: DecisionProcess,
-    behavior: Behavior,
+    equation: base.BellmanEquation,
     gradient: Gradient,
-    solver: Solver,
-    start: WarmStart,
+    solver: base.Solver,
+    start: base.WarmStart,
     visited: Int[Array, " visited"],
-    region: Region,
-) -> tuple[SolveResult, Float[Array, "visited actions outcomes"]]:
-    varying = (process.probabilities, process.reward, process.terminal_reward, process.discount, behavior.beta)
-    held = jax.lax.stop_gradient(varying)
-    constants = (process.successors, process.terminal)
-    result = solver.values(_process(constants, held), behavior.backup, held[-1], jax.lax.stop_gradient(start), region)
-    constants = (*constants, solver, result.order, region, visited)
-    solved: tuple[Array, Array] = _implicit(behavior.backup, gradient, constants, varying, result.values, start.adjoint)
+    region: base.Region,
+) -> tuple[base.SolveResult, Float[Array, "visited actions outcomes"]]:
+    inputs, process, backup = equation.inputs, equation.process, equation.backup
+    result = solver.values(equation.at(jax.lax.stop_gradient(inputs)), jax.lax.stop_gradient(start), region)
+    constants = (process.successors, process.terminal, solver, result.order, region, visited)
+    solved: tuple[Array, Array] = _implicit(backup, gradient, constants, inputs, result.values, start.adjoint)
     return result._replace(values=solved[0]), solved[1]
-
-
-def _process(constants: tuple, varying: tuple) -> DecisionProcess:
-    (successors, terminal), (probabilities, reward, terminal_reward, discount, _) = constants[:2], varying
-    return DecisionProcess(successors, probabilities, reward, terminal_reward, terminal, discount)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -276,11 +261,11 @@ def _implicit(
     backup: Backup,
     gradient: Gradient,
     constants: tuple,
-    varying: tuple,
-    values: Float[Array, " states"],
-    adjoint: Float[Array, " states"],
-) -> tuple[Float[Array, " states"], Float[Array, "visited actions outcomes"]]:
-    """Return the solution V of V = F(V, φ), φ = `varying`, with its gradient by the adjoint equation.
+    inputs: base.Cotangents,
+    values: base.Values,
+    adjoint: base.Values,
+) -> tuple[base.Values, Float[Array, "visited actions outcomes"]]:
+    """Return the solution V of V = F(V, φ), φ = `inputs`, with its gradient by the adjoint equation.
 
     Also return the probabilities of the visited states. Their gradient is added in place to the one by the values: two
     arrays of the model's size would take longer to make and to add than most of the rest.
@@ -290,24 +275,24 @@ def _implicit(
     """
     del backup, gradient, adjoint
     solver, visited = constants[2], constants[-1]
-    return values, solver.gather_rows(varying[0], visited)
+    return values, solver.gather_rows(inputs.probabilities, visited)
 
 
 def _implicit_forward(
-    backup: Backup, gradient: Gradient, constants: tuple, varying: tuple, values: Array, adjoint: Array
+    backup: Backup, gradient: Gradient, constants: tuple, inputs: base.Cotangents, values: Array, adjoint: Array
 ):
-    outputs = _implicit(backup, gradient, constants, varying, values, adjoint)
-    return outputs, (constants, varying, values, adjoint)
+    outputs = _implicit(backup, gradient, constants, inputs, values, adjoint)
+    return outputs, (constants, inputs, values, adjoint)
 
 
 def _implicit_backward(backup: Backup, gradient: Gradient, saved: tuple, cotangents: tuple[Array, Array]):
-    constants, varying, values, adjoint = saved
-    solver, order, region, visited = constants[2:]
-    process, beta = _process(constants, varying), varying[-1]
-    start = WarmStart(values, adjoint, order)
-    cotangent, result = solver.vjp(process, backup, beta, gradient, values, cotangents[0], start, region)
+    (successors, terminal, solver, order, region, visited), inputs, values, adjoint = saved
+    probabilities, reward, terminal_reward, discount, beta = inputs
+    process = base.DecisionProcess(successors, probabilities, reward, terminal_reward, terminal, discount)
+    equation, start = base.BellmanEquation(process, backup, beta), base.WarmStart(values, adjoint, order)
+    cotangent, result = solver.vjp(equation, gradient, cotangents[0], start, region)
     cotangent = cotangent._replace(probabilities=cotangent.probabilities.at[visited].add(cotangents[1]))
-    return None, tuple(cotangent), jnp.zeros_like(values), result.values
+    return None, cotangent, jnp.zeros_like(values), result.values
 
 
 _implicit.defvjp(_implicit_forward, _implicit_backward)

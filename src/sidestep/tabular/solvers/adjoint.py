@@ -8,23 +8,8 @@ the values were solved turn out to matter, there is no gradient (see `base`).
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sidestep.tabular.solvers.adjoint_kernels import (
-    AdjointKernels,
-    AdjointProblem,
-    AdjointState,
-    HostCotangents,
-    kernels_for,
-)
+from sidestep.tabular.solvers import adjoint_kernels, native
 from sidestep.tabular.solvers.base import neg_inf
-from sidestep.tabular.solvers.native import (
-    HostProcess,
-    HostResult,
-    NativeBackup,
-    SolveInfo,
-    check_interrupt,
-    inverse_permutation,
-    map_ranges,
-)
 
 _COARSEST = 1e-3
 """The first threshold, as a part of the residuals' sum; so that small residuals add up first."""
@@ -39,7 +24,7 @@ def vjp_of_process(
     max_sweeps: int,
     max_region_sweeps: int,
     into: tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]],
-    process: tuple[np.ndarray, ...],
+    process: list[np.ndarray],
     beta: Float[np.ndarray, ""],
     values: Float[np.ndarray, " states"],
     cotangent: Float[np.ndarray, " states"],
@@ -64,23 +49,23 @@ def vjp_of_process(
         tolerance: The part of the cotangent's sum that may remain.
     """
     number = values.dtype.type
-    by, result = HostCotangents(*into[0]), HostResult(*into[1])
-    position = inverse_permutation(order)
+    by, result = adjoint_kernels.HostCotangents(*into[0]), native.HostResult(*into[1])
+    position = native.inverse_permutation(order)
     total = np.abs(cotangent).sum()
     if position is None or total == 0 or not np.isfinite(total):
         # nothing to solve, or nothing that it could be solved for
         residual = 0.0 if total == 0 else np.nan
         _fill(residual, result.values, *by)
-        result.write(order, SolveInfo(0, residual, bool(total == 0)))
+        result.write(order, native.SolveInfo(0, residual, bool(total == 0)))
         return
-    host_process = HostProcess.from_arrays(process)
+    host_process = native.HostProcess.from_arrays(process)
     reachable_above = number(-((-neg_inf(values.dtype)) ** 0.5))
-    backup = NativeBackup(kind, number(beta), number(tie))
-    problem = AdjointProblem(backup, exact, values, reachable_above, order, position)
+    backup = native.NativeBackup(kind, number(beta), number(tie))
+    problem = adjoint_kernels.AdjointProblem(backup, exact, values, reachable_above, order, position)
     known = np.where(np.isfinite(start), start, number(0))
     actions, outcomes, width = host_process.kernel_sizes()
     work = _empty_state(host_process, width, known[order], cotangent[order])
-    kernels, is_whole = kernels_for(actions, outcomes, width), region.all()
+    kernels, is_whole = adjoint_kernels.kernels_for(actions, outcomes, width), region.all()
     sweeps = max_sweeps if is_whole else min(max_sweeps, max_region_sweeps)
     info = _push_all(kernels, host_process, problem, work, number(total), number(tolerance), sweeps)
     if info.converged and not is_whole:
@@ -94,13 +79,13 @@ def vjp_of_process(
     del work  # the gradient takes the memory that it held
     _fill(0.0, *by[1:])
 
-    def pull_back_range(begin: int, end: int) -> HostCotangents:
+    def pull_back_range(begin: int, end: int) -> adjoint_kernels.HostCotangents:
         sums = [np.zeros_like(part) if len(np.atleast_1d(part)) == 1 else part for part in by[1:]]
-        own = HostCotangents(by.probabilities, *sums)
+        own = adjoint_kernels.HostCotangents(by.probabilities, *sums)
         kernels.vjp_of_process(begin, end, host_process, problem, *solution, result.values, own)
         return own
 
-    for own in map_ranges(pull_back_range, len(order)):
+    for own in native.map_ranges(pull_back_range, len(order)):
         for part, added in zip(by[1:], own[1:], strict=True):
             if added is not part:
                 np.add(part, added, out=part)
@@ -112,11 +97,13 @@ def _fill(number: float, *arrays: np.ndarray) -> None:
         array[...] = number
 
 
-def _empty_state(process: HostProcess, width: int, adjoint: np.ndarray, residual: np.ndarray) -> AdjointState:
+def _empty_state(
+    process: native.HostProcess, width: int, adjoint: np.ndarray, residual: np.ndarray
+) -> adjoint_kernels.AdjointState:
     """Return a state without rows; rows that are not needed take no memory."""
     states, actions, _ = process.successors.shape
     dtype = adjoint.dtype
-    return AdjointState(
+    return adjoint_kernels.AdjointState(
         row=np.full(states, -1, np.int32),
         adjoint=adjoint,
         residual=residual,
@@ -130,10 +117,10 @@ def _empty_state(process: HostProcess, width: int, adjoint: np.ndarray, residual
 
 
 def _omission_cost(
-    kernels: AdjointKernels,
-    process: HostProcess,
-    problem: AdjointProblem,
-    work: AdjointState,
+    kernels: adjoint_kernels.AdjointKernels,
+    process: native.HostProcess,
+    problem: adjoint_kernels.AdjointProblem,
+    work: adjoint_kernels.AdjointState,
     region: Bool[np.ndarray, " states"],
 ) -> float:
     """Return the cost of the states outside the region that were not solved, as a part of Σ |λ V|."""
@@ -144,14 +131,14 @@ def _omission_cost(
 
 
 def _push_all(
-    kernels: AdjointKernels,
-    process: HostProcess,
-    problem: AdjointProblem,
-    work: AdjointState,
+    kernels: adjoint_kernels.AdjointKernels,
+    process: native.HostProcess,
+    problem: adjoint_kernels.AdjointProblem,
+    work: adjoint_kernels.AdjointState,
     total: np.floating,
     tolerance: np.floating,
     max_sweeps: int,
-) -> SolveInfo:
+) -> native.SolveInfo:
     """Push until the residuals' sum is no more than the part `tolerance` of `total`."""
     states = len(work.residual)
     finest = tolerance * total / states
@@ -160,10 +147,10 @@ def _push_all(
     if work.adjoint.any():
         # what a first λ amounts to, its rows filled in on all cores
         needed = np.flatnonzero(np.abs(work.adjoint) > finest)
-        map_ranges(lambda begin, end: kernels.fill_rows(begin, end, needed, process, problem, work), len(needed))
+        native.map_ranges(lambda begin, end: kernels.fill_rows(begin, end, needed, process, problem, work), len(needed))
         _, _, filled = kernels.push(finest, True, len(needed), process, problem, work)
     for _ in range(max_sweeps):
-        check_interrupt()
+        native.check_interrupt()
         pushes, remaining, filled = kernels.push(threshold, False, filled, process, problem, work)
         pushed += pushes
         if pushes == 0:
@@ -171,4 +158,4 @@ def _push_all(
         if left <= tolerance or np.isnan(remaining):
             break
         threshold = max(finest, _FINER * threshold)
-    return SolveInfo(-(-pushed // states), left, bool(left <= tolerance))
+    return native.SolveInfo(-(-pushed // states), left, bool(left <= tolerance))

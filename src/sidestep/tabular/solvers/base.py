@@ -52,6 +52,7 @@ from jaxtyping import Array, Bool, Float, Int, Scalar
 from sidestep.tabular.backups import Backup, Gradient
 
 Beta = Float[Scalar, ""]
+Values = Float[Array, " states"]
 Tolerance = float | Float[Array, ""] | None
 Region = Bool[Array, " states"]
 
@@ -121,6 +122,25 @@ class Cotangents(NamedTuple):
     beta: Float[Array, ""]
 
 
+class BellmanEquation(NamedTuple):
+    """The equation V = F(V; φ) of a decision process under a backup with inverse temperature β."""
+
+    process: DecisionProcess
+    backup: Backup
+    beta: Beta
+
+    @property
+    def inputs(self) -> Cotangents:
+        """Return φ, all that the values depend on."""
+        process = self.process
+        return Cotangents(process.probabilities, process.reward, process.terminal_reward, process.discount, self.beta)
+
+    def at(self, inputs: Cotangents) -> "BellmanEquation":
+        """Return the equation at another φ."""
+        process = DecisionProcess(self.process.successors, *inputs[:3], self.process.terminal, inputs.discount)
+        return BellmanEquation(process, self.backup, inputs.beta)
+
+
 class SolveResult(NamedTuple):
     """The result of a solver, and how the solve went.
 
@@ -159,24 +179,14 @@ class Solver(eqx.Module):
         """Return the start when nothing is known."""
 
     @abc.abstractmethod
-    def values(
-        self, process: DecisionProcess, backup: Backup, beta: Beta, start: WarmStart, region: Region
-    ) -> SolveResult:
+    def values(self, equation: BellmanEquation, start: WarmStart, region: Region) -> SolveResult:
         """Return V of the fixed point; outside the region it may be approximate if `start` is near it."""
 
     @abc.abstractmethod
     def vjp(
-        self,
-        process: DecisionProcess,
-        backup: Backup,
-        beta: Beta,
-        gradient: Gradient,
-        values: Float[Array, " states"],
-        cotangent: Float[Array, " states"],
-        start: WarmStart,
-        region: Region,
+        self, equation: BellmanEquation, gradient: Gradient, cotangent: Values, start: WarmStart, region: Region
     ) -> tuple[Cotangents, SolveResult]:
-        """Return λᵀ ∂F/∂φ for the adjoint λ of g = `cotangent` at the fixed point `values`, and λ as `values`.
+        """Return λᵀ ∂F/∂φ for the adjoint λ of g = `cotangent` at the fixed point `start.values`, and λ as `values`.
 
         Both are NaN if λ did not converge, or if states outside the region matter that were left out.
         """

@@ -26,30 +26,18 @@ from jaxtyping import Array, Float, Int
 
 from sidestep.errors import InputError
 from sidestep.tabular.backups import Backup, BoltzmannAverage, Gradient, HardMax, LogSumExp, Mellowmax
-from sidestep.tabular.solvers.base import (
-    Beta,
-    Cotangents,
-    DecisionProcess,
-    Region,
-    Solver,
-    SolveResult,
-    Tolerance,
-    WarmStart,
-    lower_bound,
-    neg_inf,
-)
-from sidestep.tabular.solvers.native import BOLTZMANN, HARD_MAX, LOG_SUM_EXP, MELLOWMAX, call_host, shapes_of
+from sidestep.tabular.solvers import base, native
 
 KERNELS: dict[type[Backup], int] = {
-    HardMax: HARD_MAX,
-    BoltzmannAverage: BOLTZMANN,
-    LogSumExp: LOG_SUM_EXP,
-    Mellowmax: MELLOWMAX,
+    HardMax: native.HARD_MAX,
+    BoltzmannAverage: native.BOLTZMANN,
+    LogSumExp: native.LOG_SUM_EXP,
+    Mellowmax: native.MELLOWMAX,
 }
 """The backups that have native code, and their numbers."""
 
 
-class GaussSeidel(Solver):
+class GaussSeidel(base.Solver):
     """Gauss–Seidel value iteration in order of distance, on the CPU, for the backups in `KERNELS`.
 
     Attributes:
@@ -74,46 +62,46 @@ class GaussSeidel(Solver):
         Bertsekas & Tsitsiklis, *Parallel and Distributed Computation: Numerical Methods* (1989), section 4.3.
     """
 
-    tolerance: Tolerance = None
+    tolerance: base.Tolerance = None
     max_sweeps: int = eqx.field(default=5_000, static=True)
     max_region_sweeps: int = eqx.field(default=100, static=True)
 
-    def cold_start(self, states: int, dtype: jnp.dtype) -> WarmStart:
+    def cold_start(self, states: int, dtype: jnp.dtype) -> base.WarmStart:
         """Return a start without values, adjoint and order."""
-        return WarmStart(jnp.full(states, neg_inf(dtype), dtype), jnp.zeros(states, dtype), _no_order(states))
+        return base.WarmStart(jnp.full(states, base.neg_inf(dtype), dtype), jnp.zeros(states, dtype), _no_order(states))
 
-    def values(
-        self, process: DecisionProcess, backup: Backup, beta: Beta, start: WarmStart, region: Region
-    ) -> SolveResult:
+    def values(self, equation: base.BellmanEquation, start: base.WarmStart, region: base.Region) -> base.SolveResult:
         """Return V of the fixed point; of all states where the start's values turn out to be of no use."""
-        kind, tie = _native_backup(backup, start.values.dtype)
+        kind, tie = _native_backup(equation.backup, start.values.dtype)
         # another solver may have left an order of no states
         order = start.order if start.order.shape == start.values.shape else _no_order(len(start.values))
         tolerance = self.tolerance_for(start.values.dtype)
-        arguments = (_arrays_of(process), lower_bound(process), beta, start.values, order, region, tolerance)
+        process = equation.process
+        values, bound, beta = start.values, base.lower_bound(process), equation.beta
+        arguments = (jax.tree.leaves(process), bound, beta, values, order, region, tolerance)
         solve = partial(_solve_values, kind, tie, self.max_sweeps)
-        return SolveResult(*call_host(solve, arguments, _result_shapes(start.values, order)))
+        return base.SolveResult(*native.call_host(solve, arguments, _result_shapes(start.values, order)))
 
     def vjp(
         self,
-        process: DecisionProcess,
-        backup: Backup,
-        beta: Beta,
+        equation: base.BellmanEquation,
         gradient: Gradient,
-        values: Float[Array, " states"],
-        cotangent: Float[Array, " states"],
-        start: WarmStart,
-        region: Region,
-    ) -> tuple[Cotangents, SolveResult]:
+        cotangent: base.Values,
+        start: base.WarmStart,
+        region: base.Region,
+    ) -> tuple[base.Cotangents, base.SolveResult]:
         """Return the gradient by all that the values depend on; it takes a fraction of the time that they took."""
-        kind, tie = _native_backup(backup, values.dtype)
-        tolerance = self.tolerance_for(values.dtype)
-        arguments = (_arrays_of(process), beta, values, cotangent, start.adjoint, start.order, region, tolerance)
-        by = (process.probabilities, process.reward, process.terminal_reward, process.discount, beta)
-        shapes = (shapes_of(by), _result_shapes(start.adjoint, start.order))
+        kind, tie = _native_backup(equation.backup, start.values.dtype)
+        tolerance = self.tolerance_for(start.values.dtype)
+        values, adjoint, order = start
+        process = jax.tree.leaves(equation.process)
+        arguments = (process, equation.beta, values, cotangent, adjoint, order, region, tolerance)
+        shapes = (native.shapes_of(tuple(equation.inputs)), _result_shapes(adjoint, order))
         limits = self.max_sweeps, self.max_region_sweeps
-        cotangents, result = call_host(partial(_pull_back, kind, tie, gradient == "exact", *limits), arguments, shapes)
-        return Cotangents(*cotangents), SolveResult(*result)
+        cotangents, result = native.call_host(
+            partial(_pull_back, kind, tie, gradient == "exact", *limits), arguments, shapes
+        )
+        return base.Cotangents(*cotangents), base.SolveResult(*result)
 
     def gather_rows(
         self, probabilities: Float[Array, "states actions outcomes"], visited: Int[Array, " visited"]
@@ -124,7 +112,7 @@ class GaussSeidel(Solver):
         """
         visited = jnp.where(visited < 0, visited + len(probabilities), visited)
         shape = jax.ShapeDtypeStruct((*visited.shape, *probabilities.shape[1:]), probabilities.dtype)
-        return call_host(_take_rows, (probabilities, visited), shape)
+        return native.call_host(_take_rows, (probabilities, visited), shape)
 
 
 def _solve_values(*arguments: Any) -> None:
@@ -156,20 +144,8 @@ def _no_order(states: int) -> Array:
     return jnp.full(states, -1, jnp.int32)
 
 
-def _arrays_of(process: DecisionProcess) -> tuple[Array, ...]:
-    """Return the fields of `HostProcess`."""
-    return (
-        process.successors,
-        process.probabilities,
-        process.reward,
-        process.terminal_reward,
-        process.terminal,
-        process.discount,
-    )
-
-
 def _result_shapes(values: Array, order: Array) -> tuple[jax.ShapeDtypeStruct, ...]:
     """Return the shapes of the fields of `SolveResult`."""
     count = jax.ShapeDtypeStruct((), jax.dtypes.canonicalize_dtype(int))
     residual = jax.ShapeDtypeStruct((), values.dtype)
-    return (*shapes_of((values, order)), count, residual, jax.ShapeDtypeStruct((), jnp.dtype(bool)))
+    return (*native.shapes_of((values, order)), count, residual, jax.ShapeDtypeStruct((), jnp.dtype(bool)))

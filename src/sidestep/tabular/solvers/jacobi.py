@@ -23,20 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sidestep.tabular.backups import Backup, Gradient
-from sidestep.tabular.solvers.base import (
-    Beta,
-    Cotangents,
-    DecisionProcess,
-    Region,
-    Solver,
-    SolveResult,
-    Tolerance,
-    WarmStart,
-    at_fixed_policy,
-    is_reachable,
-    lower_bound,
-    neg_inf,
-)
+from sidestep.tabular.solvers import base
 
 _STALLED = 1_000
 """The number of sweeps without progress after which an oscillating solve starts anew.
@@ -49,7 +36,7 @@ _OSCILLATIONS, _LARGE = 4, 0.1
 """The number of these sweeps in which a large change must alternate in sign; large as a part of the largest."""
 
 
-class Jacobi(Solver):
+class Jacobi(base.Solver):
     """Jacobi value iteration with a local Newton step: all states at once, on any device.
 
     Attributes:
@@ -68,18 +55,19 @@ class Jacobi(Solver):
         Puterman, *Markov Decision Processes* (1994), section 6.3.
     """
 
-    tolerance: Tolerance = None
+    tolerance: base.Tolerance = None
     max_sweeps: int = eqx.field(default=20_000, static=True)
 
-    def cold_start(self, states: int, dtype: jnp.dtype) -> WarmStart:
+    def cold_start(self, states: int, dtype: jnp.dtype) -> base.WarmStart:
         """Return a start without values and adjoint; an order is not used."""
-        return WarmStart(jnp.full(states, neg_inf(dtype), dtype), jnp.zeros(states, dtype), jnp.zeros(0, jnp.int32))
+        return base.WarmStart(
+            jnp.full(states, base.neg_inf(dtype), dtype), jnp.zeros(states, dtype), jnp.zeros(0, jnp.int32)
+        )
 
-    def values(
-        self, process: DecisionProcess, backup: Backup, beta: Beta, start: WarmStart, region: Region
-    ) -> SolveResult:
+    def values(self, equation: base.BellmanEquation, start: base.WarmStart, region: base.Region) -> base.SolveResult:
         """Return V of the fixed point, of all states whatever the region."""
         del region
+        process, backup, beta = equation
         exits = _exits(process)
         reward = jnp.broadcast_to(process.reward, process.successors.shape[:2]).T
 
@@ -91,54 +79,52 @@ class Jacobi(Solver):
             solved = process.with_terminal_rewards(_solve_states(backup, beta, exit_values, exit_weights, values))
             return solved, jnp.maximum(jnp.abs(solved), jnp.abs(exit_values).max(axis=0))
 
-        known = jnp.where(is_reachable(start.values), start.values, lower_bound(process))
+        known = jnp.where(base.is_reachable(start.values), start.values, base.lower_bound(process))
         return self._iterate(sweep, process.with_terminal_rewards(known), start.order)
 
     def vjp(
         self,
-        process: DecisionProcess,
-        backup: Backup,
-        beta: Beta,
+        equation: base.BellmanEquation,
         gradient: Gradient,
-        values: Float[Array, " states"],
-        cotangent: Float[Array, " states"],
-        start: WarmStart,
-        region: Region,
-    ) -> tuple[Cotangents, SolveResult]:
+        cotangent: base.Values,
+        start: base.WarmStart,
+        region: base.Region,
+    ) -> tuple[base.Cotangents, base.SolveResult]:
         """Return the gradient by all that the values depend on: the adjoint, and one backup pulled back by JAX."""
         del region
+        process, backup, beta = equation
+        values = start.values
         # states that cannot reach a terminal state have no finite values, and no part in the gradient
-        live = is_reachable(values) & ~process.terminal
+        live = base.is_reachable(values) & ~process.terminal
 
-        def action_values(process: DecisionProcess) -> Float[Array, "states actions"]:
+        def action_values(process: base.DecisionProcess) -> Float[Array, "states actions"]:
             return jnp.where(live[:, None], process.action_values(values), 0)
 
-        def one_backup(by: Cotangents) -> Float[Array, " states"]:
-            varied = DecisionProcess(process.successors, *by[:3], process.terminal, by.discount)
+        def one_backup(by: base.Cotangents) -> Float[Array, " states"]:
+            varied, _, beta = equation.at(by)
             q = action_values(varied)
-            backed_up = backup.value(q, by.beta) if gradient == "exact" else at_fixed_policy(backup, by.beta, q)
+            backed_up = backup.value(q, beta) if gradient == "exact" else base.at_fixed_policy(backup, beta, q)
             return varied.with_terminal_rewards(jnp.where(live, backed_up, 0))
 
         q = action_values(process)
         policy = backup.fixed_policy_weights(q, beta)
         weights = backup.weights(q, beta) if gradient == "exact" else policy
         result = self._adjoint(process, weights, policy, live, cotangent, start)
-        at = Cotangents(process.probabilities, process.reward, process.terminal_reward, process.discount, beta)
         adjoint = jnp.where(result.converged, result.values, jnp.nan)
-        by = jax.vjp(one_backup, at)[1](adjoint)[0]
+        by = jax.vjp(one_backup, equation.inputs)[1](adjoint)[0]
         # what the adjoint had no part in would stay 0
         by = jax.tree.map(lambda leaf: jnp.where(result.converged, leaf, jnp.nan), by)
         return by, result._replace(values=adjoint)
 
     def _adjoint(
         self,
-        process: DecisionProcess,
+        process: base.DecisionProcess,
         weights: Float[Array, "states actions"],
         policy: Float[Array, "states actions"],
         live: Bool[Array, " states"],
         cotangent: Float[Array, " states"],
-        start: WarmStart,
-    ) -> SolveResult:
+        start: base.WarmStart,
+    ) -> base.SolveResult:
         """Solve λ = g + Wᵀλ, with the `weights` in W and the `policy` held fixed, over `live` states."""
         exits = _exits(process)
         exit_weights = exits.one_minus_discount + exits.discounted_probs.sum(axis=1)
@@ -159,7 +145,7 @@ class Jacobi(Solver):
         sweep: Callable[[Array], tuple[Array, Array]],
         start: Float[Array, " states"],
         order: Int[Array, " ordered"],
-    ) -> SolveResult:
+    ) -> base.SolveResult:
         """Sweep until no change is large beside the sizes that `sweep` returns with its values."""
         tolerance = self.tolerance_for(start.dtype)
         most_stalled = max(_STALLED, len(start))
@@ -182,12 +168,12 @@ class Jacobi(Solver):
             diverged = jnp.isnan(residual) & jnp.isfinite(state.smallest)
             restart = diverged | ((stalled >= most_stalled) & (oscillations >= _OSCILLATIONS))
             # there is no half step to or from a state that has no value yet
-            damping = jnp.where(is_reachable(values) & is_reachable(old), state.damping, 1)
+            damping = jnp.where(base.is_reachable(values) & base.is_reachable(old), state.damping, 1)
             damped = jnp.where(damping < 1, old + damping * (values - old), values)
             left = jnp.where(diverged, jnp.inf, residual)
             sweeps = state.result.sweeps + 1
             return _LoopState(
-                SolveResult(jnp.where(restart, start, damped), order, sweeps, left, left <= tolerance),
+                base.SolveResult(jnp.where(restart, start, damped), order, sweeps, left, left <= tolerance),
                 jnp.where(restart, 0, change),
                 jnp.where(restart, state.damping / 2, state.damping),
                 jnp.where(restart, jnp.inf, jnp.where(smaller, residual, state.smallest)),
@@ -196,7 +182,7 @@ class Jacobi(Solver):
             )
 
         zero, infinite = jnp.asarray(0), jnp.asarray(jnp.inf, start.dtype)
-        result = SolveResult(start, order, zero, infinite, jnp.asarray(False))
+        result = base.SolveResult(start, order, zero, infinite, jnp.asarray(False))
         begun = _LoopState(result, jnp.zeros_like(start), jnp.ones_like(infinite), infinite, zero, zero)
         return jax.lax.while_loop(is_unfinished, step, begun).result
 
@@ -213,7 +199,7 @@ class _LoopState(NamedTuple):
         oscillations: The number of these in which a large change alternated in sign.
     """
 
-    result: SolveResult
+    result: base.SolveResult
     change: Float[Array, " states"]
     damping: Float[Array, ""]
     smallest: Float[Array, ""]
@@ -229,7 +215,7 @@ class _Exits(NamedTuple):
     one_minus_discount: Float[Array, ""]
 
 
-def _exits(process: DecisionProcess) -> _Exits:
+def _exits(process: base.DecisionProcess) -> _Exits:
     successors = jnp.moveaxis(process.successors, 0, -1)
     probabilities = jnp.moveaxis(process.probabilities, 0, -1)
     is_self_loop = successors == jnp.arange(len(process.successors))
@@ -244,24 +230,24 @@ def _probs_so_far(
 
     Once no further state gets a value, those without one cannot reach a terminal state, nor can what leads there.
     """
-    known = is_reachable(after)
-    frontier = ~is_reachable(values) & jnp.any(known & (exits.discounted_probs > 0), axis=(0, 1))
+    known = base.is_reachable(after)
+    frontier = ~base.is_reachable(values) & jnp.any(known & (exits.discounted_probs > 0), axis=(0, 1))
     return jnp.where(known | ~frontier.any(), exits.discounted_probs, 0)
 
 
 def _solve_states(
     backup: Backup,
-    beta: Beta,
+    beta: base.Beta,
     exit_values: Float[Array, "actions states"],
     exit_weights: Float[Array, "actions states"],
     old: Float[Array, " states"],
 ) -> Float[Array, " states"]:
     """Return one Newton step on each state's own equation, kept on the right side of the repeat-action value."""
-    bottom = neg_inf(old.dtype)
+    bottom = base.neg_inf(old.dtype)
     repeated = jnp.where(exit_weights > 0, exit_values / jnp.where(exit_weights > 0, exit_weights, 1), bottom)
     repeat_value = jnp.maximum(repeated.max(axis=0), bottom)
     bounded = jnp.maximum if backup.above_maximum else jnp.minimum
-    start = jnp.where(is_reachable(old), bounded(old, repeat_value), repeat_value)
+    start = jnp.where(base.is_reachable(old), bounded(old, repeat_value), repeat_value)
     advantage = (exit_values - exit_weights * start).T
     divisor = _divisor(backup.weights(advantage, beta), backup.fixed_policy_weights(advantage, beta), exit_weights)
     value = backup.value(advantage, beta)
@@ -272,7 +258,7 @@ def _solve_states(
         secant = backup.value((exit_values - exit_weights * repeat_value).T, beta) - value
         divisor = jnp.where(too_high, secant / jnp.where(too_high, start - repeat_value, 1), divisor)
     solved = bounded(start + value / divisor, repeat_value)
-    return jnp.where(is_reachable(repeat_value), jnp.maximum(solved, bottom), bottom)
+    return jnp.where(base.is_reachable(repeat_value), jnp.maximum(solved, bottom), bottom)
 
 
 def _divisor(

@@ -58,7 +58,7 @@ class HostProcess(NamedTuple):
     discount: np.floating
 
     @classmethod
-    def from_arrays(cls, arrays: tuple[np.ndarray, ...]) -> "HostProcess":
+    def from_arrays(cls, arrays: list[np.ndarray]) -> "HostProcess":
         """Return the process of its fields as arrays."""
         *others, discount = arrays
         return cls(*others, discount=discount.dtype.type(discount))

@@ -22,22 +22,14 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Float, Int
 
+from sidestep.tabular.solvers import native
 from sidestep.tabular.solvers.base import neg_inf
-from sidestep.tabular.solvers.native import (
-    BOLTZMANN,
-    LOG_SUM_EXP,
-    NativeBackup,
-    SolveInfo,
-    check_interrupt,
-    map_ranges,
-    run_parallel,
-)
 from sidestep.tabular.solvers.ordering import NumberedProcess
 from sidestep.tabular.solvers.value_kernels import SweepHistory, sweep_kernel
 
 _Result = TypeVar("_Result")
 
-_SHIFTED_BACKUPS = (BOLTZMANN, LOG_SUM_EXP)
+_SHIFTED_BACKUPS = (native.BOLTZMANN, native.LOG_SUM_EXP)
 _MOST_PAIRS = 4
 """The most pairs of rounds in step 1."""
 _GROWTH = 2.0
@@ -82,7 +74,7 @@ class SweepLoop:
         values: Float[np.ndarray, " states"],
         greedy_successor: Int[np.ndarray, " states"],
         positions: Int[np.ndarray, " solved"],
-        backup: NativeBackup,
+        backup: native.NativeBackup,
         tolerance: np.floating,
         max_sweeps: int,
         max_rounds: int,
@@ -95,7 +87,7 @@ class SweepLoop:
         self.blocks = np.split(positions, range(size, len(positions), size))
         self.number = self.round_first = self.rounds = self.solved = 0
 
-    def run(self) -> SolveInfo:
+    def run(self) -> native.SolveInfo:
         """Sweep until no value of `positions` changes by more than the tolerance, or a limit is reached."""
         if len(self.positions) < len(self.values):
             self._begin_round()
@@ -108,11 +100,11 @@ class SweepLoop:
             if residual <= self.tolerance and not self._limit_reached():
                 residual = self.jacobi_sweep()
                 converged = bool(residual <= self.tolerance)
-        return SolveInfo(-(-self.solved // len(self.values)), float(residual), converged)
+        return native.SolveInfo(-(-self.solved // len(self.values)), float(residual), converged)
 
     def sweep(self, positions: Int[np.ndarray, " solved"], shift_from: int) -> float:
         """Sweep over some states, those from a position on shifted; return the largest change."""
-        check_interrupt()
+        native.check_interrupt()
         change, solved = self._solve(self.values, self._next_sweep(), positions, shift_from)
         self.solved += solved
         return change
@@ -127,7 +119,7 @@ class SweepLoop:
         def solve(begin: int, end: int) -> float:
             return self._solve(into, sweep, self.positions[begin:end], shift_from=len(into), solve_all=True)[0]
 
-        residual = float(np.max(map_ranges(solve, len(self.positions))))
+        residual = float(np.max(native.map_ranges(solve, len(self.positions))))
         self.values[:] = into
         # no state saw the new values of the others, whichever came first
         history, changed = self.history, self.history.last_changed == self.number
@@ -250,7 +242,7 @@ def pipeline(
     first: list[_Result] = []
     second: list[_Result] = []
     while len(second) < len(blocks):
-        check_interrupt()
+        native.check_interrupt()
         ahead, behind = len(first), len(second)
         works = []
         if ahead < len(blocks):
@@ -263,6 +255,6 @@ def pipeline(
             follows = True
         if follows:
             works.append((second, partial(following, blocks[behind])))
-        for (results, _), result in zip(works, run_parallel([work for _, work in works]), strict=True):
+        for (results, _), result in zip(works, native.run_parallel([work for _, work in works]), strict=True):
             results.append(result)
     return first, second

@@ -11,15 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sidestep.tabular.solvers import native
 from sidestep.tabular.solvers.base import neg_inf
-from sidestep.tabular.solvers.native import (
-    HostProcess,
-    HostResult,
-    NativeBackup,
-    SolveInfo,
-    inverse_permutation,
-    map_ranges,
-)
 from sidestep.tabular.solvers.ordering import NumberedProcess, number_process, order_by_distance
 from sidestep.tabular.solvers.sweep_loop import SweepLoop
 from sidestep.tabular.solvers.value_kernels import first_values_kernel
@@ -38,8 +31,8 @@ _TRUSTED_ROUNDS = 4
 class _Problem(NamedTuple):
     """What is to be solved, and how well; `bound` is a lower bound of the values."""
 
-    process: HostProcess
-    backup: NativeBackup
+    process: native.HostProcess
+    backup: native.NativeBackup
     bound: np.floating
     tolerance: np.floating
 
@@ -54,7 +47,7 @@ def solve_values(
     tie: float,
     max_sweeps: int,
     into: tuple[np.ndarray, ...],
-    process: tuple[np.ndarray, ...],
+    process: list[np.ndarray],
     bound: Float[np.ndarray, ""],
     beta: Float[np.ndarray, ""],
     start: Float[np.ndarray, " states"],
@@ -75,15 +68,15 @@ def solve_values(
         tolerance: The relative change at which to stop.
     """
     number = start.dtype.type
-    backup = NativeBackup(kind, number(beta), number(tie))
-    problem = _Problem(HostProcess.from_arrays(process), backup, number(bound), number(tolerance))
-    result = HostResult(*into)
+    backup = native.NativeBackup(kind, number(beta), number(tie))
+    problem = _Problem(native.HostProcess.from_arrays(process), backup, number(bound), number(tolerance))
+    result = native.HostResult(*into)
     if problem.has_nan():
         result.values[:] = np.nan
-        result.write(order, SolveInfo(0, np.nan, False))
+        result.write(order, native.SolveInfo(0, np.nan, False))
         return
     unknown = number(neg_inf(start.dtype))
-    info = SolveInfo(0, np.inf, False)
+    info = native.SolveInfo(0, np.inf, False)
     region = region if region.any() else np.ones_like(region)
     if (start > unknown).any():
         digits = -np.log10(max(problem.tolerance, np.finfo(start.dtype).eps))
@@ -105,14 +98,14 @@ def _solve_from(
     problem: _Problem,
     max_sweeps: int,
     max_rounds: int,
-    result: HostResult,
-) -> SolveInfo:
+    result: native.HostResult,
+) -> native.SolveInfo:
     """Solve from values and an order, or a new one if that does not serve; write the values and the order."""
-    position = inverse_permutation(order)
+    position = native.inverse_permutation(order)
     begun = None if position is None else _begin(start, order, position, problem)
     if begun is None or begun.out_of_order > _OUT_OF_ORDER * len(order):
         best = order_by_distance(problem.process)
-        position = inverse_permutation(best)
+        position = native.inverse_permutation(best)
         assert position is not None
         begun = _begin(start, best, position, problem)
     positions = np.arange(len(order), dtype=np.int32)
@@ -160,7 +153,7 @@ def _begin(
     values, ends = start[order], np.flatnonzero(process.terminal)
     values[ends] = np.broadcast_to(problem.process.terminal_reward, start.shape)[order[ends]]
     greedy = np.empty_like(order)
-    counts = map_ranges(
+    counts = native.map_ranges(
         lambda begin, end: kernels.greedy_successors(begin, end, process, values, unknown, greedy), len(order)
     )
     first_values_kernel(*process.discounted_probs.shape[1:])(problem.backup, process, values, unknown, problem.bound)
