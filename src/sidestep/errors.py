@@ -39,6 +39,14 @@ class InputError(SidestepError):
         return InputError(self.message, source=source, field=self.field)
 
 
+def check(
+    valid: object, message: str, *, source: object | None = None, row: int | None = None, field: str | None = None
+) -> None:
+    """Raise `InputError` with a message and a place unless something is true."""
+    if not valid:
+        raise InputError(message, source=source, row=row, field=field)
+
+
 def check_count(value: object, least: int, field: str) -> None:
     """Raise `InputError` unless a setting is a whole number, at least `least`."""
     if isinstance(value, bool) or not isinstance(value, Integral) or value < least:

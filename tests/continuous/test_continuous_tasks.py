@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers.small_worlds import table_tasks
 from sidestep.continuous.tasks import (
     PendulumTask,
     QuadraticTask,
@@ -12,7 +13,6 @@ from sidestep.continuous.tasks import (
     batch_tasks,
     check_tasks,
     reach_region,
-    table_tasks,
     task_at,
 )
 from sidestep.errors import InputError

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from sidestep.continuous.critic import make_critic
-from sidestep.continuous.policies import FinitePolicy, finite_policy, gaussian_policy, table_policy
+from sidestep.continuous.policies import FinitePolicy, finite_policy, gaussian_policy
 from sidestep.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("unoptimised")
@@ -55,15 +55,6 @@ def test_finite_policy_sample_frequencies_match_probabilities():
     choices = drawn(FINITE, jax.random.split(KEY, 20_000), X)
     np.testing.assert_allclose(np.bincount(choices, minlength=4) / 20_000, np.exp(FINITE.log_probs(X)), atol=0.015)
     np.testing.assert_array_equal(FINITE.action(jnp.asarray(2)), ACTIONS[2])
-
-
-def test_table_policy_has_a_logit_for_every_feature_and_action():
-    policy = table_policy(3, 2)
-    weights = jnp.asarray([[1.0, 0.0], [0.0, 2.0], [0.0, 0.0]])
-    policy = eqx.tree_at(lambda each: each.network.network.weight, policy, weights)
-    expected = np.log(np.exp(weights) / np.exp(weights).sum(axis=0)).T
-    np.testing.assert_allclose(jax.vmap(policy.log_probs)(jnp.eye(2)), expected, atol=1e-12)
-    np.testing.assert_array_equal(policy.actions, [0, 1, 2])
 
 
 # Over vectors

@@ -22,10 +22,19 @@ from helpers.small_worlds import (
     linear,
     policy_table,
     table,
+    table_policy,
     with_logits,
 )
-from sidestep.continuous.planner import Planner, PlannerState, PlanProgress, PolicyPlan, check_planner, plan_policy
-from sidestep.continuous.policies import gaussian_policy, table_policy
+from sidestep.continuous.planner import (
+    Planner,
+    PlannerState,
+    PlanProblem,
+    PlanProgress,
+    PolicyPlan,
+    check_planner,
+    plan_policy,
+)
+from sidestep.continuous.policies import gaussian_policy
 from sidestep.continuous.policy_gradient import minibatches
 from sidestep.continuous.tasks import task_at
 from sidestep.errors import InputError, NotConverged
@@ -57,7 +66,8 @@ def divergence(pi, other):
 @pytest.fixture(scope="module")
 def initial() -> PlannerState:
     """PlannerState at its start, from the uniform policy."""
-    return PLANNER.initialize(jax.random.key(0), WORLD.dynamics, UNIFORM, task_at(WORLD.tasks, WHICH), SOFT, PLACES)
+    agent = PlanProblem(WORLD.dynamics, task_at(WORLD.tasks, WHICH), SOFT, PLACES)
+    return PLANNER.initialize(jax.random.key(0), agent, UNIFORM)
 
 
 @pytest.fixture(scope="module")
@@ -257,10 +267,9 @@ def test_plan_policy_refuses_bad_starts():
         planned_from(PLACES[:2], jnp.asarray([0, 2]))
     with pytest.raises(InputError, match=r"states.*row 2.*has not ended"):
         planned_from(jnp.asarray([0, 4]), jnp.zeros(2, int))
+    agent = PlanProblem(world, task_at(tasks, jnp.zeros(2, int)), SOFT, jnp.asarray([4, 4]))
     with pytest.raises(InputError, match="has not ended"):
-        PLANNER.initialize(
-            jax.random.key(0), world, UNIFORM, task_at(tasks, jnp.zeros(2, int)), SOFT, jnp.asarray([4, 4])
-        )
+        PLANNER.initialize(jax.random.key(0), agent, UNIFORM)
 
 
 def test_minibatches_hold_every_move_and_are_disjoint():

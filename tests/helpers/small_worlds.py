@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from sidestep.continuous.dynamics import LinearGaussian, TableDynamics
-from sidestep.continuous.policies import FinitePolicy, GaussianPolicy, Policy, ScaledNetwork, table_policy
-from sidestep.continuous.tasks import QuadraticTask, TableTask, table_tasks
+from sidestep.continuous.policies import FinitePolicy, GaussianPolicy, Policy, ScaledNetwork
+from sidestep.continuous.tasks import QuadraticTask, TableTask
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.graph import graph
 from sidestep.tabular.models import TabularModel
@@ -39,6 +39,22 @@ def table(seed=3) -> Table:
     tasks = Task(jnp.asarray(reward), jnp.asarray(final), ENDS, jnp.asarray(np.array([0.8, 0.6])))
     policy = with_logits(jnp.asarray(random.normal(size=reward.shape)))
     return Table(TableDynamics(model), table_tasks(tasks, STATES, ACTIONS), policy)
+
+
+def table_tasks(tasks: Task, states: int, actions: int) -> TableTask:
+    """Stacked tabular tasks as continuous ones, in a world with this number of states and actions."""
+    count = len(tasks.terminal)
+    reward = jnp.broadcast_to(tasks.reward, (count, states, actions))
+    terminal_reward = jnp.broadcast_to(tasks.terminal_reward, (count, states))
+    table = Task(reward, terminal_reward, tasks.terminal, tasks.discount)
+    return TableTask(task=table, index=jnp.eye(count, dtype=reward.dtype), discount=tasks.discount)
+
+
+def table_policy(actions: int, features: int) -> FinitePolicy:
+    """A policy with a logit of its own for every feature and action, for one-hot features."""
+    linear = eqx.nn.Linear(features, actions, use_bias=False, key=jax.random.key(0))
+    linear = eqx.tree_at(lambda layer: layer.weight, linear, jnp.zeros((actions, features)))
+    return FinitePolicy(ScaledNetwork(linear, jnp.zeros(features), jnp.ones(features)), jnp.arange(actions))
 
 
 def with_logits(logits) -> FinitePolicy:

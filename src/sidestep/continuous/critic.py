@@ -10,7 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, Scalar
 
-from sidestep.continuous.policies import Features, ScaledNetwork, scaled_network
+from sidestep.continuous.policies import Examples, Features, ScaledNetwork, scaled_network
+
+PerExample = Float[Array, " examples"]
 
 
 class Critic(eqx.Module):
@@ -27,13 +29,7 @@ class Critic(eqx.Module):
 
 
 def make_critic(
-    key: PRNGKeyArray,
-    examples: Float[Array, "examples features"],
-    left: Float[Array, " examples"],
-    returns: Float[Array, " examples"],
-    *,
-    width: int = 64,
-    depth: int = 2,
+    key: PRNGKeyArray, examples: Examples, left: PerExample, returns: PerExample, *, width: int = 64, depth: int = 2
 ) -> Critic:
     """Return a critic that begins at the mean of observed returns-to-go.
 
@@ -50,9 +46,5 @@ def make_critic(
         >>> float(critic.center), float(critic.spread)
         (2.0, 1.0)
     """
-    spread = returns.std()
-    return Critic(
-        scaled_network(key, jnp.column_stack([examples, left]), 1, width, depth),
-        returns.mean(),
-        jnp.where(spread > 0, spread, 1.0),
-    )
+    network, spread = scaled_network(key, jnp.column_stack([examples, left]), 1, width, depth), returns.std()
+    return Critic(network, returns.mean(), jnp.where(spread > 0, spread, 1.0))

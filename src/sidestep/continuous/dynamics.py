@@ -26,12 +26,14 @@ from jax.scipy.stats import norm
 from jaxtyping import Array, Float, PRNGKeyArray, Scalar, Shaped
 
 from sidestep._typing import ArrayTree, FloatTree, Tree
-from sidestep.errors import InputError
+from sidestep.errors import InputError, check
 from sidestep.tabular.models import TransitionModel
 
 State = Shaped[Array, "*state"]
 Action = Shaped[Array, "*action"]
-ValueFunction = Callable[[State], Float[Scalar, ""]]
+Real = Float[Scalar, ""]
+Vector = Float[Array, " dimensions"]
+ValueFunction = Callable[[State], Real]
 
 _Family = TypeVar("_Family", bound="Dynamics")
 
@@ -58,17 +60,14 @@ class Dynamics(eqx.Module):
         """Draw a next state s′ ~ T_θ(s, a, ·)."""
 
     @abc.abstractmethod
-    def log_prob(self, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
+    def log_prob(self, state: State, action: Action, next_state: State) -> Real:
         """Return ln T_θ(s, a, s′), in nats."""
 
-    def transition_control_variate(
-        self, value: ValueFunction, state: State, action: Action, next_state: State
-    ) -> Float[Scalar, ""]:
+    def transition_control_variate(self, value: ValueFunction, state: State, action: Action, next_state: State) -> Real:
         """Return v(s′) − E[v(s′)] for a function v close to `value`; its mean over next states is 0.
 
         Rollouts subtract it to reduce their variance. It is 0 unless a family defines it.
         """
-        del value, state, action, next_state
         return jnp.zeros((), jnp.result_type(float))
 
     def with_parameters(self: _Family, parameters: FloatTree) -> _Family:
@@ -88,7 +87,7 @@ class Outcomes(NamedTuple):
     means: Float[Array, "outcomes dimensions"]
 
     @classmethod
-    def single(cls, mean: Float[Array, " dimensions"]) -> "Outcomes":
+    def single(cls, mean: Vector) -> "Outcomes":
         """Return the outcomes of an action with a single one."""
         return cls(jnp.zeros(1, mean.dtype), mean[None])
 
@@ -103,10 +102,10 @@ class GaussianDynamics(Dynamics):
         noise: the standard deviation of every component of the state, above 0; it is not learned.
     """
 
-    noise: eqx.AbstractVar[Float[Array, " dimensions"]]
+    noise: eqx.AbstractVar[Vector]
 
     @abc.abstractmethod
-    def outcomes(self, state: Float[Array, " dimensions"], action: Float[Array, " inputs"]) -> Outcomes:
+    def outcomes(self, state: Vector, action: Float[Array, " inputs"]) -> Outcomes:
         """Return the outcomes of an action."""
 
     @property
@@ -126,13 +125,11 @@ class GaussianDynamics(Dynamics):
         outcome = 0 if len(means) == 1 else jax.random.categorical(outcome_key, log_probabilities)
         return means[outcome] + self.noise * jax.random.normal(noise_key, means.shape[1:], means.dtype)
 
-    def log_prob(self, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
+    def log_prob(self, state: State, action: Action, next_state: State) -> Real:
         """Return the logarithm of the mixture's density."""
         return jax.nn.logsumexp(self._joint_log_probs(self.outcomes(state, action), next_state))
 
-    def transition_control_variate(
-        self, value: ValueFunction, state: State, action: Action, next_state: State
-    ) -> Float[Scalar, ""]:
+    def transition_control_variate(self, value: ValueFunction, state: State, action: Action, next_state: State) -> Real:
         """Return Σ_k P(k | s′) v_k(s′) − Σ_k p_k v(m_k), with v_k(s′) = v(m_k) + ∇v(m_k)·(s′ − m_k).
 
         v_k is the value function made linear around outcome k; its mean is known.
@@ -169,28 +166,23 @@ class LinearGaussian(GaussianDynamics):
     """
 
     parameters: dict[str, Float[Array, "dimensions _"]]
-    noise: Float[Array, " dimensions"]
+    noise: Vector
 
     def __init__(
-        self,
-        state: Float[Array, "dimensions dimensions"],
-        action: Float[Array, "dimensions inputs"],
-        noise: Float[Array, " dimensions"],
+        self, state: Float[Array, "dimensions dimensions"], action: Float[Array, "dimensions inputs"], noise: Vector
     ):
         self.noise = checked_noise(noise, len(state))
         self.parameters = {"state": jnp.asarray(state), "action": jnp.asarray(action)}
-        if np.shape(state) != (len(state),) * 2 or np.ndim(action) != 2 or len(action) != len(state):
-            raise InputError(
-                f"expected a square matrix and one with as many rows, found {np.shape(state)} and {np.shape(action)}",
-                field="state, action",
-            )
+        fits = np.shape(state) == (len(state),) * 2 and np.ndim(action) == 2 and len(action) == len(state)
+        message = f"expected a square matrix and one with as many rows, found {np.shape(state)} and {np.shape(action)}"
+        check(fits, message, field="state, action")
         check_finite(self.parameters)
 
     def example_action(self) -> Float[Array, " inputs"]:
         """Return an action with as many components as B has columns."""
         return jnp.zeros_like(self.parameters["action"][0])
 
-    def outcomes(self, state: Float[Array, " dimensions"], action: Float[Array, " inputs"]) -> Outcomes:
+    def outcomes(self, state: Vector, action: Float[Array, " inputs"]) -> Outcomes:
         """Return A s + B a as the only outcome."""
         return Outcomes.single(self.parameters["state"] @ state + self.parameters["action"] @ action)
 
@@ -227,7 +219,7 @@ class TableDynamics(Dynamics):
         outcome = jax.random.categorical(key, jnp.log(self._probabilities(state, action)))
         return self.model.graph.successors[state, action, outcome].astype(state.dtype)
 
-    def log_prob(self, state: State, action: Action, next_state: State) -> Float[Scalar, ""]:
+    def log_prob(self, state: State, action: Action, next_state: State) -> Real:
         """Return the logarithm of the total probability of all outcomes that are the next state."""
         same = self.model.graph.successors[state, action] == next_state
         probability = jnp.sum(jnp.where(same, self._probabilities(state, action), 0.0))
@@ -235,15 +227,13 @@ class TableDynamics(Dynamics):
         possible = probability > 0
         return jnp.where(possible, jnp.log(jnp.where(possible, probability, 1.0)), -jnp.inf)
 
-    def transition_control_variate(
-        self, value: ValueFunction, state: State, action: Action, next_state: State
-    ) -> Float[Scalar, ""]:
+    def transition_control_variate(self, value: ValueFunction, state: State, action: Action, next_state: State) -> Real:
         """Return v(s′) − E[v(s′)] of the value function itself."""
         successors = self.model.graph.successors[state, action].astype(next_state.dtype)
         return value(next_state) - self._probabilities(state, action) @ jax.vmap(value)(successors)
 
 
-def checked_noise(noise: Float[Array, " _"] | np.ndarray, dimensions: int) -> Float[Array, " dimensions"]:
+def checked_noise(noise: Float[Array, " _"] | np.ndarray, dimensions: int) -> Vector:
     """Return standard deviations as floating-point numbers; refuse any that are not finite and above 0."""
     noise = jnp.asarray(noise, jnp.result_type(float))
     if noise.shape != (dimensions,):
@@ -260,7 +250,7 @@ def check_finite(arrays: ArrayTree, field: str = "parameters") -> None:
             raise InputError("expected finite numbers", field=field)
 
 
-def check_corners(low: Float[Array, " dimensions"], high: Float[Array, " dimensions"]) -> None:
+def check_corners(low: Vector, high: Vector) -> None:
     """Refuse corners that are not finite, or a `high` that does not lie above `low`."""
     if not (np.isfinite(low).all() and np.isfinite(high).all() and (np.asarray(low) < np.asarray(high)).all()):
         raise InputError(f"expected corners in order, found {low} and {high}", field="low, high")

@@ -31,15 +31,15 @@ from jaxtyping import Array, Float, PRNGKeyArray, Shaped
 from sidestep._typing import FloatTree
 from sidestep.continuous.critic import Critic
 from sidestep.continuous.dynamics import Dynamics
-from sidestep.continuous.policies import Policy
+from sidestep.continuous.policies import PerCandidate, PerSample, Policy
 from sidestep.continuous.rollouts import Rollout, discount_powers, q_estimates, sample_rollouts
 from sidestep.continuous.tasks import ContinuousTask
-from sidestep.errors import InputError
+from sidestep.errors import InputError, check
 from sidestep.tabular.backups import Behavior
 
 Estimator = Literal["score", "pathwise"]
 
-WeightFunction = Callable[[Float[Array, "starts candidates"]], Float[Array, "starts candidates"]]
+WeightFunction = Callable[[PerCandidate], PerCandidate]
 """The weights of ∇Q of all candidates, as a function of the estimates of Q."""
 
 
@@ -58,11 +58,8 @@ def features_at_moves(rollouts: Rollout) -> Float[Array, "*batch moves features"
 
 def policy_log_probs(policy: Policy, rollouts: Rollout) -> Float[Array, "*batch moves"]:
     """Return ln π_λ(a_i | s_i) of every move."""
-
-    def log_prob(task: ContinuousTask, state: Array, choice: Array) -> Array:
-        return policy.log_prob(task.features(state), choice)
-
-    return at_every_move(log_prob, rollouts, rollouts.choices)
+    moves = rollouts, rollouts.choices
+    return at_every_move(lambda task, state, choice: policy.log_prob(task.features(state), choice), *moves)
 
 
 def policy_advantages(policy: Policy, rollouts: Rollout) -> Float[Array, "*batch moves"]:
@@ -77,11 +74,8 @@ def policy_advantages(policy: Policy, rollouts: Rollout) -> Float[Array, "*batch
 
 def critic_values(critic: Critic, rollouts: Rollout) -> Float[Array, "*batch moves"]:
     """Return V_w of every state that a move leaves."""
-
-    def value(task: ContinuousTask, state: Array, left: Array) -> Array:
-        return critic(task.features(state), left)
-
-    return at_every_move(value, rollouts, rollouts.fraction_left)
+    moves = rollouts, rollouts.fraction_left
+    return at_every_move(lambda task, state, left: critic(task.features(state), left), *moves)
 
 
 def action_baselines(critic: Critic | None, rollouts: Rollout) -> Float[Array, "*batch moves"]:
@@ -126,8 +120,7 @@ def score_surrogate(
     beyond = q_estimates(rollouts) + rollouts.transition_control_variates - baselines
     credit = discount_powers(rollouts, rollouts.acting.shape[-1]) * jnp.where(rollouts.acting, beyond, 0.0)
 
-    def log_prob(task: ContinuousTask, state: Array, choice: Array, following: Array) -> Array:
-        del task
+    def log_prob(_: ContinuousTask, state: Array, choice: Array, following: Array) -> Array:
         return dynamics.log_prob(state, policy.action(choice), following)
 
     log_probs = at_every_move(log_prob, rollouts, rollouts.choices, rollouts.following)
@@ -209,16 +202,13 @@ def value_gradient(
 
 def check_estimator(estimator: Estimator, dynamics: Dynamics, tasks: ContinuousTask) -> None:
     """Refuse an estimator that does not exist, or is biased for these dynamics or tasks."""
-    if estimator not in ("score", "pathwise"):
-        raise InputError(f"expected 'score' or 'pathwise', found {estimator!r}", field="estimator")
+    check(estimator in ("score", "pathwise"), f"expected 'score' or 'pathwise', found {estimator!r}", field="estimator")
     if estimator == "pathwise" and not (dynamics.reparameterized and tasks.smooth):
         what = "these dynamics jump" if not dynamics.reparameterized else "the returns of these tasks jump"
         raise InputError(f"{what}, and gradients along the path do not see that: expected 'score'", field="estimator")
 
 
-def _cross_weights(
-    q: Float[Array, "starts candidates samples"], weight_function: WeightFunction
-) -> Float[Array, "starts candidates samples"]:
+def _cross_weights(q: PerSample, weight_function: WeightFunction) -> PerSample:
     """Return the weight of every rollout, by the Q estimates of the other half of the samples."""
     samples = q.shape[-1]
     if samples < 2:

@@ -30,7 +30,7 @@ from sidestep.continuous.likelihood import (
     improve_policy,
     objective_gradient,
 )
-from sidestep.continuous.planner import Planner, PlannerState, SomePolicy, plan_policy
+from sidestep.continuous.planner import Planner, PlannerState, PlanProblem, SomePolicy, plan_policy
 from sidestep.continuous.policies import Policy
 from sidestep.continuous.tasks import task_at
 from sidestep.continuous.trajectories import check_choices
@@ -141,10 +141,8 @@ def fit_dynamics(
         progress = FitProgress(iteration, *(float(number) for number in numbers[1:]))
         history.append(progress)
         if not np.isfinite(progress).all():
-            raise NotConverged(
-                f"the figures ceased to be finite at iteration {iteration}: dynamics or rewards that return NaN, "
-                "or too high a learning rate"
-            )
+            reason = "dynamics or rewards that return NaN, or too high a learning rate"
+            raise NotConverged(f"the figures ceased to be finite at iteration {iteration}: {reason}")
         saver.save(carried, history)
         if report:
             report(progress, dynamics.with_parameters(eqx.combine(carried, fixed).parameters))
@@ -160,12 +158,11 @@ def problem_fingerprint(problem: Tree) -> str:
 
 def _initialize(problem: FitProblem, policy: Policy, key: PRNGKeyArray) -> _State:
     demos, parameters = problem.demonstrations, problem.dynamics.parameters
-    own = task_at(demos.tasks, demos.task)
-    planner_state = problem.planner.initialize(key, problem.dynamics, policy, own, problem.behavior, demos.states)
+    agent = PlanProblem(problem.dynamics, task_at(demos.tasks, demos.task), problem.behavior, demos.states)
+    planner_state = problem.planner.initialize(key, agent, policy)
     flat = ravel_pytree(parameters)[0]
-    return _State(
-        parameters, problem.schedule.adam().init(parameters), planner_state, jnp.zeros((2, len(flat)), flat.dtype)
-    )
+    sums = jnp.zeros((2, len(flat)), flat.dtype)
+    return _State(parameters, problem.schedule.adam().init(parameters), planner_state, sums)
 
 
 def _warm_up(problem: FitProblem, state: _State, key: PRNGKeyArray) -> _State:
@@ -173,18 +170,10 @@ def _warm_up(problem: FitProblem, state: _State, key: PRNGKeyArray) -> _State:
     if not problem.schedule.policy_warmup or "actions" not in problem.terms:
         return state
     demos = problem.demonstrations
-    plan = plan_policy(
-        problem.dynamics,
-        demos.tasks,
-        problem.behavior,
-        state.planner_state.policy,
-        demos.states,
-        demos.task,
-        problem.planner,
-        steps=problem.schedule.policy_warmup,
-        seed=int(jax.random.randint(key, (), 0, 2**31 - 1)),
-        warm_start=state.planner_state,
-    )
+    start, steps = state.planner_state, problem.schedule.policy_warmup
+    agent = problem.dynamics, demos.tasks, problem.behavior, start.policy
+    seed = int(jax.random.randint(key, (), 0, 2**31 - 1))
+    plan = plan_policy(*agent, demos.states, demos.task, problem.planner, steps=steps, seed=seed, warm_start=start)
     return eqx.tree_at(lambda state: state.planner_state, state, plan.planner_state)
 
 

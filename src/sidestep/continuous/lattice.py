@@ -15,14 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sidestep.continuous.dynamics import GaussianDynamics, check_corners
+from sidestep.continuous.dynamics import GaussianDynamics, Vector, check_corners
 from sidestep.continuous.tasks import ContinuousTask
 from sidestep.errors import InputError
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.models import TabularModel
 from sidestep.tabular.tasks import Task
 
-Vector = Float[Array, " dimensions"]
+Actions = Float[Array, "actions inputs"]
 
 
 class Lattice(eqx.Module):
@@ -73,11 +73,8 @@ class Lattice(eqx.Module):
 
     def interpolation_weights(self, place: Vector) -> tuple[Int[Array, " corners"], Float[Array, " corners"]]:
         """Return the points around a place and their weights, which add up to one."""
-        position, counts, rings = (
-            (place - self.low) / self.spacing,
-            jnp.asarray(self.counts),
-            jnp.asarray(self.periodic),
-        )
+        position = (place - self.low) / self.spacing
+        counts, rings = jnp.asarray(self.counts), jnp.asarray(self.periodic)
         position = jnp.where(rings, jnp.mod(position, counts), jnp.clip(position, 0, counts - 1))
         first = jnp.floor(position).astype(jnp.int32)
         first = jnp.where(rings, first, jnp.minimum(first, counts - 2))
@@ -93,9 +90,7 @@ class Lattice(eqx.Module):
         return values[points] @ weights
 
 
-def tabular_model(
-    dynamics: GaussianDynamics, lattice: Lattice, actions: Float[Array, "actions inputs"]
-) -> TabularModel:
+def tabular_model(dynamics: GaussianDynamics, lattice: Lattice, actions: Actions) -> TabularModel:
     """Return the transition model of a lattice over a continuous world.
 
     References:
@@ -113,7 +108,7 @@ def tabular_model(
     return TabularModel(Graph(successors, jnp.ones((1, 1))), logits, possible)
 
 
-def tabular_task(task: ContinuousTask, lattice: Lattice, actions: Float[Array, "actions inputs"]) -> Task:
+def tabular_task(task: ContinuousTask, lattice: Lattice, actions: Actions) -> Task:
     """Return a continuous task on the points of a lattice."""
     points = lattice.points()
     reward = jax.vmap(jax.vmap(task.reward, (None, 0)), (0, None))(points, actions)
@@ -126,7 +121,7 @@ def action_values(
     task: ContinuousTask,
     values: Float[Array, " points"],
     state: Vector,
-    actions: Float[Array, "actions inputs"],
+    actions: Actions,
 ) -> Float[Array, " actions"]:
     """Return Q(s, a) at any place by one move of look-ahead, from the values of a lattice's points."""
 

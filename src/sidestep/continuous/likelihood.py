@@ -22,14 +22,16 @@ from sidestep._typing import Tree
 from sidestep.continuous.dynamics import Dynamics, check_finite
 from sidestep.continuous.estimators import Estimator, check_estimator, value_gradient
 from sidestep.continuous.planner import Planner, PlannerState, PlanProgress, check_planner, check_starts
-from sidestep.continuous.policies import FinitePolicy, Policy
+from sidestep.continuous.policies import FinitePolicy, PerCandidate, Policy
 from sidestep.continuous.rollouts import q_estimates
 from sidestep.continuous.tasks import ContinuousTask, check_tasks, task_at, task_features
-from sidestep.errors import InputError, check_count, check_positive
+from sidestep.errors import InputError, check, check_count, check_positive
 from sidestep.inference.priors import Prior
 from sidestep.tabular.backups import Behavior, LogSumExp
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import ALL_TERMS, Term
+
+_Moves = Int[Array, " batch"]
 
 
 class FitProgress(NamedTuple):
@@ -110,19 +112,12 @@ class FitProblem(eqx.Module):
     estimator: Estimator = eqx.field(static=True)
 
 
-class _Batch(NamedTuple):
-    """Indices of moves, and the factor from a sum over them to a sum over all moves."""
-
-    moves: Int[Array, " batch"]
-    scale: float
-
-
 def improve_policy(
     problem: FitProblem, parameters: Tree, planner_state: PlannerState, key: PRNGKeyArray
 ) -> PlannerState:
     """Make a step of the policy and its critic by rollouts from a batch of moves; the model stays the same."""
     batch_key, rollout_key = jax.random.split(key)
-    return _action_terms(problem, parameters, planner_state, _draw_batch(problem, batch_key), rollout_key)[0]
+    return _action_terms(problem, parameters, planner_state, _draw_moves(problem, batch_key), rollout_key)[0]
 
 
 def objective_gradient(
@@ -137,12 +132,12 @@ def objective_gradient(
         Eq. 6 of the paper, with ∇Q by eq. 11.
     """
     batch_key, rollout_key = jax.random.split(key)
-    batch = _draw_batch(problem, batch_key)
-    slope, transitions, prior = _rollout_free_terms(problem, parameters, batch)
+    moves = _draw_moves(problem, batch_key)
+    slope, transitions, prior = _rollout_free_terms(problem, parameters, moves)
     actions = zero = jnp.zeros_like(prior)
     figures = zero, zero, zero
     if "actions" in problem.terms:
-        terms = _action_terms(problem, parameters, planner_state, batch, rollout_key)
+        terms = _action_terms(problem, parameters, planner_state, moves, rollout_key)
         planner_state, action_slope, actions, plan = terms
         slope = jax.tree.map(jnp.add, slope, action_slope)
         figures = plan.expected_return, plan.entropy, plan.policy_gap
@@ -150,23 +145,21 @@ def objective_gradient(
     return planner_state, slope, FitProgress(0, *values, optax.tree.norm(slope), *figures)  # pyright: ignore[reportArgumentType]
 
 
-def _draw_batch(problem: FitProblem, key: PRNGKeyArray) -> _Batch:
-    moves = len(problem.demonstrations)
-    count = min(problem.schedule.batch_size, moves)
-    return _Batch(jax.random.choice(key, moves, (count,), replace=False), moves / count)
+def _draw_moves(problem: FitProblem, key: PRNGKeyArray) -> _Moves:
+    count = len(problem.demonstrations)
+    return jax.random.choice(key, count, (min(problem.schedule.batch_size, count),), replace=False)
 
 
-def _rollout_free_terms(problem: FitProblem, parameters: Tree, batch: _Batch) -> tuple[Tree, Array, Array]:
+def _rollout_free_terms(problem: FitProblem, parameters: Tree, moves: _Moves) -> tuple[Tree, Array, Array]:
     """Return the gradient of minus the transitions' term (if it counts) and the prior, and the two values."""
     demos = problem.demonstrations
-    moves, scale = batch
 
     def loss(parameters: Tree) -> tuple[Array, tuple[Array, Array]]:
         dynamics, prior = problem.dynamics.with_parameters(parameters), problem.prior.log_density(parameters)
         transitions = jnp.zeros_like(prior)
         if "transitions" in problem.terms:
             arguments = demos.states[moves], problem.actions[moves], demos.next_states[moves]
-            transitions = scale * jax.vmap(dynamics.log_prob)(*arguments).sum()
+            transitions = len(demos) / len(moves) * jax.vmap(dynamics.log_prob)(*arguments).sum()
         return -(transitions + prior), (transitions, prior)
 
     slope, (transitions, prior) = jax.grad(loss, has_aux=True)(parameters)
@@ -174,7 +167,7 @@ def _rollout_free_terms(problem: FitProblem, parameters: Tree, batch: _Batch) ->
 
 
 def _action_terms(
-    problem: FitProblem, parameters: Tree, planner_state: PlannerState, batch: _Batch, key: PRNGKeyArray
+    problem: FitProblem, parameters: Tree, planner_state: PlannerState, moves: _Moves, key: PRNGKeyArray
 ) -> tuple[PlannerState, Tree, Array, PlanProgress]:
     """Estimate the actions' term by rollouts from the states of a batch of moves.
 
@@ -184,25 +177,15 @@ def _action_terms(
     """
     demos, planner, behavior, policy = problem.demonstrations, problem.planner, problem.behavior, planner_state.policy
     choice_key, rollout_key = jax.random.split(key)
-    moves, scale = batch
+    scale = len(demos) / len(moves)
     tasks, states, observed = task_at(demos.tasks, demos.task[moves]), demos.states[moves], demos.actions[moves]
     drawn, probabilities = planner.candidate_actions(choice_key, policy, tasks, states)
     likelihood = _ActionLikelihood(behavior, policy, tasks, states, observed, drawn)
     candidates, probabilities = likelihood.candidates(probabilities)
-    gradient, rollouts = value_gradient(
-        problem.dynamics.with_parameters(parameters),
-        policy,
-        tasks,
-        behavior,
-        rollout_key,
-        states,
-        candidates,
-        likelihood.weights,
-        horizon=planner.horizon,
-        samples=planner.samples,
-        critic=planner_state.critic,
-        estimator=problem.estimator,
-    )
+    agent = problem.dynamics.with_parameters(parameters), policy, tasks, behavior
+    size = {"horizon": planner.horizon, "samples": planner.samples}
+    method = {"critic": planner_state.critic, "estimator": problem.estimator}
+    gradient, rollouts = value_gradient(*agent, rollout_key, states, candidates, likelihood.weights, **size, **method)
     improved, progress = planner.update(planner_state, behavior, rollouts, probabilities)
     q = q_estimates(rollouts)[..., 0].mean(axis=-1)
     slope = jax.tree.map(lambda leaf: -scale * leaf, gradient)
@@ -226,12 +209,10 @@ class _ActionLikelihood(NamedTuple):
         """Return all actions of a finite set, or the observed choices followed by those that the policy draws."""
         if isinstance(self.policy, FinitePolicy):
             return self.drawn, probabilities
-        return (
-            jnp.concatenate([self.observed[:, None], self.drawn], axis=1),
-            jnp.concatenate([jnp.zeros_like(probabilities[:, :1]), probabilities], axis=1),
-        )
+        candidates = jnp.concatenate([self.observed[:, None], self.drawn], axis=1)
+        return candidates, jnp.concatenate([jnp.zeros_like(probabilities[:, :1]), probabilities], axis=1)
 
-    def weights(self, q: Float[Array, "starts candidates"]) -> Float[Array, "starts candidates"]:
+    def weights(self, q: PerCandidate) -> PerCandidate:
         """Return β (1 for the observed choice − π), the weights of ∇Q in ∇ log π of the observed choices."""
         beta = self.behavior.beta
         if isinstance(self.policy, FinitePolicy):
@@ -240,14 +221,14 @@ class _ActionLikelihood(NamedTuple):
         probabilities = jax.nn.softmax(self._log_importance(q), axis=1)
         return beta * jnp.concatenate([jnp.ones_like(probabilities[:, :1]), -probabilities], axis=1)
 
-    def log_probs(self, q: Float[Array, "starts candidates"]) -> Float[Array, " starts"]:
+    def log_probs(self, q: PerCandidate) -> Float[Array, " starts"]:
         """Return ln π of the observed choices."""
         if isinstance(self.policy, FinitePolicy):
             return jnp.take_along_axis(self.behavior.log_policy(q), self.observed[:, None], axis=1)[:, 0]
         weights = self._log_importance(q)
         return self.behavior.beta * q[:, 0] - jax.nn.logsumexp(weights, axis=1) + jnp.log(weights.shape[1])
 
-    def _log_importance(self, q: Float[Array, "starts candidates"]) -> Float[Array, "starts drawn"]:
+    def _log_importance(self, q: PerCandidate) -> Float[Array, "starts drawn"]:
         """Return the logarithms βQ − ln π_λ of the importance weights of the drawn choices."""
         features = task_features(self.tasks, self.states)
         log_probs = jax.vmap(jax.vmap(self.policy.log_prob, (None, 0)))(features, self.drawn)
@@ -257,32 +238,25 @@ class _ActionLikelihood(NamedTuple):
 def check_problem(problem: FitProblem, policy: Policy) -> None:
     """Refuse data or settings that do not go together."""
     demos = problem.demonstrations
-    if not problem.terms or not set(problem.terms) <= set(ALL_TERMS):
-        raise InputError(f"expected one or both of {ALL_TERMS}, found {problem.terms}", field="terms")
+    message = f"expected one or both of {ALL_TERMS}, found {problem.terms}"
+    check(problem.terms and set(problem.terms) <= set(ALL_TERMS), message, field="terms")
     check_schedule(problem.schedule)
     check_planner(problem.planner)
-    if not jax.tree.leaves(problem.dynamics.parameters):
-        raise InputError("expected parameters to learn, found none", field="dynamics")
+    check(jax.tree.leaves(problem.dynamics.parameters), "expected parameters to learn, found none", field="dynamics")
     check_finite(problem.dynamics.parameters)
     check_tasks(demos.tasks)
     check_starts(demos.states, demos.task, demos.tasks)
     check_estimator(problem.estimator, problem.dynamics, demos.tasks)
-    if not isinstance(policy, FinitePolicy) and not isinstance(problem.behavior.backup, LogSumExp):
-        raise InputError(
-            "over vectors of actions the policy is known for the log-sum-exp only: expected that, or a finite set",
-            field="behavior",
-        )
+    message = "over vectors of actions the policy is known for the log-sum-exp only: expected that, or a finite set"
+    known = isinstance(policy, FinitePolicy) or isinstance(problem.behavior.backup, LogSumExp)
+    check(known, message, field="behavior")
     check_finite(demos.next_states, field="next_states")
     _check_shapes(problem)
     densities = np.asarray(jax.vmap(problem.dynamics.log_prob)(demos.states, problem.actions, demos.next_states))
     wrong = np.isnan(densities) | ((densities == -np.inf) & ("transitions" in problem.terms))
-    if wrong.any():
-        move = int(wrong.argmax())
-        raise InputError(
-            f"expected a density above 0 for every transition, found the logarithm {densities[move]}",
-            source=f"trajectory {int(demos.trajectory[move]) + 1}",
-            field="log_prob",
-        )
+    move = int(wrong.argmax())
+    message = f"expected a density above 0 for every transition, found the logarithm {densities[move]}"
+    check(not wrong.any(), message, source=f"trajectory {int(demos.trajectory[move]) + 1}", field="log_prob")
 
 
 def _check_shapes(problem: FitProblem) -> None:
@@ -293,8 +267,7 @@ def _check_shapes(problem: FitProblem) -> None:
         following = jax.eval_shape(problem.dynamics.sample, jax.random.key(0), state, action).shape
     except (TypeError, ValueError, IndexError) as error:
         raise InputError(expected, field="demonstrations") from error
-    if following != state.shape:
-        raise InputError(f"{expected}, which lead to {following}", field="demonstrations")
+    check(following == state.shape, f"{expected}, which lead to {following}", field="demonstrations")
 
 
 def check_schedule(schedule: Schedule) -> None:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Scalar
 
 from sidestep.continuous.dynamics import GaussianDynamics, Outcomes, check_finite, checked_noise
-from sidestep.errors import InputError, check_positive
+from sidestep.errors import check, check_positive
 
 PENDULUM_CONSTANTS = ("gravity", "mass", "length")
 """The constants of a pendulum that may be unknown."""
@@ -66,8 +66,8 @@ class Pendulum(GaussianDynamics):
         values: dict[str, float] = dict(zip(PENDULUM_CONSTANTS, (gravity, mass, length), strict=True))
         for name, value in (*values.items(), ("time_step", time_step)):
             check_positive(value, name)
-        if not set(unknown) <= set(values):
-            raise InputError(f"expected some of {PENDULUM_CONSTANTS}, found {tuple(unknown)}", field="unknown")
+        message = f"expected some of {PENDULUM_CONSTANTS}, found {tuple(unknown)}"
+        check(set(unknown) <= set(values), message, field="unknown")
         self.parameters = {name: jnp.log(jnp.asarray(values[name], jnp.result_type(float))) for name in unknown}
         self.known = {name: value for name, value in values.items() if name not in unknown}
         self.noise, self.time_step = checked_noise(jnp.asarray(noise), 2), time_step

@@ -12,17 +12,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
+from jaxtyping import Array, Int, PRNGKeyArray, Shaped
 
 from sidestep._typing import Tree
 from sidestep.continuous.critic import Critic, make_critic
 from sidestep.continuous.dynamics import Dynamics, check_finite
 from sidestep.continuous.estimators import features_at_moves, policy_advantages, with_control_variates
-from sidestep.continuous.policies import FinitePolicy, Policy
-from sidestep.continuous.policy_gradient import Probabilities, fit_critic, policy_gap, policy_gradient
+from sidestep.continuous.policies import FinitePolicy, PerCandidate, Policy
+from sidestep.continuous.policy_gradient import fit_critic, policy_gap, policy_gradient
 from sidestep.continuous.rollouts import Rollout, discounted_returns, q_estimates, returns_to_go, sample_rollouts
 from sidestep.continuous.tasks import ContinuousTask, check_tasks, has_ended, task_at, task_features
-from sidestep.errors import InputError, NotConverged, check_count, check_positive
+from sidestep.errors import NotConverged, check, check_count, check_positive
 from sidestep.tabular.backups import Behavior
 
 SomePolicy = TypeVar("SomePolicy", bound=Policy)
@@ -64,6 +64,22 @@ class PlannerState(eqx.Module, Generic[SomePolicy]):
     critic_moments: Tree
 
 
+class PlanProblem(eqx.Module):
+    """An agent to plan for.
+
+    Attributes:
+        dynamics: T_θ.
+        tasks: the task of each start.
+        behavior: the agent's backup and β.
+        states: the starts.
+    """
+
+    dynamics: Dynamics
+    tasks: ContinuousTask
+    behavior: Behavior
+    states: Shaped[Array, "starts *state"]
+
+
 class Planner(eqx.Module):
     """Settings of rollouts and of the optimizers.
 
@@ -91,37 +107,27 @@ class Planner(eqx.Module):
     critic_width: int = eqx.field(default=64, static=True)
     critic_steps: int = eqx.field(default=8, static=True)
 
-    def initialize(
-        self,
-        key: PRNGKeyArray,
-        dynamics: Dynamics,
-        policy: SomePolicy,
-        tasks: ContinuousTask,
-        behavior: Behavior,
-        states: Shaped[Array, "starts *state"],
-    ) -> PlannerState[SomePolicy]:
+    def initialize(self, key: PRNGKeyArray, problem: PlanProblem, policy: SomePolicy) -> PlannerState[SomePolicy]:
         """Return the initial state, with a critic fitted to the mean return of the first policy.
 
         Args:
             key: draws everything random.
-            dynamics: T_θ.
+            problem: the agent to plan for.
             policy: the initial policy.
-            tasks: the task of each start.
-            behavior: the agent's backup and β.
-            states: the starts.
 
         Raises:
             InputError: settings that `check_planner` refuses, or no start where a task goes on.
         """
         check_planner(self)
         start_key, rollout_key, choice_key, critic_key = jax.random.split(key, 4)
-        batch = jax.random.choice(start_key, len(states), (min(len(states), 8 * self.batch_size),), replace=False)
-        tasks, states = task_at(tasks, batch), states[batch]
+        count = len(problem.states)
+        batch = jax.random.choice(start_key, count, (min(count, 8 * self.batch_size),), replace=False)
+        tasks, states = task_at(problem.tasks, batch), problem.states[batch]
         choices, _ = self.candidate_actions(choice_key, policy, tasks, states)
-        rollouts = _sample(dynamics, policy, tasks, behavior, rollout_key, states, self.horizon, choices, self.samples)
+        agent = problem.dynamics, policy, tasks, problem.behavior
+        rollouts = _sample(*agent, rollout_key, states, self.horizon, choices, self.samples)
         acting = np.asarray(rollouts.acting)
-        if not acting.any():
-            raise InputError("expected starts where a task has not ended", field="states")
+        check(acting.any(), "expected starts where a task has not ended", field="states")
         examples = features_at_moves(rollouts), rollouts.fraction_left, returns_to_go(rollouts)[..., :-1]
         critic = make_critic(critic_key, *(leaf[acting] for leaf in examples), width=self.critic_width)
         optimizers = (policy, optax.adam(self.learning_rate)), (critic, optax.adam(self.critic_rate))
@@ -130,7 +136,7 @@ class Planner(eqx.Module):
 
     def candidate_actions(
         self, key: PRNGKeyArray, policy: Policy, tasks: ContinuousTask, states: Shaped[Array, "starts *state"]
-    ) -> tuple[Shaped[Array, "starts candidates *choice"], Probabilities]:
+    ) -> tuple[Shaped[Array, "starts candidates *choice"], PerCandidate]:
         """Return the first choices to try from every start, and their probabilities.
 
         A sum over the candidates with these probabilities is a mean under the policy.
@@ -145,7 +151,7 @@ class Planner(eqx.Module):
         return choices, jnp.full(choices.shape[:2], 1 / self.candidates, features.dtype)
 
     def update(
-        self, state: PlannerState[SomePolicy], behavior: Behavior, rollouts: Rollout, probabilities: Probabilities
+        self, state: PlannerState[SomePolicy], behavior: Behavior, rollouts: Rollout, probabilities: PerCandidate
     ) -> tuple[PlannerState[SomePolicy], PlanProgress]:
         """Make one step with the policy and several with its critic.
 
@@ -164,19 +170,14 @@ class Planner(eqx.Module):
         adam = optax.adam(self.critic_rate)
         critic, critic_moments = fit_critic(critic, adam, state.critic_moments, rollouts, self.critic_steps)
         after = PlannerState(eqx.apply_updates(policy, step), critic, policy_moments, critic_moments)
-        return after, _progress(policy, behavior, rollouts, probabilities, optax.tree.norm(gradient))
-
-
-def _progress(
-    policy: Policy, behavior: Behavior, rollouts: Rollout, probabilities: Probabilities, gradient: Float[Array, ""]
-) -> PlanProgress:
-    mean_returns = discounted_returns(rollouts).mean(axis=-1)
-    expected_return = jnp.sum(probabilities * mean_returns, axis=1).mean()
-    tasks = jax.tree.map(lambda leaf: leaf[:, 0, 0], rollouts.task)
-    entropy = jax.vmap(policy.entropy)(task_features(tasks, rollouts.states[:, 0, 0, 0])).mean()
-    advantages = policy_advantages(policy, rollouts)[..., 0, 0]
-    gap = policy_gap(behavior, advantages, q_estimates(rollouts)[..., 0], probabilities)
-    return PlanProgress(0, expected_return, gradient, entropy, gap)  # pyright: ignore[reportArgumentType]
+        mean_returns = discounted_returns(rollouts).mean(axis=-1)
+        expected_return = jnp.sum(probabilities * mean_returns, axis=1).mean()
+        tasks = jax.tree.map(lambda leaf: leaf[:, 0, 0], rollouts.task)
+        entropy = jax.vmap(policy.entropy)(task_features(tasks, rollouts.states[:, 0, 0, 0])).mean()
+        advantages = policy_advantages(policy, rollouts)[..., 0, 0]
+        gap = policy_gap(behavior, advantages, q_estimates(rollouts)[..., 0], probabilities)
+        figures = expected_return, optax.tree.norm(gradient), entropy, gap
+        return after, PlanProgress(0, *figures)  # pyright: ignore[reportArgumentType]
 
 
 class PolicyPlan(eqx.Module, Generic[SomePolicy]):
@@ -256,18 +257,16 @@ def plan_policy(
     check_finite(dynamics.parameters)
     check_count(steps, 1, "steps")
     initial_key, key = jax.random.split(jax.random.key(seed))
-    own = task_at(tasks, task)
-    state = warm_start or planner.initialize(initial_key, dynamics, policy, own, behavior, states)
+    problem = PlanProblem(dynamics, task_at(tasks, task), behavior, states)
+    state = warm_start or planner.initialize(initial_key, problem, policy)
     history = []
     for iteration in range(steps):
         step_key = jax.random.fold_in(key, iteration)
-        state, progress = _plan_step(planner, state, dynamics, own, behavior, step_key, states)
+        state, progress = _plan_step(planner, problem, state, step_key)
         history.append(PlanProgress(iteration, *(float(number) for number in progress[1:])))
         if not np.isfinite(history[-1]).all():
-            raise NotConverged(
-                f"the policy's figures ceased to be finite at step {iteration}: dynamics or rewards that return NaN, "
-                "or too high a rate"
-            )
+            reason = "dynamics or rewards that return NaN, or too high a rate"
+            raise NotConverged(f"the policy's figures ceased to be finite at step {iteration}: {reason}")
         if report:
             report(history[-1])
     return PolicyPlan(state, tuple(history))
@@ -275,24 +274,17 @@ def plan_policy(
 
 @eqx.filter_jit
 def _plan_step(
-    planner: Planner,
-    state: PlannerState[SomePolicy],
-    dynamics: Dynamics,
-    tasks: ContinuousTask,
-    behavior: Behavior,
-    key: PRNGKeyArray,
-    states: Shaped[Array, "starts *state"],
+    planner: Planner, problem: PlanProblem, state: PlannerState[SomePolicy], key: PRNGKeyArray
 ) -> tuple[PlannerState[SomePolicy], PlanProgress]:
     start_key, choice_key, rollout_key = jax.random.split(key, 3)
-    repeats = len(states) < planner.batch_size
-    batch = jax.random.choice(start_key, len(states), (planner.batch_size,), replace=repeats)
-    own, starts = task_at(tasks, batch), states[batch]
-    choices, probabilities = planner.candidate_actions(choice_key, state.policy, own, starts)
-    rollouts = sample_rollouts(
-        dynamics, state.policy, own, behavior, rollout_key, starts, planner.horizon, choices, planner.samples
-    )
-    rollouts = with_control_variates(dynamics, state.policy, rollouts, state.critic)
-    return planner.update(state, behavior, rollouts, probabilities)
+    count, policy = len(problem.states), state.policy
+    batch = jax.random.choice(start_key, count, (planner.batch_size,), replace=count < planner.batch_size)
+    tasks, states = task_at(problem.tasks, batch), problem.states[batch]
+    choices, probabilities = planner.candidate_actions(choice_key, policy, tasks, states)
+    agent = problem.dynamics, policy, tasks, problem.behavior
+    rollouts = sample_rollouts(*agent, rollout_key, states, planner.horizon, choices, planner.samples)
+    rollouts = with_control_variates(problem.dynamics, policy, rollouts, state.critic)
+    return planner.update(state, problem.behavior, rollouts, probabilities)
 
 
 def check_planner(planner: Planner) -> None:
@@ -306,14 +298,10 @@ def check_planner(planner: Planner) -> None:
 def check_starts(states: Shaped[Array, "starts *state"], task: Int[Array, " starts"], tasks: ContinuousTask) -> None:
     """Refuse no starts, starts that are not finite, and tasks that do not exist or have ended there."""
     count = len(tasks.discount)
-    if len(states) == 0 or len(task) != len(states):
-        raise InputError(f"expected starts and a task for each, found {len(states)} and {len(task)}", field="states")
+    message = f"expected starts and a task for each, found {len(states)} and {len(task)}"
+    check(0 < len(states) == len(task), message, field="states")
     finite = np.isfinite(states).reshape(len(states), -1).all(axis=1)
-    if not finite.all():
-        raise InputError("expected finite numbers", source="states", row=int(finite.argmin()) + 1)
-    if int(task.min()) < 0 or int(task.max()) >= count:
-        raise InputError(f"expected tasks in 0…{count - 1}", field="task")
-    ended = has_ended(tasks, task, states)
-    if ended.any():
-        row = int(ended.argmax()) + 1
-        raise InputError("expected starts where a task has not ended", source="states", row=row)
+    check(finite.all(), "expected finite numbers", source="states", row=int(finite.argmin()) + 1)
+    check(((task >= 0) & (task < count)).all(), f"expected tasks in 0…{count - 1}", field="task")
+    ended, message = has_ended(tasks, task, states), "expected starts where a task has not ended"
+    check(not ended.any(), message, source="states", row=int(ended.argmax()) + 1)

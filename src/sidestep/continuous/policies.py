@@ -17,13 +17,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.stats import norm
-from jaxtyping import Array, Float, PRNGKeyArray, Scalar, Shaped
+from jaxtyping import Array, Float, PRNGKeyArray, Shaped
 
-from sidestep.continuous.dynamics import Action
-from sidestep.errors import InputError, check_positive
+from sidestep.continuous.dynamics import Action, Real
+from sidestep.errors import check, check_positive
 
 Features = Float[Array, " features"]
 Choice = Shaped[Array, "*choice"]
+Examples = Float[Array, "examples features"]
+PerCandidate = Float[Array, "starts candidates"]
+PerSample = Float[Array, "starts candidates samples"]
 
 
 class ScaledNetwork(eqx.Module):
@@ -39,9 +42,7 @@ class ScaledNetwork(eqx.Module):
         return self.network((x - center) / scale)  # pyright: ignore[reportCallIssue]
 
 
-def scaled_network(
-    key: PRNGKeyArray, examples: Float[Array, "examples features"], outputs: int, width: int, depth: int
-) -> ScaledNetwork:
+def scaled_network(key: PRNGKeyArray, examples: Examples, outputs: int, width: int, depth: int) -> ScaledNetwork:
     """Return a network of `depth` hidden layers (0: linear), scaled by examples of its inputs, with outputs near 0."""
     network = eqx.nn.MLP(examples.shape[-1], outputs, width, depth, jnp.tanh, key=key)
     last = network.layers[-1]
@@ -64,11 +65,11 @@ class Policy(eqx.Module):
         """Draw a choice c ~ π_λ(· | x)."""
 
     @abc.abstractmethod
-    def log_prob(self, x: Features, choice: Choice) -> Float[Scalar, ""]:
+    def log_prob(self, x: Features, choice: Choice) -> Real:
         """Return ln π_λ(c | x), in nats."""
 
     @abc.abstractmethod
-    def entropy(self, x: Features) -> Float[Scalar, ""]:
+    def entropy(self, x: Features) -> Real:
         """Return H(π_λ(· | x)), in nats."""
 
     @abc.abstractmethod
@@ -96,11 +97,11 @@ class FinitePolicy(Policy):
         """Draw the index of an action."""
         return jax.random.categorical(key, self.network(x))
 
-    def log_prob(self, x: Features, choice: Choice) -> Float[Scalar, ""]:
+    def log_prob(self, x: Features, choice: Choice) -> Real:
         """Return ln π_λ of the index of an action."""
         return self.log_probs(x)[choice]
 
-    def entropy(self, x: Features) -> Float[Scalar, ""]:
+    def entropy(self, x: Features) -> Real:
         """Return the entropy in nats, from 0 to ln(actions)."""
         log_probs = self.log_probs(x)
         return -jnp.sum(jnp.exp(log_probs) * log_probs)
@@ -127,13 +128,12 @@ class GaussianPolicy(Policy):
         noise = jax.random.normal(key, self.log_spread.shape, self.log_spread.dtype)
         return self.network(x) + jnp.exp(self.log_spread) * noise
 
-    def log_prob(self, x: Features, choice: Choice) -> Float[Scalar, ""]:
+    def log_prob(self, x: Features, choice: Choice) -> Real:
         """Return ln π_λ of an action."""
         return norm.logpdf(choice, self.network(x), jnp.exp(self.log_spread)).sum()
 
-    def entropy(self, x: Features) -> Float[Scalar, ""]:
+    def entropy(self, x: Features) -> Real:
         """Return the entropy in nats; below 0 for narrow policies."""
-        del x
         return jnp.sum(self.log_spread + 0.5 * math.log(2 * math.pi * math.e))
 
     def action(self, choice: Choice) -> Action:
@@ -142,12 +142,7 @@ class GaussianPolicy(Policy):
 
 
 def finite_policy(
-    key: PRNGKeyArray,
-    actions: Shaped[Array, "actions *action"],
-    examples: Float[Array, "examples features"],
-    *,
-    width: int = 64,
-    depth: int = 2,
+    key: PRNGKeyArray, actions: Shaped[Array, "actions *action"], examples: Examples, *, width: int = 64, depth: int = 2
 ) -> FinitePolicy:
     """Return a network policy over a finite set of actions that begins uniform.
 
@@ -166,28 +161,14 @@ def finite_policy(
         >>> jnp.exp(policy.log_probs(jnp.zeros(3))).round(1).tolist()
         [0.5, 0.5]
     """
-    if len(actions) < 2 or not np.isfinite(actions).all():
-        raise InputError("expected two or more actions of finite numbers", field="actions")
+    valid = len(actions) >= 2 and np.isfinite(actions).all()
+    check(valid, "expected two or more actions of finite numbers", field="actions")
     _check_examples(examples)
     return FinitePolicy(scaled_network(key, examples, len(actions), width, depth), jnp.asarray(actions))
 
 
-def table_policy(actions: int, features: int) -> FinitePolicy:
-    """Return a policy with a logit of its own for every feature and action, for one-hot features."""
-    real = jnp.result_type(float)
-    linear = eqx.nn.Linear(features, actions, use_bias=False, key=jax.random.key(0))
-    linear = eqx.tree_at(lambda layer: layer.weight, linear, jnp.zeros((actions, features), real))
-    return FinitePolicy(ScaledNetwork(linear, jnp.zeros(features), jnp.ones(features)), jnp.arange(actions))
-
-
 def gaussian_policy(
-    key: PRNGKeyArray,
-    inputs: int,
-    examples: Float[Array, "examples features"],
-    *,
-    spread: float = 1.0,
-    width: int = 64,
-    depth: int = 2,
+    key: PRNGKeyArray, inputs: int, examples: Examples, *, spread: float = 1.0, width: int = 64, depth: int = 2
 ) -> GaussianPolicy:
     """Return a Gaussian policy over vectors with a mean that begins near 0.
 
@@ -212,6 +193,6 @@ def gaussian_policy(
     return GaussianPolicy(network, jnp.full(inputs, math.log(spread), examples.dtype))
 
 
-def _check_examples(examples: Float[Array, "examples features"]) -> None:
-    if len(examples) == 0 or not np.isfinite(examples).all():
-        raise InputError("expected one or more rows of finite numbers", field="examples")
+def _check_examples(examples: Examples) -> None:
+    valid = len(examples) > 0 and np.isfinite(examples).all()
+    check(valid, "expected one or more rows of finite numbers", field="examples")

@@ -24,19 +24,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Shaped
+from jaxtyping import Array, Float, Shaped
 
 from sidestep._typing import Tree
 from sidestep.continuous.critic import Critic
 from sidestep.continuous.estimators import action_baselines, features_at_moves, policy_log_probs
-from sidestep.continuous.policies import Policy
+from sidestep.continuous.policies import PerCandidate, PerSample, Policy
 from sidestep.continuous.rollouts import Rollout, discount_powers, q_estimates, returns_to_go
 from sidestep.tabular.backups import Behavior, HardMax
 
-Probabilities = Float[Array, "starts candidates"]
 
-
-def policy_gradient(policy: Policy, critic: Critic, rollouts: Rollout, probabilities: Probabilities) -> Tree:
+def policy_gradient(policy: Policy, critic: Critic, rollouts: Rollout, probabilities: PerCandidate) -> Tree:
     """Return the mean of eq. 12 over −β, with the sign of a loss: the policy improves against it.
 
     Args:
@@ -77,9 +75,15 @@ def fit_critic(
     batches = jax.tree.map(lambda leaf: minibatches(leaf[:, :, :, 1:], steps), moves)
     learned, fixed = eqx.partition(critic, eqx.is_inexact_array)
 
+    def loss(learned: Tree, features: Array, left: Array, returns: Array, acting: Array) -> Array:
+        """Return the mean squared error, in units of the critic's spread."""
+        critic = eqx.combine(learned, fixed)
+        squares = jnp.where(acting, (jax.vmap(critic)(features, left) - returns) ** 2, 0.0) / critic.spread**2
+        return squares.sum() / jnp.maximum(acting.sum(), 1)
+
     def step(carry: tuple[Tree, Tree], batch: tuple[Array, Array, Array, Array]) -> tuple[tuple, None]:
         learned, moments = carry
-        slope = jax.grad(lambda learned: _critic_loss(eqx.combine(learned, fixed), *batch))(learned)
+        slope = jax.grad(loss)(learned, *batch)
         change, moments = optimizer.update(slope, moments)
         return (optax.apply_updates(learned, change), moments), None
 
@@ -100,23 +104,8 @@ def minibatches(
     return jnp.swapaxes(flat[: size * count].reshape(size, count, *leaf.shape[4:]), 0, 1)
 
 
-def _critic_loss(
-    critic: Critic,
-    features: Float[Array, "moves features"],
-    left: Float[Array, " moves"],
-    returns: Float[Array, " moves"],
-    acting: Bool[Array, " moves"],
-) -> Float[Array, ""]:
-    """Return the mean squared error, in units of the critic's spread."""
-    squares = jnp.where(acting, (jax.vmap(critic)(features, left) - returns) ** 2, 0.0) / critic.spread**2
-    return squares.sum() / jnp.maximum(acting.sum(), 1)
-
-
 def policy_gap(
-    behavior: Behavior,
-    advantages: Float[Array, "starts candidates"],
-    q: Float[Array, "starts candidates samples"],
-    probabilities: Probabilities,
+    behavior: Behavior, advantages: PerCandidate, q: PerSample, probabilities: PerCandidate
 ) -> Float[Array, ""]:
     """Return the mean gap between a policy and its own Q estimates.
 

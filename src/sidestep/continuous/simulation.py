@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 from sidestep.continuous.dynamics import GaussianDynamics
 from sidestep.continuous.lattice import Lattice, action_values, tabular_model, tabular_task
 from sidestep.continuous.tasks import ContinuousTask
-from sidestep.errors import InputError, NotConverged, check_count
+from sidestep.errors import NotConverged, check, check_count
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.demonstrations import Trajectory
 from sidestep.tabular.solve import SolveOptions, check_proper, solve
@@ -66,16 +66,16 @@ def simulate_trajectories(
         [1, 1]
     """
     check_count(moves, 1, "moves")
-    if not tasks or len(tasks) != len(starts):
-        raise InputError(f"expected as many as tasks, found {len(starts)} for {len(tasks)}", field="starts")
+    message = f"expected as many as tasks, found {len(starts)} for {len(tasks)}"
+    check(0 < len(tasks) == len(starts), message, field="starts")
     width = real.example_action().shape
-    if not np.isfinite(actions).all() or actions.shape[1:] != width:
-        raise InputError(f"expected rows of finite numbers of shape {width}, found {actions.shape}", field="actions")
+    message = f"expected rows of finite numbers of shape {width}, found {actions.shape}"
+    check(np.isfinite(actions).all() and actions.shape[1:] == width, message, field="actions")
     model = tabular_model(believed, lattice, actions)
     trajectories = []
     for index, (task, own) in enumerate(zip(tasks, starts, strict=True)):
-        if not np.isfinite(own).all() or np.shape(own)[1:] != real.noise.shape:
-            raise InputError(f"expected rows of {len(real.noise)} finite numbers", source=f"starts of task {index}")
+        fits = np.isfinite(own).all() and np.shape(own)[1:] == real.noise.shape
+        check(fits, f"expected rows of {len(real.noise)} finite numbers", source=f"starts of task {index}")
         table = tabular_task(task, lattice, actions)
         check_proper(table, behavior, len(actions))
         solution = solve(model, table, behavior, options=options)
@@ -115,9 +115,8 @@ def _simulate(world: _World, starts: Array, keys: Key[Array, " agents"], moves: 
         return (after, over), (state, choice, ~over)
 
     def simulate(start: Array, key: PRNGKeyArray) -> tuple[Array, Array, Array]:
-        (last, _), (states, choices, acting) = jax.lax.scan(
-            move, (start, jnp.zeros((), bool)), jax.random.split(key, moves)
-        )
+        begin = start, jnp.zeros((), bool)
+        (last, _), (states, choices, acting) = jax.lax.scan(move, begin, jax.random.split(key, moves))
         return jnp.concatenate([states, last[None]]), choices, acting
 
     return jax.vmap(simulate)(starts, keys)

@@ -12,12 +12,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Scalar, Shaped
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from sidestep.continuous.dynamics import Action, State, check_finite
-from sidestep.errors import InputError, check_positive
+from sidestep.continuous.dynamics import Action, Real, State, check_finite
+from sidestep.errors import InputError, check, check_positive
 from sidestep.tabular.tasks import Task, check_discount
 
+States = Shaped[Array, "states *state"]
 _Task = TypeVar("_Task", bound="ContinuousTask")
 
 
@@ -35,21 +36,19 @@ class ContinuousTask(eqx.Module):
     smooth: ClassVar[bool]
 
     @abc.abstractmethod
-    def reward(self, state: State, action: Action) -> Float[Scalar, ""]:
+    def reward(self, state: State, action: Action) -> Real:
         """Return R(s, a)."""
 
     @abc.abstractmethod
     def features(self, state: State) -> Float[Array, " features"]:
         """Return the state and the goal as the input of a policy."""
 
-    def terminal_reward(self, state: State) -> Float[Scalar, ""]:
+    def terminal_reward(self, state: State) -> Real:
         """Return the reward of ending in a terminal state."""
-        del state
         return jnp.zeros((), self.discount.dtype)
 
-    def terminal(self, state: State) -> Bool[Scalar, ""]:
+    def terminal(self, state: State) -> Bool[Array, ""]:
         """Return whether the task ends in this state."""
-        del state
         return jnp.zeros((), bool)
 
 
@@ -71,21 +70,19 @@ class ReachTask(ContinuousTask):
     discount: Float[Array, "*tasks"]
     smooth: ClassVar[bool] = False
 
-    def reward(self, state: State, action: Action) -> Float[Scalar, ""]:
+    def reward(self, state: State, action: Action) -> Real:
         """Return minus the cost of a step."""
-        del state, action
         return -self.step_cost
 
     def features(self, state: State) -> Float[Array, " features"]:
         """Return the state, the goal, and the vector to the goal."""
         return jnp.concatenate([state, self.goal, self.goal - state[: len(self.goal)]])
 
-    def terminal_reward(self, state: State) -> Float[Scalar, ""]:
+    def terminal_reward(self, state: State) -> Real:
         """Return the goal's reward."""
-        del state
         return self.goal_reward
 
-    def terminal(self, state: State) -> Bool[Scalar, ""]:
+    def terminal(self, state: State) -> Bool[Array, ""]:
         """Return whether the goal is within the radius."""
         return jnp.sum((state[: len(self.goal)] - self.goal) ** 2) <= self.radius**2
 
@@ -112,8 +109,7 @@ def reach_region(
     check_discount(discount)
     if step_cost is None and discount == 1:
         raise InputError("a goal that pays 1 needs a discount below 1 (or give a step cost)", field="discount")
-    if not np.isfinite(np.asarray(goal)).all():
-        raise InputError(f"expected finite numbers, found {tuple(goal)}", field="goal")
+    check(np.isfinite(np.asarray(goal)).all(), f"expected finite numbers, found {tuple(goal)}", field="goal")
     check_positive(radius, "radius")
     if step_cost is not None:
         check_positive(step_cost, "step_cost")
@@ -144,7 +140,7 @@ class QuadraticTask(ContinuousTask):
     discount: Float[Array, "*tasks"]
     smooth: ClassVar[bool] = True
 
-    def reward(self, state: State, action: Action) -> Float[Scalar, ""]:
+    def reward(self, state: State, action: Action) -> Real:
         """Return minus the quadratic costs."""
         error = state - self.goal
         return -error @ self.state_cost @ error - action @ self.action_cost @ action
@@ -173,7 +169,7 @@ class PendulumTask(ContinuousTask):
     discount: Float[Array, "*tasks"]
     smooth: ClassVar[bool] = True
 
-    def reward(self, state: State, action: Action) -> Float[Scalar, ""]:
+    def reward(self, state: State, action: Action) -> Real:
         """Return minus the costs of the angle, the speed and the torque."""
         error = jnp.mod(state[0] - self.goal + jnp.pi, 2 * jnp.pi) - jnp.pi
         return -(error**2) - 0.1 * state[1] ** 2 - 0.001 * action[0] ** 2
@@ -199,15 +195,15 @@ class TableTask(ContinuousTask):
     discount: Float[Array, "*tasks"]
     smooth: ClassVar[bool] = False
 
-    def reward(self, state: State, action: Action) -> Float[Scalar, ""]:
+    def reward(self, state: State, action: Action) -> Real:
         """Return R(s, a), from the table."""
         return self.task.reward[state, action]
 
-    def terminal_reward(self, state: State) -> Float[Scalar, ""]:
+    def terminal_reward(self, state: State) -> Real:
         """Return the reward of ending in a terminal state, from the table."""
         return self.task.terminal_reward[state]
 
-    def terminal(self, state: State) -> Bool[Scalar, ""]:
+    def terminal(self, state: State) -> Bool[Array, ""]:
         """Return whether the task ends in this state, from the table."""
         return self.task.terminal[state]
 
@@ -215,15 +211,6 @@ class TableTask(ContinuousTask):
         """Return a one-hot code of task and state."""
         states = jax.nn.one_hot(state, self.task.terminal.shape[-1], dtype=self.discount.dtype)
         return jnp.outer(self.index, states).ravel()
-
-
-def table_tasks(tasks: Task, states: int, actions: int) -> TableTask:
-    """Return stacked tabular tasks as continuous ones, in a world with this number of states and actions."""
-    count = len(tasks.terminal)
-    reward = jnp.broadcast_to(tasks.reward, (count, states, actions))
-    terminal_reward = jnp.broadcast_to(tasks.terminal_reward, (count, states))
-    table = Task(reward, terminal_reward, tasks.terminal, tasks.discount)
-    return TableTask(task=table, index=jnp.eye(count, dtype=reward.dtype), discount=tasks.discount)
 
 
 def batch_tasks(tasks: Sequence[_Task]) -> _Task:
@@ -237,8 +224,7 @@ def batch_tasks(tasks: Sequence[_Task]) -> _Task:
         [[0.0], [1.0]]
     """
     kinds = {(jax.tree.structure(task), *map(np.shape, jax.tree.leaves(task))) for task in tasks}
-    if len(kinds) != 1:
-        raise InputError("expected at least one task, all of a kind", field="tasks")
+    check(len(kinds) == 1, "expected at least one task, all of a kind", field="tasks")
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *tasks)
 
 
@@ -247,14 +233,12 @@ def task_at(tasks: _Task, index: Array | int) -> _Task:
     return jax.tree.map(lambda leaf: leaf[index], tasks)
 
 
-def task_features(tasks: ContinuousTask, states: Shaped[Array, "states *state"]) -> Float[Array, "states features"]:
+def task_features(tasks: ContinuousTask, states: States) -> Float[Array, "states features"]:
     """Return the features of every state under its own task (`tasks` has an axis of states)."""
     return jax.vmap(lambda task, state: task.features(state))(tasks, states)
 
 
-def has_ended(
-    tasks: ContinuousTask, task: Int[Array, " states"], states: Shaped[Array, "states *state"]
-) -> Bool[np.ndarray, " states"]:
+def has_ended(tasks: ContinuousTask, task: Int[Array, " states"], states: States) -> Bool[np.ndarray, " states"]:
     """Return whether every state is terminal in its task; `task` holds indices into a batch of tasks."""
     return np.asarray(jax.vmap(lambda task, state: task.terminal(state))(task_at(tasks, task), states))
 

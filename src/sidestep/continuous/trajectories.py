@@ -7,7 +7,7 @@ import numpy as np
 
 from sidestep.continuous.policies import FinitePolicy, GaussianPolicy, Policy
 from sidestep.continuous.tasks import ContinuousTask, batch_tasks, check_tasks, has_ended
-from sidestep.errors import InputError
+from sidestep.errors import InputError, check
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory
 
 
@@ -30,8 +30,7 @@ def gather_trajectories(trajectories: Sequence[Trajectory], tasks: Sequence[Cont
     """
     batched = batch_tasks(tasks)
     check_tasks(batched)
-    if not trajectories:
-        raise InputError("expected at least one trajectory", field="trajectories")
+    check(trajectories, "expected at least one trajectory", field="trajectories")
     for row, trajectory in enumerate(trajectories, start=1):
         _check_trajectory(trajectory, trajectories[0], len(tasks), row)
     states, actions, task = zip(*trajectories, strict=True)
@@ -45,9 +44,8 @@ def gather_trajectories(trajectories: Sequence[Trajectory], tasks: Sequence[Cont
         tasks=batched,
     )
     ended = has_ended(batched, demonstrations.task, demonstrations.states)
-    if ended.any():
-        row = int(demonstrations.trajectory[int(ended.argmax())]) + 1
-        raise InputError("goes on after a terminal state of its task", source="trajectory", row=row)
+    row = int(demonstrations.trajectory[int(ended.argmax())]) + 1
+    check(not ended.any(), "goes on after a terminal state of its task", source="trajectory", row=row)
     return demonstrations
 
 
@@ -55,7 +53,7 @@ def _check_trajectory(trajectory: Trajectory, first: Trajectory, tasks: int, row
     """Refuse a trajectory that is inconsistent, or has other shapes than the first."""
     states, actions, task = trajectory
     shape, action = np.shape(first.states)[1:], np.shape(first.actions)[1:]
-    message = field = None
+    message, field = "", None
     if len(actions) == 0 or len(states) != len(actions) + 1 or np.shape(states)[1:] != shape:
         message = f"expected moves and one state of shape {shape} more, found {len(actions)} and {np.shape(states)}"
     elif np.shape(actions)[1:] != action:
@@ -64,8 +62,7 @@ def _check_trajectory(trajectory: Trajectory, first: Trajectory, tasks: int, row
         message, field = "expected finite numbers", "actions" if np.isfinite(states).all() else "states"
     elif not 0 <= task < tasks:
         message = f"expected a task in 0…{tasks - 1}, found {task}"
-    if message:
-        raise InputError(message, source="trajectory", row=row, field=field)
+    check(not message, message, source="trajectory", row=row, field=field)
 
 
 def check_choices(demonstrations: Demonstrations, policy: Policy) -> None:
@@ -77,11 +74,9 @@ def check_choices(demonstrations: Demonstrations, policy: Policy) -> None:
         wrong = (choices < 0) | (choices > last) if is_index else np.ones(len(choices), bool)
         if wrong.any():
             move = int(wrong.argmax())
-            raise InputError(
-                f"expected the index of an action, 0…{last}, found {choices[move]}",
-                source=f"trajectory {int(demonstrations.trajectory[move]) + 1}",
-                field="actions",
-            )
+            source = f"trajectory {int(demonstrations.trajectory[move]) + 1}"
+            message = f"expected the index of an action, 0…{last}, found {choices[move]}"
+            raise InputError(message, source=source, field="actions")
     elif not np.issubdtype(choices.dtype, np.floating):
         raise InputError("expected vectors, as the policy's actions are", field="actions")
     elif isinstance(policy, GaussianPolicy) and choices.shape[1:] != policy.log_spread.shape:

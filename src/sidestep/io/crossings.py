@@ -17,6 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+Occupied = Bool[np.ndarray, "rows columns"]
+Points = Float[np.ndarray, "points 2"]
+Cells = Int[np.ndarray, "points 2"]
+_Crossings = tuple[Int[np.ndarray, " crossings"], Float[np.ndarray, " crossings"]]
+
 TOUCH = 1e-9
 """A shorter path in a cell, in cell sides, only touches a corner or a side, up to rounding."""
 
@@ -42,11 +47,7 @@ class Visits:
         return Visits(self.walk[index], self.cell[index], self.length[index], self.arrival[index])
 
 
-def visited_cells(
-    points: Float[np.ndarray, "points 2"],
-    offsets: Int[np.ndarray, " boundaries"],
-    occupied: Bool[np.ndarray, "rows columns"],
-) -> Visits:
+def visited_cells(points: Points, offsets: Int[np.ndarray, " boundaries"], occupied: Occupied) -> Visits:
     """Return the cells on the straight lines between successive points of each walk.
 
     Every walk has a visit, even if it stands still. Successive visits are to cells that share a side, or only a corner
@@ -73,13 +74,11 @@ def visited_cells(
     return _merged(visits[lasting | (first & ~moving[visits.walk])])
 
 
-def cells_at(
-    points: Float[np.ndarray, "points 2"], occupied: Bool[np.ndarray, "rows columns"]
-) -> Int[np.ndarray, "points 2"]:
+def cells_at(points: Points, occupied: Occupied) -> Cells:
     """Return row and column of the cell of each point; on a border, as `visited_cells` does."""
     rows, columns = occupied.shape
 
-    def cells(shift_right: float, shift_up: float) -> Int[np.ndarray, "points 2"]:
+    def cells(shift_right: float, shift_up: float) -> Cells:
         column, row_up = np.floor(points + np.array([shift_right, shift_up])).astype(np.int64).T
         return np.stack([rows - 1 - np.clip(row_up, 0, rows - 1), np.clip(column, 0, columns - 1)], axis=1)
 
@@ -104,9 +103,7 @@ def _pieces(
     return segment, begin, np.where(last, 1.0, np.append(begin[1:], 1.0))
 
 
-def _crossings(
-    start: Float[np.ndarray, " segments"], end: Float[np.ndarray, " segments"]
-) -> tuple[Int[np.ndarray, " crossings"], Float[np.ndarray, " crossings"]]:
+def _crossings(start: Float[np.ndarray, " segments"], end: Float[np.ndarray, " segments"]) -> _Crossings:
     """Return where segments cross whole numbers on one axis: the segment, and the fraction of it before."""
     first = np.floor(np.minimum(start, end)) + 1
     count = np.maximum(np.ceil(np.maximum(start, end)) - first, 0).astype(np.int64)

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Int
 
-from sidestep.errors import InputError
+from sidestep.errors import InputError, check
 from sidestep.io.gridding import Moves, grid_walks
 from sidestep.io.walks import Walks
 from sidestep.tabular.demonstrations import Demonstrations, gather
@@ -58,8 +58,7 @@ def demonstrations_from_moves(
         message = "the goal cannot be reached from here: known obstacles wall it off"
         raise InputError(message, source=moves.source, row=int(moves.rows[np.argmax(walled_off)]))
     moves = moves.before_goal()
-    if not len(moves):
-        raise InputError("every walk starts at its goal: expected moves towards one", source=moves.source)
+    check(len(moves), "every walk starts at its goal: expected moves towards one", source=moves.source)
     goals, task = np.unique(moves.goals[np.unique(moves.walk)], return_inverse=True)
     tasks = [reach(grid, int(state), discount=discount, step_cost=step_cost) for state in goals]
     return gather(moves.trajectories(task.tolist()), tasks)

@@ -20,15 +20,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
 
-from sidestep.errors import InputError
-from sidestep.io.crossings import TOUCH, Visits, cells_at, visited_cells
+from sidestep.errors import InputError, check
+from sidestep.io.crossings import TOUCH, Occupied, Points, Visits, cells_at, visited_cells
 from sidestep.io.walks import Walks
 from sidestep.tabular.demonstrations import Trajectory
 from sidestep.tabular.grid import Cell, Grid
 
 _HALF_DIAGONAL = np.sqrt(0.5)
+_Failures = Int[np.ndarray, " failures"]
+_Steps = Int[np.ndarray, "failures 2"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +63,8 @@ class Moves:
         """Return the moves that start before their walk has reached its goal."""
         arrivals = np.cumsum(self.states == self.goals[self.walk])
         before_walk = np.append(0, arrivals)[np.searchsorted(self.walk, self.walk)]
-        early = arrivals == before_walk
-        fields = ("states", "actions", "next_states", "walk", "rows")
-        return replace(self, **{name: getattr(self, name)[early] for name in fields})
+        by_move = ("states", "actions", "next_states", "walk", "rows")
+        return replace(self, **{name: getattr(self, name)[arrivals == before_walk] for name in by_move})
 
     def trajectories(self, tasks: Sequence[int] | None = None) -> list[Trajectory]:
         """Return one trajectory for each walk that has a move.
@@ -100,10 +101,9 @@ def grid_walks(walks: Walks, grid: Grid) -> Moves:
         >>> grid_walks(walks, Grid.unknown(rows=1, columns=3)).next_states.tolist()
         [1, 2]
     """
-    if len(walks) == 0:
-        raise InputError("expected at least one walk, found none", source=walks.source)
-    _check_inside(walks.positions, walks.rows, ("x", "y"), walks, grid)
-    _check_inside(walks.goals, walks.rows[walks.offsets[:-1]], ("goal_x", "goal_y"), walks, grid)
+    check(len(walks) > 0, "expected at least one walk, found none", source=walks.source)
+    _check_inside(walks.positions, walks.rows, "", walks, grid)
+    _check_inside(walks.goals, walks.rows[walks.offsets[:-1]], "goal_", walks, grid)
     occupied = grid.known == Cell.OCCUPIED
     visits = visited_cells(grid.to_cell_units(walks.positions), walks.offsets, occupied)
     visits = _around_corners(visits, occupied, diagonals=grid.connectivity == 8)
@@ -115,7 +115,7 @@ def grid_walks(walks: Walks, grid: Grid) -> Moves:
     return _moves(visits, failures, goals, walks, grid)
 
 
-def _around_corners(visits: Visits, occupied: Bool[np.ndarray, "rows columns"], diagonals: bool) -> Visits:
+def _around_corners(visits: Visits, occupied: Occupied, diagonals: bool) -> Visits:
     """Insert a side cell wherever a walk passes a corner and a diagonal move is not possible."""
     before, after = visits.cell[:-1], visits.cell[1:]
     corner = (visits.walk[:-1] == visits.walk[1:]) & (before != after).all(axis=1)
@@ -126,17 +126,13 @@ def _around_corners(visits: Visits, occupied: Bool[np.ndarray, "rows columns"], 
         corner &= blocked_sideways | occupied[upright[:, 0], upright[:, 1]]
     index = np.flatnonzero(corner)
     side = np.where(blocked_sideways[:, None], upright, sideways)[index]
-    return Visits(
-        np.insert(visits.walk, index + 1, visits.walk[index]),
-        np.insert(visits.cell, index + 1, side, axis=0),
-        np.insert(visits.length, index + 1, 0.0),
-        np.insert(visits.arrival, index + 1, visits.arrival[index + 1]),
-    )
+    walk = np.insert(visits.walk, index + 1, visits.walk[index])
+    arrival = np.insert(visits.arrival, index + 1, visits.arrival[index + 1])
+    length = np.insert(visits.length, index + 1, 0.0)
+    return Visits(walk, np.insert(visits.cell, index + 1, side, axis=0), length, arrival)
 
 
-def _without_clipped(
-    visits: Visits, occupied: Bool[np.ndarray, "rows columns"], kept: Int[np.ndarray, " failures"]
-) -> Visits:
+def _without_clipped(visits: Visits, occupied: Occupied, kept: _Failures) -> Visits:
     """Remove the cells that a walk only clips, except the visits `kept`, where a move failed."""
     before, clipped, after = visits.cell[:-2], visits.cell[1:-1], visits.cell[2:]
     possible = (visits.walk[:-2] == visits.walk[2:]) & (visits.length[1:-1] <= _HALF_DIAGONAL + TOUCH)
@@ -150,52 +146,33 @@ def _without_clipped(
     return visits[np.delete(np.arange(len(visits.walk)), middle[rank % 2 == 0] + 1)]
 
 
-def _visit_at(positions: Int[np.ndarray, " failures"], visits: Visits, walks: Walks) -> Int[np.ndarray, " failures"]:
+def _visit_at(positions: _Failures, visits: Visits, walks: Walks) -> _Failures:
     """Return the index of the visit to which each position (an index) belongs."""
     latest = np.searchsorted(visits.arrival, positions, side="right") - 1
     walk = np.searchsorted(walks.offsets, positions, side="right") - 1
     return np.maximum(latest, np.searchsorted(visits.walk, walk))
 
 
-def _moves(
-    visits: Visits,
-    failures: Int[np.ndarray, " failures"],
-    goals: Int[np.ndarray, " walks"],
-    walks: Walks,
-    grid: Grid,
-) -> Moves:
+def _moves(visits: Visits, failures: _Failures, goals: Int[np.ndarray, " walks"], walks: Walks, grid: Grid) -> Moves:
     """Return the moves between successive visits and the failed moves, in their order."""
-    columns = grid.shape[1]
-    state = visits.cell @ np.array([columns, 1])
+    state = visits.cell @ np.array([grid.shape[1], 1])
     entered = np.flatnonzero(np.diff(visits.walk, prepend=-1) == 0)
     stayed = _visit_at(failures, visits, walks)
-    steps = np.concatenate(
-        [visits.cell[entered] - visits.cell[entered - 1], _failed_steps(failures, stayed, visits, walks, grid)]
-    )
+    failed_steps = _failed_steps(failures, visits.cell[stayed], walks, grid)
+    steps = np.concatenate([visits.cell[entered] - visits.cell[entered - 1], failed_steps])
     order = np.argsort(np.concatenate([entered, stayed + 0.5]), kind="stable")
-    moves = Moves(
-        states=np.concatenate([state[entered - 1], state[stayed]])[order],
-        actions=_actions(steps, grid)[order],
-        next_states=np.concatenate([state[entered], state[stayed]])[order],
-        walk=np.concatenate([visits.walk[entered], visits.walk[stayed]])[order],
-        rows=np.concatenate([walks.rows[visits.arrival[entered]], walks.rows[failures]])[order],
-        goals=goals,
-        source=walks.source,
-    )
-    _check_moving(moves, walks)
-    return moves
+    states = np.concatenate([state[entered - 1], state[stayed]])[order]
+    next_states = np.concatenate([state[entered], state[stayed]])[order]
+    walk = np.concatenate([visits.walk[entered], visits.walk[stayed]])[order]
+    rows = np.concatenate([walks.rows[visits.arrival[entered]], walks.rows[failures]])[order]
+    _check_moving(walk, walks)
+    return Moves(states, _actions(steps, grid)[order], next_states, walk, rows, goals, walks.source)
 
 
-def _failed_steps(
-    failures: Int[np.ndarray, " failures"],
-    stayed: Int[np.ndarray, " failures"],
-    visits: Visits,
-    walks: Walks,
-    grid: Grid,
-) -> Int[np.ndarray, "failures 2"]:
-    """Return the row and column change of each failed move."""
+def _failed_steps(failures: _Failures, cells: _Steps, walks: Walks, grid: Grid) -> _Steps:
+    """Return the row and column change of each failed move from its cell."""
     column, row_up = np.floor(grid.to_cell_units(walks.failed_moves[failures]) + TOUCH).T
-    steps = np.stack([grid.shape[0] - 1 - row_up, column], axis=1) - visits.cell[stayed]
+    steps = np.stack([grid.shape[0] - 1 - row_up, column], axis=1) - cells
     adjacent = (steps[:, None, :] == grid.steps).all(axis=2).any(axis=1)
     if not adjacent.all():
         index = failures[np.argmin(adjacent)]
@@ -212,9 +189,7 @@ def _actions(steps: Int[np.ndarray, "moves 2"], grid: Grid) -> Int[np.ndarray, "
     return table[tuple((steps + 1).T)]
 
 
-def _goal_cells(
-    walks: Walks, grid: Grid, visits: Visits, occupied: Bool[np.ndarray, "rows columns"]
-) -> Int[np.ndarray, " walks"]:
+def _goal_cells(walks: Walks, grid: Grid, visits: Visits, occupied: Occupied) -> Int[np.ndarray, " walks"]:
     """Return the goal state of each walk."""
     goals = grid.to_cell_units(walks.goals)
     last = visits.cell[np.searchsorted(visits.walk, np.arange(len(walks)), side="right") - 1]
@@ -225,46 +200,35 @@ def _goal_cells(
     if blocked.size:
         index = blocked[0]
         message = f"the goal {tuple(walks.goals[index].tolist())} lies in a cell that the map shows as occupied"
-        row = int(walks.rows[walks.offsets[index]])
-        raise InputError(message, source=walks.source, row=row, field="goal_x")
+        raise InputError(message, source=walks.source, row=int(walks.rows[walks.offsets[index]]), field="goal_x")
     return cells @ np.array([grid.shape[1], 1])
 
 
-def _check_inside(
-    positions: Float[np.ndarray, "points 2"],
-    rows: Int[np.ndarray, " points"],
-    fields: tuple[str, str],
-    walks: Walks,
-    grid: Grid,
-) -> None:
-    """Raise `InputError` for the first position outside the map."""
-    inside = grid.contains(positions)
-    if inside.all():
-        return
-    outside = np.flatnonzero(~inside)
-    index = outside[np.argmin(rows[outside])]
-    column = grid.to_cell_units(positions[index][None])[0, 0]
-    field = fields[1] if 0 <= column <= grid.shape[1] else fields[0]
-    message = f"expected a position on the map, found {tuple(positions[index].tolist())}"
-    raise InputError(message, source=walks.source, row=int(rows[index]), field=field)
+def _check_inside(positions: Points, rows: Int[np.ndarray, " points"], prefix: str, walks: Walks, grid: Grid) -> None:
+    """Raise `InputError` for the first position outside the map; its columns are x and y after the prefix."""
+    outside = np.flatnonzero(~grid.contains(positions))
+    if outside.size:
+        index = outside[np.argmin(rows[outside])]
+        column = grid.to_cell_units(positions[index][None])[0, 0]
+        field = prefix + ("y" if 0 <= column <= grid.shape[1] else "x")
+        message = f"expected a position on the map, found {tuple(positions[index].tolist())}"
+        raise InputError(message, source=walks.source, row=int(rows[index]), field=field)
 
 
-def _check_unoccupied(visits: Visits, occupied: Bool[np.ndarray, "rows columns"], walks: Walks) -> None:
+def _check_unoccupied(visits: Visits, occupied: Occupied, walks: Walks) -> None:
     """Raise `InputError` for a walk through a cell that is known to be occupied."""
     blocked = np.flatnonzero(occupied[visits.cell[:, 0], visits.cell[:, 1]])
     if blocked.size:
         rows = walks.rows[visits.arrival[blocked]]
         row, column = visits.cell[blocked[np.argmin(rows)]].tolist()
-        message = (
-            "the way to this position leads through a cell that the map shows as occupied "
-            f"(image row {row}, column {column}, from 0); expected walks around known obstacles"
-        )
+        message = "the way to this position leads through a cell that the map shows as occupied "
+        message += f"(image row {row}, column {column}, from 0); expected walks around known obstacles"
         raise InputError(message, source=walks.source, row=int(rows.min()), field="x")
 
 
-def _check_moving(moves: Moves, walks: Walks) -> None:
+def _check_moving(walk: Int[np.ndarray, " moves"], walks: Walks) -> None:
     """Raise `InputError` for a walk without a move."""
-    idle = np.bincount(moves.walk, minlength=len(walks)) == 0
+    idle = np.bincount(walk, minlength=len(walks)) == 0
     if idle.any():
         index = int(np.argmax(idle))
         message = f"expected at least one move, but walk {walks.labels[index]!r} never leaves its cell"

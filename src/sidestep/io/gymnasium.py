@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sidestep.errors import InputError, check_count
+from sidestep.errors import InputError, check, check_count
 from sidestep.tabular.demonstrations import Trajectory
 from sidestep.tabular.graph import graph
 from sidestep.tabular.models import FIXED, IMPOSSIBLE, TabularModel, TiedModel
@@ -72,17 +72,14 @@ def from_gymnasium(env: Any, discount: float = 0.99) -> Environment:
     table = [[[_Outcome(*each) for each in rows[s][a] if each[0] > 0] for a in rows[s]] for s in range(len(rows))]
     ends = _separate_ends(table)
     terminal = np.zeros(len(table), dtype=bool)
-    width = 1
-    for row in table:
-        for outcomes in row:
-            width = max(width, len(outcomes))
-            terminal[[outcome.state for outcome in outcomes if outcome.ends]] = True
+    width = max(1, *(len(outcomes) for row in table for outcomes in row))
     successors = np.tile(np.arange(len(table))[:, None, None], (1, len(table[0]), width))
     probabilities = np.zeros(successors.shape)
     for s, row in enumerate(table):
         for a, outcomes in enumerate(row):
             for k, outcome in enumerate(outcomes):
                 successors[s, a, k], probabilities[s, a, k] = outcome.state, outcome.probability
+                terminal[outcome.state] |= outcome.ends
     logits = jnp.log(jnp.asarray(np.where(probabilities > 0, probabilities, 1.0)))
     model = TabularModel(graph(successors), logits, jnp.asarray(probabilities > 0))
     return Environment(model, _task(table, terminal, discount), ends)
@@ -125,10 +122,8 @@ def _set_terminal_rewards(final: Float[np.ndarray, " states"], outcomes: list[_O
     for outcome in outcomes:
         if outcome.ends:
             beyond, known = outcome.reward - reward, final[outcome.state]
-            if not np.isnan(known) and not np.isclose(known, beyond):
-                raise InputError(
-                    f"ending in state {outcome.state} pays {beyond:g} beyond one action and {known:g} beyond another"
-                )
+            message = f"ending in state {outcome.state} pays {beyond:g} beyond one action and {known:g} beyond another"
+            check(np.isnan(known) or np.isclose(known, beyond), message)
             final[outcome.state] = beyond
 
 
@@ -148,8 +143,8 @@ def slippery(environment: Environment, logit: float = 0.0) -> TiedModel:
         0.6666...
     """
     possible = np.asarray(environment.model.possible)
-    if possible.shape[-1] != 3:
-        raise InputError(f"expected three outcomes an action, found {possible.shape[-1]}", field="environment")
+    message = f"expected three outcomes an action, found {possible.shape[-1]}"
+    check(possible.shape[-1] == 3, message, field="environment")
     index = np.tile([0, FIXED, 0], (*possible.shape[:2], 1))
     certain = possible.sum(axis=-1) == 1
     index[certain] = np.where(possible[certain], FIXED, IMPOSSIBLE)

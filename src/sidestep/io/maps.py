@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sidestep._files import read_whole, write_whole
-from sidestep.errors import InputError
+from sidestep.errors import InputError, check
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 
 if TYPE_CHECKING:
@@ -90,14 +90,12 @@ def check_geometry(
     path: object, shape: tuple[int, ...], resolution: float, origin: tuple[float, float, float], grid: Grid
 ) -> None:
     """Raise `InputError` if the map in `path` has another size, resolution or origin than `grid`."""
-    if shape != grid.shape:
-        expected, actual = (" × ".join(map(str, each)) for each in (grid.shape, shape))
-        raise InputError(f"expected the map's {expected} cells, found {actual}", source=path, field="image")
-    if not np.isclose(resolution, grid.resolution):
-        message = f"expected the map's {grid.resolution} metres a cell, found {resolution}"
-        raise InputError(message, source=path, field="resolution")
-    if not np.allclose(origin, grid.origin, atol=_ORIGIN_TOLERANCE * grid.resolution):
-        raise InputError(f"expected the map's {grid.origin}, found {origin}", source=path, field="origin")
+    expected, actual = (" × ".join(map(str, each)) for each in (grid.shape, shape))
+    check(shape == grid.shape, f"expected the map's {expected} cells, found {actual}", source=path, field="image")
+    message = f"expected the map's {grid.resolution} metres a cell, found {resolution}"
+    check(np.isclose(resolution, grid.resolution), message, source=path, field="resolution")
+    same = np.allclose(origin, grid.origin, atol=_ORIGIN_TOLERANCE * grid.resolution)
+    check(same, f"expected the map's {grid.origin}, found {origin}", source=path, field="origin")
 
 
 def read_raster(path: str | Path) -> Raster:
@@ -115,22 +113,22 @@ def read_raster(path: str | Path) -> Raster:
     """
     path = Path(path)
     settings = _settings(path)
-    resolution, occupied, free = (
-        _number(_entry(settings, key, path), key, path) for key in ("resolution", "occupied_thresh", "free_thresh")
-    )
-    if resolution <= 0:
-        raise InputError(f"expected metres above 0, found {resolution}", source=path, field="resolution")
+    keys = ("resolution", "occupied_thresh", "free_thresh")
+    resolution, occupied, free = (_number(_entry(settings, key, path), key, path) for key in keys)
+    check(resolution > 0, f"expected metres above 0, found {resolution}", source=path, field="resolution")
     for key, threshold in (("occupied_thresh", occupied), ("free_thresh", free)):
-        if not 0 <= threshold <= 1:
-            raise InputError(f"expected a number from 0 to 1, found {threshold}", source=path, field=key)
-    if free >= occupied:
-        message = f"expected less than occupied_thresh ({occupied}), found {free}"
-        raise InputError(message, source=path, field="free_thresh")
-    origin, mode = _origin(settings, path), settings.get("mode", "trinary")
-    negate = _one_of(_entry(settings, "negate", path), (0, 1), "0 or 1", "negate", path)
-    _one_of(mode, ("trinary", "scale", "raw"), "trinary, scale or raw", "mode", path)
+        check(0 <= threshold <= 1, f"expected a number from 0 to 1, found {threshold}", source=path, field=key)
+    message = f"expected less than occupied_thresh ({occupied}), found {free}"
+    check(free < occupied, message, source=path, field="free_thresh")
+    origin, mode, negate = _origin(settings, path), settings.get("mode", "trinary"), _entry(settings, "negate", path)
+    check(negate in (0, 1), f"expected 0 or 1, found {negate!r}", source=path, field="negate")
+    message = f"expected trinary, scale or raw, found {mode!r}"
+    check(mode in ("trinary", "scale", "raw"), message, source=path, field="mode")
     gray, transparent = _gray(_image_path(settings, path))
-    occupancy = _occupancy(gray, bool(negate), mode)
+    occupancy = gray / 255 if negate else (255 - gray) / 255
+    if mode == "raw":  # `negate` has no meaning here, as in Nav2.
+        percent = np.rint(gray)
+        occupancy = np.where(percent <= 100, percent / 100, np.nan)
     occupancy[transparent] = np.nan
     return Raster(occupancy, mode, resolution, origin, occupied, free)
 
@@ -156,12 +154,10 @@ def write_map(path: str | Path, blocked: Float[np.ndarray, "rows columns"], grid
     from PIL import Image
 
     path = Path(path)
-    if path.suffix.lower() not in (".yaml", ".yml"):
-        raise InputError("expected a file name that ends in .yaml or .yml", source=path)
-    if blocked.shape != grid.shape:
-        raise InputError(f"expected an array of shape {grid.shape}, found {blocked.shape}", field="blocked")
-    if not ((blocked >= 0) & (blocked <= 1)).all():
-        raise InputError("expected probabilities from 0 to 1 in every cell", field="blocked")
+    check(path.suffix.lower() in (".yaml", ".yml"), "expected a file name that ends in .yaml or .yml", source=path)
+    message = f"expected an array of shape {grid.shape}, found {blocked.shape}"
+    check(blocked.shape == grid.shape, message, field="blocked")
+    check(((blocked >= 0) & (blocked <= 1)).all(), "expected probabilities from 0 to 1 in every cell", field="blocked")
     image = path.with_suffix(".pgm")
     settings = {
         "image": image.name,
@@ -187,15 +183,13 @@ def _settings(path: Path) -> dict[str, Any]:
         settings = yaml.safe_load(content)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise InputError(f"expected YAML: {' '.join(str(error).split())}", source=path) from error
-    if not isinstance(settings, dict):
-        raise InputError("expected YAML with keys such as 'image: map.pgm'", source=path)
+    check(isinstance(settings, dict), "expected YAML with keys such as 'image: map.pgm'", source=path)
     return settings
 
 
 def _entry(settings: dict[str, Any], key: str, path: Path) -> Any:
     """Return the value of a required key."""
-    if settings.get(key) is None:
-        raise InputError("the key is missing", source=path, field=key)
+    check(settings.get(key) is not None, "the key is missing", source=path, field=key)
     return settings[key]
 
 
@@ -205,41 +199,31 @@ def _number(value: object, key: str, path: Path) -> float:
         number = math.nan if isinstance(value, bool) else float(value)  # pyright: ignore[reportArgumentType]
     except (TypeError, ValueError, OverflowError):
         number = math.nan
-    if not math.isfinite(number):
-        raise InputError(f"expected a finite number, found {value!r}", source=path, field=key)
+    check(math.isfinite(number), f"expected a finite number, found {value!r}", source=path, field=key)
     return number
 
 
 def _origin(settings: dict[str, Any], path: Path) -> tuple[float, float, float]:
     """Return x, y (metres) and yaw (radians) of the lower-left corner."""
     origin = _entry(settings, "origin", path)
-    if not isinstance(origin, list) or len(origin) != 3:
-        raise InputError(f"expected three numbers [x, y, yaw], found {origin!r}", source=path, field="origin")
+    three = isinstance(origin, list) and len(origin) == 3
+    check(three, f"expected three numbers [x, y, yaw], found {origin!r}", source=path, field="origin")
     x, y, yaw = (_number(value, "origin", path) for value in origin)
     return x, y, yaw
-
-
-def _one_of(value: Any, allowed: tuple[Any, ...], expected: str, key: str, path: Path) -> Any:
-    if value not in allowed:
-        raise InputError(f"expected {expected}, found {value!r}", source=path, field=key)
-    return value
 
 
 def _image_path(settings: dict[str, Any], path: Path) -> Path:
     """Return the path of the image, which must be in the folder of the YAML file or below, links followed."""
     name = _entry(settings, "image", path)
-    if not isinstance(name, str) or not name:
-        raise InputError(f"expected the name of an image, found {name!r}", source=path, field="image")
+    check(isinstance(name, str) and name, f"expected the name of an image, found {name!r}", source=path, field="image")
     try:
         folder = path.parent.resolve()
         image = (folder / name).resolve()
     except (OSError, RuntimeError, ValueError) as error:
         raise InputError(f"expected the name of an image: {error}", source=path, field="image") from error
-    if Path(name).is_absolute() or not image.is_relative_to(folder):
-        message = f"expected an image inside the folder of the YAML file, found {name!r}"
-        raise InputError(message, source=path, field="image")
-    if not image.is_file():
-        raise InputError(f"there is no image {name!r}", source=path, field="image")
+    message = f"expected an image inside the folder of the YAML file, found {name!r}"
+    check(not Path(name).is_absolute() and image.is_relative_to(folder), message, source=path, field="image")
+    check(image.is_file(), f"there is no image {name!r}", source=path, field="image")
     return path.parent / name
 
 
@@ -251,9 +235,8 @@ def _gray(path: Path) -> tuple[Float[np.ndarray, "rows columns"], Bool[np.ndarra
         # Pillow warns of large images and of oddities in headers without naming the file.
         with warnings.catch_warnings(action="ignore"), Image.open(path, formats=("PPM", "PNG")) as image:
             width, height = image.size
-            if not 0 < width * height <= MOST_PIXELS:
-                message = f"expected from 1 to {MOST_PIXELS:,} pixels, found {width:,} by {height:,}"
-                raise InputError(message, source=path)
+            message = f"expected from 1 to {MOST_PIXELS:,} pixels, found {width:,} by {height:,}"
+            check(0 < width * height <= MOST_PIXELS, message, source=path)
             return _gray_of_image(image)
     except InputError:
         raise
@@ -263,9 +246,7 @@ def _gray(path: Path) -> tuple[Float[np.ndarray, "rows columns"], Bool[np.ndarra
         raise InputError(f"expected an image in PGM or PNG format: {error}", source=path) from error
 
 
-def _gray_of_image(
-    image: "Image.Image",
-) -> tuple[Float[np.ndarray, "rows columns"], Bool[np.ndarray, "rows columns"]]:
+def _gray_of_image(image: "Image.Image") -> tuple[Float[np.ndarray, "rows columns"], Bool[np.ndarray, "rows columns"]]:
     if image.mode.startswith("I"):  # 16 bits a pixel
         gray = np.asarray(image, dtype=np.float64) * (255 / 65535)
     elif image.mode in ("1", "L") and "transparency" not in image.info:
@@ -276,11 +257,3 @@ def _gray_of_image(
         channels = np.asarray(image.convert("RGBA"))
         return channels[..., :3].mean(axis=-1), channels[..., 3] == 0
     return gray, np.zeros(gray.shape, dtype=bool)
-
-
-def _occupancy(gray: Float[np.ndarray, "rows columns"], negate: bool, mode: str) -> Float[np.ndarray, "rows columns"]:
-    """Return the occupancy of each cell, from 0 to 1; NaN where the map has none."""
-    if mode == "raw":  # `negate` has no meaning here, as in Nav2.
-        percent = np.rint(gray)
-        return np.where(percent <= 100, percent / 100, np.nan)
-    return gray / 255 if negate else (255 - gray) / 255

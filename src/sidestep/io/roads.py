@@ -14,19 +14,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 from jaxtyping import Bool, Float, Int
 
-from sidestep.errors import InputError
+from sidestep.errors import InputError, check
 from sidestep.io.tables import check_columns, check_rows, finite_column, read_table
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.tasks import reach
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 EIGHTHS = 8
 """The number of directions of turns."""
@@ -105,12 +102,16 @@ def read_trips(path: str | Path, roads: Roads) -> list[Int[np.ndarray, " _"]]:
     trips = []
     for row, (cell, (origin, destination)) in enumerate(zip(_labels(table, "links", path), ends, strict=True), start=1):
         trip = cell.split()
-        _check_trip(trip, number, turns, path, row)
+        check(len(trip) >= 2, f"expected at least two links, found {len(trip)}", source=path, row=row, field="links")
+        for link in trip:
+            check(link in number, f"there is no link {link}", source=path, row=row, field="links")
+        for one, other in pairwise(trip):
+            connected = (number[one], number[other]) in turns
+            check(connected, f"there is no turn from {one} to {other}", source=path, row=row, field="links")
         for field, label, link in (("origin", origin, trip[0]), ("destination", destination, trip[-1])):
-            if label != link:
-                raise InputError(f"expected {link}, as in its links, found {label}", source=path, row=row, field=field)
-        if destination in trip[:-1]:
-            raise InputError("continues after it has reached its destination", source=path, row=row, field="links")
+            check(label == link, f"expected {link}, as in its links, found {label}", source=path, row=row, field=field)
+        message = "continues after it has reached its destination"
+        check(destination not in trip[:-1], message, source=path, row=row, field="links")
         trips.append(np.asarray([number[link] for link in trip]))
     return trips
 
@@ -134,34 +135,21 @@ def demonstrations_from_trips(
     trajectories = []
     for row, (trip, goal) in enumerate(zip(trips, task.tolist(), strict=True), start=1):
         matches = next_links[trip[:-1]] == trip[1:, None]
-        if not matches.any(axis=1).all():
-            raise InputError("expected a turn from each link to the next", source="trip", row=row)
+        check(matches.any(axis=1).all(), "expected a turn from each link to the next", source="trip", row=row)
         trajectories.append(Trajectory(trip, matches.argmax(axis=1), goal))
     tasks = [reach(graph, int(goal), discount=discount, step_cost=step_cost) for goal in goals]
     return gather(trajectories, tasks)
 
 
-def _check_trip(trip: list[str], number: dict[str, int], turns: set[tuple[int, int]], path: object, row: int) -> None:
-    if len(trip) < 2:
-        raise InputError(f"expected at least two links, found {len(trip)}", source=path, row=row, field="links")
-    for link in trip:
-        if link not in number:
-            raise InputError(f"there is no link {link}", source=path, row=row, field="links")
-    for one, other in pairwise(trip):
-        if (number[one], number[other]) not in turns:
-            raise InputError(f"there is no turn from {one} to {other}", source=path, row=row, field="links")
-
-
-def _read(path: str | Path, names: tuple[str, ...]) -> "pa.Table":
+def _read(path: str | Path, names: tuple[str, ...]) -> pa.Table:
     """Return a table that has these columns, and rows."""
     table = read_table(path, labels=tuple(name for name in names if name != "length_m"))
     check_columns(table, names, str(path))
-    if not len(table):
-        raise InputError("expected at least one row", source=path)
+    check(len(table), "expected at least one row", source=path)
     return table
 
 
-def _labels(table: "pa.Table", name: str, path: object) -> list[str]:
+def _labels(table: pa.Table, name: str, path: object) -> list[str]:
     """Return a column without empty cells as text."""
     cells = table[name].to_pylist()
     if None in cells:
@@ -170,17 +158,16 @@ def _labels(table: "pa.Table", name: str, path: object) -> list[str]:
 
 
 def _numbered(
-    table: "pa.Table", name: str, path: object, number: dict[str, int], links: object
+    table: pa.Table, name: str, path: object, number: dict[str, int], links: object
 ) -> Int[np.ndarray, " rows"]:
     """Return the numbers of the links in a column of labels."""
     labels = _labels(table, name, path)
     for row, label in enumerate(labels, start=1):
-        if label not in number:
-            raise InputError(f"expected a link of {links}, found {label}", source=path, row=row, field=name)
+        check(label in number, f"expected a link of {links}, found {label}", source=path, row=row, field=name)
     return np.asarray([number[label] for label in labels])
 
 
-def _whole(table: "pa.Table", name: str, path: object, most: int) -> Int[np.ndarray, " rows"]:
+def _whole(table: pa.Table, name: str, path: object, most: int) -> Int[np.ndarray, " rows"]:
     """Return a column of whole numbers from 0."""
     values = finite_column(table, name, str(path))
     valid = (values >= 0) & (values <= most) & (values % 1 == 0)

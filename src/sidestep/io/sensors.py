@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sidestep._files import read_array
-from sidestep.errors import InputError
+from sidestep.errors import InputError, check
 from sidestep.io.maps import check_geometry, read_raster
 from sidestep.tabular.grid import Grid
 
@@ -50,9 +50,8 @@ def read_sensor_variance(path: str | Path, grid: Grid) -> Float[np.ndarray, "row
         >>> variance = read_sensor_variance("variance.npy", grid)  # doctest: +SKIP
     """
     variance, field = read_array(path, kinds="fiu").astype(np.float64), "sensor variance"
-    if variance.shape != grid.shape:
-        message = f"expected the map's {grid.shape} rows and columns, found {variance.shape}"
-        raise InputError(message, source=path, field=field)
+    message = f"expected the map's {grid.shape} rows and columns, found {variance.shape}"
+    check(variance.shape == grid.shape, message, source=path, field=field)
     wrong = np.argwhere(variance <= 0)
     if len(wrong):
         row, column = wrong[0]

@@ -4,22 +4,21 @@ import csv
 import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.csv
 from jaxtyping import Bool, Float
+from pyarrow import parquet
 
 from sidestep._files import read_whole, write_whole
-from sidestep.errors import InputError
-
-if TYPE_CHECKING:
-    import pyarrow as pa
+from sidestep.errors import InputError, check
 
 _WHOLE_NUMBER = r"^-?(0|[1-9][0-9]{0,17})$"
 _NUMBER = r"^-?(0|[1-9][0-9]{0,14})(\.[0-9]+)?([eE][+-]?[0-9]{1,3})?$"
 
 
-def read_table(path: str | Path, labels: tuple[str, ...] = ()) -> "pa.Table":
+def read_table(path: str | Path, labels: tuple[str, ...] = ()) -> pa.Table:
     """Return the table in a `.csv` or `.parquet` file; empty cells are null.
 
     Columns of a CSV become numbers only where that loses nothing: a column with a cell `003` stays text.
@@ -34,23 +33,20 @@ def read_table(path: str | Path, labels: tuple[str, ...] = ()) -> "pa.Table":
     """
     table = _by_ending(path, _read_csv, _read_parquet)(Path(path))
     for name in table.column_names:
-        if table.column_names.count(name) > 1:
-            raise InputError("the column appears more than once", source=path, field=name)
+        check(table.column_names.count(name) == 1, "the column appears more than once", source=path, field=name)
     if Path(path).suffix.lower() != ".csv":
         return table
     columns = [_typed(table[name], fractions=name not in labels) for name in table.column_names]
     return table.from_arrays(columns, table.column_names)
 
 
-def write_table(path: str | Path, table: "pa.Table") -> None:
+def write_table(path: str | Path, table: pa.Table) -> None:
     """Write a table as `.csv` or `.parquet` atomically.
 
     Raises:
         InputError: for another ending, and for a column that CSV cannot represent.
     """
-    import pyarrow as pa
-
-    write = _by_ending(path, _write_csv, _write_parquet)
+    write = _by_ending(path, pyarrow.csv.write_csv, parquet.write_table)
     try:
         write_whole(path, lambda file: write(table, file))
     except pa.ArrowException as error:
@@ -63,25 +59,23 @@ def check_rows(valid: Bool[np.ndarray, " rows"], message: str, source: object, f
         raise InputError(message, source=source, row=int(np.argmin(valid)) + 1, field=field)
 
 
-def check_columns(table: "pa.Table", names: Sequence[str], source: str) -> None:
+def check_columns(table: pa.Table, names: Sequence[str], source: str) -> None:
     """Raise `InputError` for the first of these columns that is not in a table."""
     for name in names:
-        if name not in table.column_names:
-            raise InputError(f"the column is missing; found {', '.join(table.column_names)}", source=source, field=name)
+        message = f"the column is missing; found {', '.join(table.column_names)}"
+        check(name in table.column_names, message, source=source, field=name)
 
 
-def number_column(table: "pa.Table", name: str, source: str) -> Float[np.ndarray, " rows"]:
+def number_column(table: pa.Table, name: str, source: str) -> Float[np.ndarray, " rows"]:
     """Return a column as numbers, NaN where a cell is empty.
 
     Raises:
         InputError: with the row, for infinity and for a cell that is not a number.
     """
-    import pyarrow as pa
-
     column = table[name]
-    kinds = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal, pa.types.is_string)
-    if not any(is_kind(column.type) for is_kind in (*kinds, pa.types.is_large_string, pa.types.is_null)):
-        raise InputError(f"expected numbers, found {column.type}", source=source, field=name)
+    kinds = ("integer", "floating", "decimal", "string", "large_string", "null")
+    is_number = any(getattr(pa.types, f"is_{kind}")(column.type) for kind in kinds)
+    check(is_number, f"expected numbers, found {column.type}", source=source, field=name)
     try:
         # Not safe, because whole numbers beyond 2^53 may lose their last digits here.
         numbers = column.cast(pa.float64(), safe=False).to_numpy()
@@ -92,9 +86,7 @@ def number_column(table: "pa.Table", name: str, source: str) -> Float[np.ndarray
     return numbers
 
 
-def _is_number(cell: "pa.Scalar") -> bool:
-    import pyarrow as pa
-
+def _is_number(cell: pa.Scalar) -> bool:
     try:
         cell.cast(pa.float64())
     except pa.ArrowInvalid:
@@ -102,7 +94,7 @@ def _is_number(cell: "pa.Scalar") -> bool:
     return True
 
 
-def finite_column(table: "pa.Table", name: str, source: str) -> Float[np.ndarray, " rows"]:
+def finite_column(table: pa.Table, name: str, source: str) -> Float[np.ndarray, " rows"]:
     """Return a column of numbers without empty cells.
 
     Raises:
@@ -118,28 +110,12 @@ def finite_column(table: "pa.Table", name: str, source: str) -> Float[np.ndarray
 def _by_ending(path: str | Path, for_csv: Callable, for_parquet: Callable) -> Callable:
     functions = {".csv": for_csv, ".parquet": for_parquet}
     ending = Path(path).suffix.lower()
-    if ending not in functions:
-        raise InputError("expected a file name that ends in .csv or .parquet", source=path)
+    check(ending in functions, "expected a file name that ends in .csv or .parquet", source=path)
     return functions[ending]
 
 
-def _write_csv(table: "pa.Table", file: BinaryIO) -> None:
-    from pyarrow.csv import write_csv
-
-    write_csv(table, file)
-
-
-def _write_parquet(table: "pa.Table", file: BinaryIO) -> None:
-    from pyarrow import parquet
-
-    parquet.write_table(table, file)
-
-
-def _read_csv(path: Path) -> "pa.Table":
+def _read_csv(path: Path) -> pa.Table:
     """Return a CSV with every cell as text, nulls where a cell is empty."""
-    import pyarrow as pa
-    import pyarrow.csv
-
     content = read_whole(path)
     text = _decoded(content, path)
     ragged: list[pyarrow.csv.InvalidRow] = []
@@ -156,9 +132,7 @@ def _read_csv(path: Path) -> "pa.Table":
             read_options=pyarrow.csv.ReadOptions(use_threads=False),
             parse_options=pyarrow.csv.ParseOptions(newlines_in_values=True, invalid_row_handler=remember),
             convert_options=pyarrow.csv.ConvertOptions(
-                column_types={name: pa.string() for name in header},
-                null_values=[""],
-                strings_can_be_null=True,
+                column_types={name: pa.string() for name in header}, null_values=[""], strings_can_be_null=True
             ),
         )
     except (pa.ArrowException, csv.Error) as error:
@@ -179,29 +153,20 @@ def _decoded(content: bytes, path: Path) -> str:
         raise InputError("expected text in UTF-8", source=path, row=row or None) from error
 
 
-def _read_parquet(path: Path) -> "pa.Table":
+def _read_parquet(path: Path) -> pa.Table:
     """Return the table in a Parquet file; unlike `read_table`, `ParquetFile` adds no columns for folder names."""
-    import pyarrow as pa
-    from pyarrow.parquet import ParquetFile
-
     try:
-        return ParquetFile(pa.BufferReader(read_whole(path))).read()
+        return parquet.ParquetFile(pa.BufferReader(read_whole(path))).read()
     except (pa.ArrowException, OSError) as error:
         raise InputError(f"expected a table in Parquet: {error}", source=path) from error
 
 
-def _typed(column: "pa.ChunkedArray", fractions: bool) -> "pa.ChunkedArray":
-    """Return a column of text as numbers if every cell is one."""
-    import pyarrow as pa
-
-    if _all_match(column, _WHOLE_NUMBER):
-        return column.cast(pa.int64())
-    return column.cast(pa.float64()) if fractions and _all_match(column, _NUMBER) else column
-
-
-def _all_match(column: "pa.ChunkedArray", pattern: str) -> bool:
-    """Return whether every cell that is not empty matches a regular expression."""
+def _typed(column: pa.ChunkedArray, fractions: bool) -> pa.ChunkedArray:
+    """Return a column of text as numbers if every cell that is not empty is one."""
     import pyarrow.compute as pc
 
-    matches = pc.call_function("match_substring_regex", [column], pc.MatchSubstringOptions(pattern))
-    return False not in matches.unique().to_pylist()
+    for pattern, kind in ((_WHOLE_NUMBER, pa.int64()), (_NUMBER, pa.float64()))[: 1 + fractions]:
+        matches = pc.call_function("match_substring_regex", [column], pc.MatchSubstringOptions(pattern))
+        if False not in matches.unique().to_pylist():
+            return column.cast(kind)
+    return column

@@ -18,17 +18,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from jaxtyping import Bool, Float, Int, Integer, Real
 
-from sidestep.errors import InputError
+from sidestep.errors import InputError, check
 from sidestep.io.minari.walks import read_positions, write_positions
 from sidestep.io.tables import check_columns, check_rows, finite_column, number_column, read_table, write_table
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 _REQUIRED = ("walk", "step", "x", "y")
 _OPTIONAL = ("goal_x", "goal_y", "failed_x", "failed_y")
@@ -59,7 +57,7 @@ class Walks:
     failed_moves: Float[np.ndarray, "rows 2"]
     steps: Real[np.ndarray, " rows"]
     rows: Int[np.ndarray, " rows"]
-    metadata: "pa.Table"
+    metadata: pa.Table
     source: str
 
     def __len__(self) -> int:
@@ -76,8 +74,7 @@ class Walks:
         Raises:
             InputError: if the column does not exist, has an empty cell, or has two values within a walk.
         """
-        if column in _REQUIRED + _OPTIONAL:
-            raise InputError("expected a column of metadata", source=self.source, field=column)
+        check(column not in _REQUIRED + _OPTIONAL, "expected a column of metadata", source=self.source, field=column)
         check_columns(self.metadata, (column,), self.source)
         values = self.metadata[column].to_pylist()
         for row, first in enumerate(np.repeat(self.offsets[:-1], np.diff(self.offsets)).tolist()):
@@ -96,17 +93,9 @@ class Walks:
         lengths = np.diff(self.offsets)[indices]
         offsets = np.concatenate([[0], np.cumsum(lengths)])
         rows = np.arange(offsets[-1]) + np.repeat(self.offsets[indices] - offsets[:-1], lengths)
-        return replace(
-            self,
-            labels=[self.labels[index] for index in indices],
-            offsets=offsets,
-            goals=self.goals[indices],
-            positions=self.positions[rows],
-            failed_moves=self.failed_moves[rows],
-            steps=self.steps[rows],
-            rows=self.rows[rows],
-            metadata=self.metadata.take(rows),
-        )
+        by_row = {name: getattr(self, name)[rows] for name in ("positions", "failed_moves", "steps", "rows")}
+        labels, goals = [self.labels[index] for index in indices], self.goals[indices]
+        return replace(self, labels=labels, offsets=offsets, goals=goals, metadata=self.metadata.take(rows), **by_row)
 
 
 def read_walks(path: str | Path) -> Walks:
@@ -137,7 +126,7 @@ def write_walks(path: str | Path, walks: Walks) -> None:
     write(name, table_from_walks(walks))
 
 
-def walks_from_table(table: "pa.Table", source: str = "walks") -> Walks:
+def walks_from_table(table: pa.Table, source: str = "walks") -> Walks:
     """Return the walks in a table in memory.
 
     Args:
@@ -161,22 +150,36 @@ def walks_from_table(table: "pa.Table", source: str = "walks") -> Walks:
     order = np.argsort(row_walks, kind="stable")
     walk, rows = row_walks[order], order + 1
     offsets = np.searchsorted(walk, np.arange(len(encoded.dictionary) + 1))
-    positions = np.stack([finite_column(table, "x", source), finite_column(table, "y", source)], axis=1)[order]
+
+    def check_pairs(valid: Bool[np.ndarray, " pairs"], field: str, message: str) -> None:
+        """Raise `InputError` for the earliest data row that is not valid after the row before it in its walk."""
+        later = np.flatnonzero(~valid & (walk[1:] == walk[:-1])) + 1
+        if later.size:
+            index = later[np.argmin(rows[later])]
+            message = f"{message}, but this row does not follow row {rows[index - 1]} so"
+            raise InputError(message, source=source, row=int(rows[index]), field=field)
+
+    positions = np.stack([finite_column(table, name, source) for name in ("x", "y")], axis=1)[order]
     steps = _steps(table, source)[order]
-    _check_pairs(np.diff(steps) > 0, walk, rows, source, "step", "expected steps that increase within a walk")
+    check_pairs(np.diff(steps) > 0, "step", "expected steps that increase within a walk")
     if "t" in table.column_names:
         times = finite_column(table, "t", source)[order]
-        _check_pairs(np.diff(times) >= 0, walk, rows, source, "t", "expected times that never decrease within a walk")
+        check_pairs(np.diff(times) >= 0, "t", "expected times that never decrease within a walk")
     if (np.diff(offsets) == 1).any():
         index = int(np.argmax(np.diff(offsets) == 1))
         message = f"expected at least two positions, found one in walk {encoded.dictionary[index].as_py()!r}"
         raise InputError(message, source=source, row=int(rows[offsets[index]]), field="walk")
+    goals = _pair(table, "goal", source)[order]
+    for field, column in zip(("goal_x", "goal_y"), goals.T, strict=True):
+        same = (column[1:] == column[:-1]) | (np.isnan(column[1:]) & np.isnan(column[:-1]))
+        check_pairs(same, field, "expected the same goal in all rows of a walk")
+    goals = goals[offsets[:-1]]
     return Walks(
         labels=encoded.dictionary.to_pylist(),
         offsets=offsets.astype(np.int64),
-        goals=_goals(_pair(table, "goal_x", "goal_y", source)[order], positions, walk, offsets, rows, source),
+        goals=np.where(np.isnan(goals), positions[offsets[1:] - 1], goals),
         positions=positions,
-        failed_moves=_pair(table, "failed_x", "failed_y", source)[order],
+        failed_moves=_pair(table, "failed", source)[order],
         steps=steps,
         rows=rows,
         metadata=table.drop_columns([name for name in table.column_names if name in _REQUIRED + _OPTIONAL]).take(order),
@@ -184,47 +187,42 @@ def walks_from_table(table: "pa.Table", source: str = "walks") -> Walks:
     )
 
 
-def table_from_walks(walks: Walks) -> "pa.Table":
+def table_from_walks(walks: Walks) -> pa.Table:
     """Return the table of walks, one row per position; with `failed_x` and `failed_y` only if a move failed."""
-    import pyarrow as pa
-
     lengths = np.diff(walks.offsets)
     goals = np.repeat(walks.goals, lengths, axis=0)
-    columns = {
-        "walk": pa.array(walks.labels).take(np.repeat(np.arange(len(walks)), lengths)),
-        "step": walks.steps,
-        "x": walks.positions[:, 0],
-        "y": walks.positions[:, 1],
-        "goal_x": goals[:, 0],
-        "goal_y": goals[:, 1],
-    }
+    labels = pa.array(walks.labels).take(np.repeat(np.arange(len(walks)), lengths))
+    columns = {"walk": labels, "step": walks.steps}
+    columns |= position_columns("", walks.positions) | position_columns("goal_", goals)
     if not np.isnan(walks.failed_moves).all():
-        for name, values in zip(("failed_x", "failed_y"), walks.failed_moves.T, strict=True):
-            columns[name] = pa.array(values, from_pandas=True)
+        failed = position_columns("failed_", walks.failed_moves)
+        columns |= {name: pa.array(values, from_pandas=True) for name, values in failed.items()}
     return pa.table(columns | {name: walks.metadata[name] for name in walks.metadata.column_names})
 
 
-def _store(path: str | Path) -> tuple[Callable[[Any], "pa.Table"], Callable[[Any, "pa.Table"], None], str | Path]:
+def position_columns(prefix: str, positions: Float[np.ndarray, "rows 2"]) -> dict[str, Any]:
+    """Return x and y of positions as columns of a table."""
+    return {f"{prefix}x": positions[:, 0], f"{prefix}y": positions[:, 1]}
+
+
+def _store(path: str | Path) -> tuple[Callable[[Any], pa.Table], Callable[[Any, pa.Table], None], str | Path]:
     """Return the functions that read and write walks in a place, and the name of the place for them."""
     store, _, name = PurePath(path).as_posix().partition(":")
     return (*_STORES[store], name) if store in _STORES else (partial(read_table, labels=("walk",)), write_table, path)
 
 
-def _check_columns(table: "pa.Table", source: str) -> None:
+def _check_columns(table: pa.Table, source: str) -> None:
     check_columns(table, _REQUIRED, source)
     names = table.column_names
     for first, second in (("goal_x", "goal_y"), ("failed_x", "failed_y")):
-        if (first in names) != (second in names):
-            absent = second if first in names else first
-            raise InputError(f"expected {first} and {second}, or neither", source=source, field=absent)
-    if len(table) == 0:
-        raise InputError("expected at least one walk, found a table without rows", source=source)
+        absent = second if first in names else first
+        together = (first in names) == (second in names)
+        check(together, f"expected {first} and {second}, or neither", source=source, field=absent)
+    check(len(table) > 0, "expected at least one walk, found a table without rows", source=source)
 
 
-def _labels(table: "pa.Table", source: str) -> "pa.DictionaryArray":
+def _labels(table: pa.Table, source: str) -> pa.DictionaryArray:
     """Return the label of the walk of each row, numbered in order of first appearance."""
-    import pyarrow as pa
-
     column = table["walk"].combine_chunks()
     if isinstance(column, pa.DictionaryArray):  # It may list labels in another order, or labels that no row has.
         column = column.dictionary_decode()
@@ -233,10 +231,8 @@ def _labels(table: "pa.Table", source: str) -> "pa.DictionaryArray":
     return column.dictionary_encode()
 
 
-def _steps(table: "pa.Table", source: str) -> Real[np.ndarray, " rows"]:
+def _steps(table: pa.Table, source: str) -> Real[np.ndarray, " rows"]:
     """Return the steps as whole numbers where all are (nanoseconds do not fit a float), else as floats."""
-    import pyarrow as pa
-
     numbers = finite_column(table, "step", source)
     try:
         return table["step"].cast(pa.int64()).to_numpy()
@@ -244,8 +240,9 @@ def _steps(table: "pa.Table", source: str) -> Real[np.ndarray, " rows"]:
         return numbers
 
 
-def _pair(table: "pa.Table", first: str, second: str, source: str) -> Float[np.ndarray, "rows 2"]:
-    """Return two optional columns of numbers; in each row both are empty (NaN) or neither is."""
+def _pair(table: pa.Table, name: str, source: str) -> Float[np.ndarray, "rows 2"]:
+    """Return x and y of optional positions; in each row both are empty (NaN) or neither is."""
+    first, second = f"{name}_x", f"{name}_y"
     if first not in table.column_names:
         return np.full((len(table), 2), np.nan)
     pair = np.stack([number_column(table, first, source), number_column(table, second, source)], axis=1)
@@ -254,36 +251,3 @@ def _pair(table: "pa.Table", first: str, second: str, source: str) -> Float[np.n
     field = first if empty[np.argmin(complete), 0] else second
     check_rows(complete, f"expected {first} and {second}, or neither, in a row", source, field)
     return pair
-
-
-def _goals(
-    pair: Float[np.ndarray, "rows 2"],
-    positions: Float[np.ndarray, "rows 2"],
-    walk: Int[np.ndarray, " rows"],
-    offsets: Int[np.ndarray, " boundaries"],
-    rows: Int[np.ndarray, " rows"],
-    source: str,
-) -> Float[np.ndarray, "walks 2"]:
-    """Return the goal of each walk: that in its rows, or its last position."""
-    for axis, field in enumerate(("goal_x", "goal_y")):
-        column = pair[:, axis]
-        same = (column[1:] == column[:-1]) | (np.isnan(column[1:]) & np.isnan(column[:-1]))
-        _check_pairs(same, walk, rows, source, field, "expected the same goal in all rows of a walk")
-    goals = pair[offsets[:-1]]
-    return np.where(np.isnan(goals), positions[offsets[1:] - 1], goals)
-
-
-def _check_pairs(
-    valid: Bool[np.ndarray, " pairs"],
-    walk: Int[np.ndarray, " rows"],
-    rows: Int[np.ndarray, " rows"],
-    source: str,
-    field: str,
-    message: str,
-) -> None:
-    """Raise `InputError` for the earliest data row that is not valid after the row before it in its walk."""
-    later = np.flatnonzero(~valid & (walk[1:] == walk[:-1])) + 1
-    if later.size:
-        index = later[np.argmin(rows[later])]
-        message = f"{message}, but this row does not follow row {rows[index - 1]} so"
-        raise InputError(message, source=source, row=int(rows[index]), field=field)

@@ -20,6 +20,9 @@ _GAP = 0.12
 """The least space in inches between neighbors and along the edge of a figure."""
 
 
+Lengths = Float[np.ndarray, " parts"]
+
+
 class ColorBar(NamedTuple):
     """A color bar for `image`, to the right of a column of axes; `label` names the values."""
 
@@ -82,9 +85,7 @@ def _margins(axes: Axes, width: float, height: float, renderer: RendererAgg) -> 
     return np.maximum([-x0, x1 - width, -y0, y1 - height], 0.0)
 
 
-def _starts(
-    before: Float[np.ndarray, " parts"], sizes: Float[np.ndarray, " parts"], after: Float[np.ndarray, " parts"]
-) -> tuple[Float[np.ndarray, " parts"], float]:
+def _starts(before: Lengths, sizes: Lengths, after: Lengths) -> tuple[Lengths, float]:
     """Return where each part of a row or column starts, and the length of all, with a gap around each part."""
     ends = np.cumsum(_GAP + before + sizes + after)
     return ends - after - sizes, float(ends[-1]) + _GAP

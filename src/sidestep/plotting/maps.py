@@ -30,8 +30,10 @@ _MOST_CELL_LINES = 25
 _PANEL, _FIT, _PLAN = 2.9, 4.2, 5.5
 """The longer side of a map in inches, in each kind of figure."""
 
+Values = Float[np.ndarray, "rows columns"]
 Places = Integer[np.ndarray, " _"] | Float[np.ndarray, "_ 2"]
 """States, or positions in metres."""
+Marks = Sequence[int] | Places
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +52,11 @@ class Panel:
 
     title: str
     grid: Grid
-    blocked: Float[np.ndarray, "rows columns"] | None = None
+    blocked: Values | None = None
     truth: Grid | None = None
     paths: Sequence[Places] = ()
-    starts: Sequence[int] | Places = ()
-    goals: Sequence[int] | Places = ()
+    starts: Marks = ()
+    goals: Marks = ()
 
 
 def draw_cells(
@@ -89,9 +91,7 @@ def draw_map(axes: Axes, grid: Grid) -> AxesImage:
     return draw_cells(axes, grid.known, grid, ListedColormap(palette.KNOWN), limits)
 
 
-def draw_blocked(
-    axes: Axes, blocked: Float[np.ndarray, "rows columns"], grid: Grid, truth: Grid | None = None
-) -> AxesImage:
+def draw_blocked(axes: Axes, blocked: Values, grid: Grid, truth: Grid | None = None) -> AxesImage:
     """Draw P(blocked) in colors for 0 to 1, with the obstacles of `truth` outlined; return the image."""
     image = draw_cells(axes, blocked, grid, palette.BLOCKED, (0.0, 1.0))
     if truth is not None:
@@ -136,7 +136,7 @@ def draw_path(axes: Axes, states: Integer[np.ndarray, " steps"], grid: Grid) -> 
     _draw_markers(axes, states[-1:], grid, "*", palette.GOAL, "goal", scale=1.7)
 
 
-def draw_places(axes: Axes, starts: Sequence[int] | Places, goals: Sequence[int] | Places, grid: Grid) -> None:
+def draw_places(axes: Axes, starts: Marks, goals: Marks, grid: Grid) -> None:
     """Draw starts as red squares and goals as green diamonds."""
     _draw_markers(axes, starts, grid, "s", palette.START, "start")
     _draw_markers(axes, goals, grid, "D", palette.GOAL, "goal")
@@ -165,11 +165,7 @@ def figure_learned(panels: Sequence[Panel], columns: int | None = None, label: s
 
 
 def figure_fit(
-    grid: Grid,
-    paths: Sequence[Integer[np.ndarray, " _"]],
-    blocked: Float[np.ndarray, "rows columns"],
-    objective: Float[np.ndarray, " iterations"],
-    seen: Float[np.ndarray, "rows columns"] | None = None,
+    grid: Grid, paths: Sequence[Places], blocked: Values, objective: Float[np.ndarray, " _"], seen: Values | None = None
 ) -> Figure:
     """Return a figure of a fit: the walks, the learned map, and the objective in every iteration.
 
@@ -199,7 +195,7 @@ def figure_fit(
     return figure
 
 
-def figure_plan(grid: Grid, blocked: Float[np.ndarray, "rows columns"], path: Integer[np.ndarray, " steps"]) -> Figure:
+def figure_plan(grid: Grid, blocked: Values, path: Integer[np.ndarray, " steps"]) -> Figure:
     """Return a figure of one path (states) planned in a learned map."""
     width, height = _size(grid, _PLAN)
     figure, (axes,) = new_figure(1, 1)
@@ -221,15 +217,14 @@ def save(figure: Figure, path: str | Path) -> None:
 
 def _draw_panel(axes: Axes, panel: Panel) -> AxesImage | None:
     """Draw a panel; return its image if a color bar applies to it."""
-    image = None
-    if panel.blocked is None:
-        draw_map(axes, panel.grid)
-    else:
+    if panel.blocked is not None:
         image = draw_blocked(axes, panel.blocked, panel.grid, panel.truth)
+    else:
+        image = draw_map(axes, panel.grid)
     draw_walks(axes, panel.paths, panel.grid, label="path")
     draw_places(axes, panel.starts, panel.goals, panel.grid)
     axes.set_title(panel.title)
-    return image
+    return None if panel.blocked is None else image
 
 
 def _cell_lines(grid: Grid) -> list[Float[np.ndarray, "2 2"]]:
@@ -260,7 +255,7 @@ def _shifts(count: int) -> Float[np.ndarray, "walks 2"]:
 
 
 def _draw_markers(
-    axes: Axes, places: Sequence[int] | Places, grid: Grid, marker: str, color: str, label: str, scale: float = 1.0
+    axes: Axes, places: Marks, grid: Grid, marker: str, color: str, label: str, scale: float = 1.0
 ) -> None:
     if not len(places):
         return

@@ -56,12 +56,10 @@ def room(lattice_points: int = 41) -> Room:
     walls = Walls(low=jnp.asarray([WALL_LOW]), high=jnp.asarray([WALL_HIGH]))
     low, high = jnp.zeros(2), jnp.full(2, SIDE)
     angles = np.arange(8) * np.pi / 4
-    return Room(
-        ObstacleMotion(walls, low, high, jnp.full(2, NOISE)),
-        [reach_region(goal, RADIUS, discount=1.0, step_cost=1.0) for goal in GOALS],
-        jnp.asarray(np.stack([np.cos(angles), np.sin(angles)], axis=1)),
-        Lattice(low, high, (lattice_points, lattice_points)),
-    )
+    actions = jnp.asarray(np.stack([np.cos(angles), np.sin(angles)], axis=1))
+    tasks = [reach_region(goal, RADIUS, discount=1.0, step_cost=1.0) for goal in GOALS]
+    dynamics = ObstacleMotion(walls, low, high, jnp.full(2, NOISE))
+    return Room(dynamics, tasks, actions, Lattice(low, high, (lattice_points, lattice_points)))
 
 
 def random_starts(world: Room, count: int, random: np.random.Generator) -> list[Float[np.ndarray, "count 2"]]:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.errors import InputError
+from sidestep.errors import check
 from sidestep.tabular.graph import graph, straight_moves
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import FIXED, IMPOSSIBLE, TiedModel
@@ -43,8 +43,8 @@ class Farm(NamedTuple):
             InputError: maps of different shapes, or without terrain or machines.
         """
         count, terrains = self.machines, int(self.terrain.max())
-        if self.terrain.shape != self.machine.shape or terrains < 1 or count < 1:
-            raise InputError("expected maps of one shape with terrain above 0 and machines from 0", field="terrain")
+        valid = self.terrain.shape == self.machine.shape and terrains >= 1 and count >= 1
+        check(valid, "expected maps of one shape with terrain above 0 and machines from 0", field="terrain")
         cells, driven = np.divmod(np.arange(count * self.terrain.size), count)
         target = straight_moves(Grid.unknown(*self.terrain.shape))[cells]
         moves = target != cells[:, None]

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sidestep.errors import InputError
+from sidestep.errors import check
 from sidestep.tabular.graph import graph, straight_moves
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import FIXED, IMPOSSIBLE, TiedModel
@@ -39,8 +39,7 @@ class Gravity(NamedTuple):
             InputError: a map without colors.
         """
         count = int(self.colors.max())
-        if self.colors.min() < 0 or count == 0:
-            raise InputError("expected colors 0…n, and one above 0", field="colors")
+        check(self.colors.min() >= 0 and count > 0, "expected colors 0…n, and one above 0", field="colors")
         cells, gravity = np.divmod(np.arange(4 * self.colors.size), 4)
         target = straight_moves(Grid.unknown(*self.colors.shape))[cells]
         moved = (target != cells[:, None]) & (np.arange(4) != _OPPOSITE[gravity][:, None])

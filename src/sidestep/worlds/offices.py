@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Int
 
-from sidestep.errors import InputError
+from sidestep.errors import check
 from sidestep.tabular.graph import walkable_graph
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 
@@ -36,10 +36,8 @@ def office(rows: int, columns: int, seed: int, connectivity: Connectivity = 4) -
         >>> office(20, 30, seed=0).shape
         (20, 30)
     """
-    if rows < _SMALLEST[0] or columns < _SMALLEST[1]:
-        raise InputError(
-            f"expected at least {_SMALLEST[0]} rows and {_SMALLEST[1]} columns, found {rows} and {columns}"
-        )
+    message = f"expected at least {_SMALLEST[0]} rows and {_SMALLEST[1]} columns, found {rows} and {columns}"
+    check(rows >= _SMALLEST[0] and columns >= _SMALLEST[1], message)
     random = np.random.default_rng(seed)
     cells = np.full((rows, columns), int(Cell.OCCUPIED), dtype=np.int64)
     wings = max(1, round((rows - 1) / _WING))
@@ -69,8 +67,8 @@ def places(grid: Grid, count: int, seed: int) -> Int[np.ndarray, " count"]:
 
     graph = walkable_graph(grid)
     candidates = connected_cells(grid)
-    if not 1 <= count <= len(candidates):
-        raise InputError(f"expected 1…{len(candidates)} (connected free cells), found {count}", field="count")
+    message = f"expected 1…{len(candidates)} (connected free cells), found {count}"
+    check(1 <= count <= len(candidates), message, field="count")
     random = np.random.default_rng(seed)
     chosen = [int(random.choice(candidates))]
     distance = dijkstra(graph, indices=chosen[0])
@@ -117,12 +115,9 @@ def _add_rooms(
 ) -> None:
     """Clear a row of rooms in `rows` (first and last), each with a door in the wall at `door_row`."""
     first, last = rows
-    columns = cells.shape[1]
     # a crossing corridor has a wall on either side, and the rooms end there
-    sections = pairwise([0, *(column for left in crossings for column in (left - 1, left + 2)), columns - 1])
-    for index, (left, right) in enumerate(sections):
-        if index % 2 == 1:
-            continue
+    ends = [0, *(column for left in crossings for column in (left - 1, left + 2)), cells.shape[1] - 1]
+    for left, right in zip(ends[::2], ends[1::2], strict=True):
         walls = _room_walls(left, right, random)
         for west, east in pairwise(walls):
             cells[first : last + 1, west + 1 : east] = Cell.FREE

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sidestep.errors import InputError
+from sidestep.errors import check
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 
 
@@ -45,15 +45,12 @@ def three_rooms(rows: int, columns: int, doors: tuple[int, int], connectivity: C
 
 
 def _rooms_in_a_row(rows: int, columns: int, doors: tuple[int, ...], connectivity: Connectivity) -> Grid:
-    if columns < 2 * len(doors) + 1:
-        raise InputError(f"expected at least {2 * len(doors) + 1}, found {columns}", field="columns")
-    if rows < 1:
-        raise InputError(f"expected at least 1, found {rows}", field="rows")
+    check(columns >= 2 * len(doors) + 1, f"expected at least {2 * len(doors) + 1}, found {columns}", field="columns")
+    check(rows >= 1, f"expected at least 1, found {rows}", field="rows")
     cells = np.full((rows, columns), int(Cell.FREE))
     walls = np.arange(1, len(doors) + 1) * (columns + 1) // (len(doors) + 1) - 1
     for wall, door in zip(walls, doors, strict=True):
-        if not 0 <= door < rows:
-            raise InputError(f"expected a row in 0…{rows - 1}, found {door}", field="door")
+        check(0 <= door < rows, f"expected a row in 0…{rows - 1}, found {door}", field="door")
         cells[:, wall] = Cell.OCCUPIED
         cells[door, wall] = Cell.FREE
     return Grid(cells, connectivity=connectivity)

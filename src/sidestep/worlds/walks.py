@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 
-from sidestep.errors import InputError
+from sidestep.errors import check
 from sidestep.maps.config import SimulationConfig
 from sidestep.tabular.backups import BACKUPS, Behavior
 from sidestep.tabular.demonstrations import Trajectory
@@ -28,10 +28,8 @@ def simulate_walks(grid: Grid, config: SimulationConfig) -> tuple[list[Trajector
     """
     candidates = connected_cells(grid)
     needed = max(2, config.goals)
-    if len(candidates) < needed:
-        raise InputError(
-            f"expected at least {needed} free cells that can reach one another, found {len(candidates)}", field="map"
-        )
+    message = f"expected at least {needed} free cells that can reach one another, found {len(candidates)}"
+    check(len(candidates) >= needed, message, field="map")
     goals = places(grid, config.goals, config.seed).tolist()[: config.walks]
     random = np.random.default_rng(config.seed)
     goal_of_walk = np.arange(config.walks) % len(goals)

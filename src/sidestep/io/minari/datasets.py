@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sidestep._files import write_whole_folder
-from sidestep.errors import InputError, SidestepError
+from sidestep.errors import InputError, SidestepError, check
 
 _ID = re.compile(r"(?:(?P<namespace>[-\w]+(?:/[-\w]+)*)/)?[-\w]+?(?P<version>-v\d+)?")
 
@@ -87,32 +87,20 @@ def read_dataset(dataset: str | Path, check_spaces: Callable[[Any, Any], None]) 
         by_id = isinstance(dataset, str) and _ID.fullmatch(dataset)
         folder = get_dataset_path(str(dataset)) if by_id else Path(dataset)
         data = folder / "data" if (folder / "data").is_dir() else folder
-        if not (data / "metadata.json").is_file():
-            raise InputError(
-                "there is no such dataset here: expected one that `minari list local` shows, or the path of one",
-                source=dataset,
-            )
+        message = "there is no such dataset here: expected one that `minari list local` shows, or the path of one"
+        check((data / "metadata.json").is_file(), message, source=dataset)
         opened = MinariDataset(data)
         check_spaces(opened.observation_space, opened.action_space)
         stored = list(opened.iterate_episodes())
         metadata = list(opened.storage.get_episode_metadata(opened.episode_indices))
         spaces, whole = (opened.observation_space, opened.action_space), opened.storage.metadata
-    if not stored:
-        raise InputError("expected at least one episode, found none", source=dataset)
-    episodes = [
-        Episode(
-            each.observations,
-            each.actions,
-            each.rewards,
-            bool(each.terminations[-1:].any()),
-            each.infos or {},
-            own,
-            f"{dataset}, episode {each.id}",
-        )
-        for each, own in zip(stored, metadata, strict=True)
-    ]
-    for episode in episodes:
-        _check_lengths(episode)
+    check(stored, "expected at least one episode, found none", source=dataset)
+    episodes = []
+    for each, own in zip(stored, metadata, strict=True):
+        terminated, source = bool(each.terminations[-1:].any()), f"{dataset}, episode {each.id}"
+        fields = each.observations, each.actions, each.rewards, terminated, each.infos or {}, own, source
+        episodes.append(Episode(*fields))
+        _check_lengths(episodes[-1])
     return Dataset(*spaces, whole, episodes)
 
 
@@ -161,15 +149,11 @@ def _buffer_fields(episode: Episode) -> dict[str, Any]:
 
 def _check_lengths(episode: Episode) -> None:
     moves = len(episode.rewards)
-    if moves == 0:
-        raise InputError("expected at least one move, found none", source=episode.source, field="rewards")
-    several = (
-        episode.observations if isinstance(episode.observations, Mapping) else {"observations": episode.observations}
-    )
-    for name, values in several.items():
-        if len(values) != moves + 1:
-            message = f"expected {moves + 1} observations around {moves} moves, found {len(values)}"
-            raise InputError(message, source=episode.source, field=name)
+    check(moves != 0, "expected at least one move, found none", source=episode.source, field="rewards")
+    several = episode.observations
+    for name, values in (several if isinstance(several, Mapping) else {"observations": several}).items():
+        message = f"expected {moves + 1} observations around {moves} moves, found {len(values)}"
+        check(len(values) == moves + 1, message, source=episode.source, field=name)
 
 
 @contextmanager

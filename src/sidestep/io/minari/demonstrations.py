@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from sidestep.errors import InputError
+from sidestep.errors import InputError, check
 from sidestep.io.minari.datasets import Dataset, Episode, read_dataset, require_minari, write_dataset
 from sidestep.io.minari.tasks import best_terminal_states, describe_tasks, tasks_of_episodes, world_size
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
@@ -23,11 +23,7 @@ _NO_ENDS: Mapping[int, int] = {}
 
 
 def write_demonstrations(
-    dataset: str,
-    demonstrations: Demonstrations[Task],
-    world: Grid | Graph,
-    *,
-    ends: Mapping[int, int] = _NO_ENDS,
+    dataset: str, demonstrations: Demonstrations[Task], world: Grid | Graph, *, ends: Mapping[int, int] = _NO_ENDS
 ) -> None:
     """Write demonstrations and their tasks as a local Minari dataset atomically.
 
@@ -55,11 +51,7 @@ def write_demonstrations(
         message = f"{expected}, found {own_states} states and action {last_action}"
         raise InputError(message, field="demonstrations")
     tasks = describe_tasks(demonstrations.tasks)
-    episodes = list(_episodes(demonstrations, states, actions, {own: state for state, own in ends.items()}))
-    episodes = [
-        episode._replace(metadata={**episode.metadata, **_goal_and_discount(tasks[episode.metadata["task"]])})
-        for episode in episodes
-    ]
+    episodes = list(_episodes(demonstrations, tasks, (states, actions), ends))
     write_dataset(dataset, Dataset(Discrete(states - len(ends)), Discrete(actions), {"tasks": tasks}, episodes))
 
 
@@ -104,7 +96,7 @@ def read_demonstrations(
     else:
         raise InputError(f"expected one task of {states} states, found {task.terminal.shape}", field="task")
     trajectories = [
-        _trajectory(episode, states - len(ends), actions, ends)._replace(task=index)
+        _trajectory(episode, index, states - len(ends), actions, ends)
         for episode, index in zip(stored.episodes, indices, strict=True)
     ]
     try:
@@ -114,12 +106,13 @@ def read_demonstrations(
 
 
 def _episodes(
-    demonstrations: Demonstrations[Task], states: int, actions: int, origin: Mapping[int, int]
+    demonstrations: Demonstrations[Task], tasks: list[dict], size: tuple[int, int], ends: Mapping[int, int]
 ) -> Iterator[Episode]:
-    """Yield the episode of each trajectory; `origin` has the environment's state for each separate end state."""
+    """Yield the episode of each trajectory; `tasks` describes each task, `size` counts states and actions."""
+    origin = {own: state for state, own in ends.items()}
     before, after = np.asarray(demonstrations.states), np.asarray(demonstrations.next_states)
     acted, task = np.asarray(demonstrations.actions), np.asarray(demonstrations.task)
-    rewards = _rewards(demonstrations, states, actions)
+    rewards = _rewards(demonstrations, *size)
     ended = np.asarray(demonstrations.tasks.terminal)[task, after]
     trajectory = np.asarray(demonstrations.trajectory)
     for moves in np.split(np.arange(len(trajectory)), np.flatnonzero(np.diff(trajectory)) + 1):
@@ -129,7 +122,10 @@ def _episodes(
             raise InputError(message, source="trajectory", row=int(trajectory[first]) + 1)
         end = origin.get(int(after[last]), int(after[last]))
         path = np.append(before[moves], end).astype(np.int64)
-        metadata = {"task": int(task[first])}
+        entry = tasks[task[first]]
+        goals = best_terminal_states(entry)
+        metadata = {"task": int(task[first]), "discount": entry["discount"]}
+        metadata |= {"goal": goals[0] if len(goals) == 1 else goals} if goals else {}
         yield Episode(path, acted[moves].astype(np.int64), rewards[moves], bool(ended[last]), {}, metadata)
 
 
@@ -144,27 +140,20 @@ def _rewards(demonstrations: Demonstrations[Task], states: int, actions: int) ->
     return paid + np.asarray(tasks.discount, dtype=np.float64)[task] * at_end
 
 
-def _goal_and_discount(entry: Mapping) -> dict:
-    """Return the metadata of an episode that describe its task."""
-    goals = best_terminal_states(entry)
-    return {"discount": entry["discount"]} | ({"goal": goals[0] if len(goals) == 1 else goals} if goals else {})
-
-
-def _trajectory(episode: Episode, states: int, actions: int, ends: Mapping[int, int]) -> Trajectory:
+def _trajectory(episode: Episode, task: int, states: int, actions: int, ends: Mapping[int, int]) -> Trajectory:
     moves = len(episode.rewards)
     path = _within(episode.observations, moves + 1, states, episode.source, "observations")
     acted = _within(episode.actions, moves, actions, episode.source, "actions")
     if episode.terminated:
         path[-1] = ends.get(int(path[-1]), int(path[-1]))
-    return Trajectory(path, acted, 0)
+    return Trajectory(path, acted, task)
 
 
 def _within(values: object, length: int, count: int, source: str, field: str) -> Int[np.ndarray, " length"]:
     """Return whole numbers in 0…count − 1, one for each move or observation."""
     numbers = np.asarray(values)
-    if numbers.shape != (length,) or numbers.dtype.kind not in "iu":
-        message = f"expected {length} whole numbers, found {numbers.dtype} of shape {numbers.shape}"
-        raise InputError(message, source=source, field=field)
+    message = f"expected {length} whole numbers, found {numbers.dtype} of shape {numbers.shape}"
+    check(numbers.shape == (length,) and numbers.dtype.kind in "iu", message, source=source, field=field)
     outside = (numbers < 0) | (numbers >= count)
     if outside.any():
         step = int(np.argmax(outside))
@@ -176,5 +165,5 @@ def _within(values: object, length: int, count: int, source: str, field: str) ->
 def _check_space(space: object, count: int, dataset: str | Path, field: str) -> None:
     from gymnasium.spaces import Discrete
 
-    if not (isinstance(space, Discrete) and space.n == count and space.start == 0):
-        raise InputError(f"expected Discrete({count}), as the world has, found {space}", source=dataset, field=field)
+    fits = isinstance(space, Discrete) and space.n == count and space.start == 0
+    check(fits, f"expected Discrete({count}), as the world has, found {space}", source=dataset, field=field)

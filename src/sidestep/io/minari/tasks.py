@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from sidestep.errors import InputError
+from sidestep.errors import InputError, check
 from sidestep.io.minari.datasets import Dataset, Episode
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.grid import Grid
@@ -59,8 +59,7 @@ def tasks_of_episodes(
     entries = dataset.metadata.get("tasks")
     if entries is None:
         return _towards_goals(dataset.episodes, world, discount, step_cost)
-    if not isinstance(entries, list) or not entries:
-        raise InputError("expected a list of tasks", source=source, field="tasks")
+    check(isinstance(entries, list) and entries, "expected a list of tasks", source=source, field="tasks")
     tasks = [_task(entry, world, f"{source}, task {index}") for index, entry in enumerate(entries)]
     return tasks, [_entry_of(episode, entries) for episode in dataset.episodes]
 
@@ -87,15 +86,13 @@ def _towards_goals(
 def _entry_of(episode: Episode, entries: Sequence[Mapping[str, Any]]) -> int:
     """Return the entry of an episode; goal and discount of its metadata, if any, must be those of the entry."""
     index = _whole(episode.metadata, "task", episode.source)
-    if not 0 <= index < len(entries):
-        message = f"expected a task in 0…{len(entries) - 1}, found {index}"
-        raise InputError(message, source=episode.source, field="task")
+    message = f"expected a task in 0…{len(entries) - 1}, found {index}"
+    check(0 <= index < len(entries), message, source=episode.source, field="task")
     entry = entries[index]
     for field, expected in (("goal", best_terminal_states(entry)), ("discount", entry["discount"])):
         own = episode.metadata.get(field, expected)
-        if not np.array_equal(np.atleast_1d(own), np.atleast_1d(expected)):
-            message = f"expected {expected} as in task {index}, found {own}"
-            raise InputError(message, source=episode.source, field=field)
+        message = f"expected {expected} as in task {index}, found {own}"
+        check(np.array_equal(np.atleast_1d(own), np.atleast_1d(expected)), message, source=episode.source, field=field)
     return index
 
 
@@ -105,24 +102,24 @@ def _number(metadata: Mapping[str, Any], field: str, source: str) -> float:
     if value is None:
         message = "neither the episode nor an argument has it: expected a number, or a task for all episodes"
         raise InputError(message, source=source, field=field)
-    if np.ndim(value) or np.asarray(value).dtype.kind not in "iuf":
-        raise InputError(f"expected a number, found {value!r}", source=source, field=field)
+    is_number = np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"
+    check(is_number, f"expected a number, found {value!r}", source=source, field=field)
     return float(value)
 
 
 def _whole(metadata: Mapping[str, Any], field: str, source: str) -> int:
     """Return a whole number in the metadata of an episode."""
     value = _number(metadata, field, source)
-    if not value.is_integer():
-        raise InputError(f"expected a whole number, found {value:g}", source=source, field=field)
+    check(value.is_integer(), f"expected a whole number, found {value:g}", source=source, field=field)
     return int(value)
 
 
 def _task(entry: Any, world: Grid | Graph, source: str) -> Task:
     """Return the task of an entry; raise `InputError` for one that does not fit the world."""
     states, actions = world_size(world)
-    if not isinstance(entry, Mapping) or not {"discount", "terminal", "terminal_reward", "reward"} <= entry.keys():
-        raise InputError("expected discount, terminal, terminal_reward and reward", source=source)
+    keys = {"discount", "terminal", "terminal_reward", "reward"}
+    complete = isinstance(entry, Mapping) and keys <= entry.keys()
+    check(complete, "expected discount, terminal, terminal_reward and reward", source=source)
     discount = _number(entry, "discount", source)
     try:
         check_discount(discount)
@@ -132,11 +129,9 @@ def _task(entry: Any, world: Grid | Graph, source: str) -> Task:
     if ends.ndim != 1 or (len(ends) and (ends.dtype.kind != "i" or ends.min() < 0 or ends.max() >= states)):
         raise InputError(f"expected a list of states in 0…{states - 1}", source=source, field="terminal")
     terminal = jnp.asarray(np.isin(np.arange(states), ends))
-    reward = _table(entry, "reward", (states, actions), source)
-    terminal_reward = _table(entry, "terminal_reward", (states,), source)
-    return Task(
-        jnp.asarray(reward), jnp.asarray(terminal_reward), terminal, jnp.asarray(discount, jnp.result_type(float))
-    )
+    reward = jnp.asarray(_table(entry, "reward", (states, actions), source))
+    terminal_reward = jnp.asarray(_table(entry, "terminal_reward", (states,), source))
+    return Task(reward, terminal_reward, terminal, jnp.asarray(discount, jnp.result_type(float)))
 
 
 def _table(entry: Mapping[str, Any], field: str, shape: tuple[int, ...], source: str) -> Float[np.ndarray, "..."]:
@@ -145,12 +140,9 @@ def _table(entry: Mapping[str, Any], field: str, shape: tuple[int, ...], source:
         table = np.asarray(entry[field], dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError("expected a table of numbers", source=source, field=field) from error
-    fits = table.ndim == len(shape) and all(
-        length in (1, full) for length, full in zip(table.shape, shape, strict=True)
-    )
-    if not fits or not np.isfinite(table).all():
-        message = f"expected finite numbers of shape {shape}, found shape {table.shape}"
-        raise InputError(message, source=source, field=field)
+    fits = table.ndim == len(shape) and all(np.isin(table.shape, 1) | (np.array(table.shape) == shape))
+    message = f"expected finite numbers of shape {shape}, found shape {table.shape}"
+    check(fits and np.isfinite(table).all(), message, source=source, field=field)
     return table
 
 

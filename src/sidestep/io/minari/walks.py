@@ -12,23 +12,21 @@ last action is 1 if it reaches the goal, and all other rewards are 0.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from jaxtyping import Float, Shaped
 
-from sidestep.errors import InputError
+from sidestep.errors import InputError, check
 from sidestep.io.minari.datasets import Dataset, Episode, read_dataset, require_minari, write_dataset
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 _OWN = ("walk", "x", "y", "goal_x", "goal_y")
 """Columns that are not from `infos`."""
 _FAILED = ("failed_x", "failed_y")
 
 
-def read_positions(dataset: str) -> "pa.Table":
+def read_positions(dataset: str) -> pa.Table:
     """Return the walks of a local Minari dataset, by its id or its path, as a table for `sidestep.io.walks`.
 
     Raises:
@@ -36,8 +34,6 @@ def read_positions(dataset: str) -> "pa.Table":
             two walks with one label, and, naming the episode and the field, for positions and goals that are not finite
             or of another shape, and for goals that change.
     """
-    import pyarrow as pa
-
     episodes = read_dataset(dataset, lambda observation_space, _: _check_space(observation_space, dataset)).episodes
     tables = [_table(episode, label) for episode, label in zip(episodes, _labels(episodes, dataset), strict=True)]
     try:
@@ -47,7 +43,7 @@ def read_positions(dataset: str) -> "pa.Table":
         raise InputError(message, source=dataset, field="infos") from error
 
 
-def write_positions(dataset: str, table: "pa.Table") -> None:
+def write_positions(dataset: str, table: pa.Table) -> None:
     """Write a table of walks from `table_from_walks` as a local Minari dataset atomically.
 
     Raises:
@@ -55,8 +51,7 @@ def write_positions(dataset: str, table: "pa.Table") -> None:
             numbers nor text, or has empty cells.
     """
     require_minari(dataset)
-    if len(table) == 0:
-        raise InputError("expected at least one walk, found none", source=dataset)
+    check(len(table) > 0, "expected at least one walk, found none", source=dataset)
     from gymnasium.spaces import Box, Dict
 
     plane = Box(-np.inf, np.inf, (2,), np.float64)
@@ -64,7 +59,7 @@ def write_positions(dataset: str, table: "pa.Table") -> None:
     write_dataset(dataset, Dataset(observation_space, plane, {}, list(_episodes(table, dataset))))
 
 
-def _episodes(table: "pa.Table", dataset: str) -> Iterator[Episode]:
+def _episodes(table: pa.Table, dataset: str) -> Iterator[Episode]:
     """Yield the episode of each walk."""
     infos = {name: _info(table[name], name, dataset) for name in table.column_names if name not in _OWN}
     positions, goals = _pair(table, "x", "y"), _pair(table, "goal_x", "goal_y")
@@ -84,10 +79,8 @@ def _episodes(table: "pa.Table", dataset: str) -> Iterator[Episode]:
         yield Episode(observations, targets[rows[1:]] - path[:-1], rewards, arrived, own, metadata)
 
 
-def _info(column: "pa.ChunkedArray", name: str, dataset: str) -> Shaped[np.ndarray, " rows"]:
+def _info(column: pa.ChunkedArray, name: str, dataset: str) -> Shaped[np.ndarray, " rows"]:
     """Return a column as an array for `infos`."""
-    import pyarrow as pa
-
     if name in _FAILED:  # NaN except where a move failed
         return column.to_numpy()
     kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
@@ -104,7 +97,7 @@ def _info(column: "pa.ChunkedArray", name: str, dataset: str) -> Shaped[np.ndarr
     return values
 
 
-def _pair(table: "pa.Table", first: str, second: str) -> Float[np.ndarray, "rows 2"]:
+def _pair(table: pa.Table, first: str, second: str) -> Float[np.ndarray, "rows 2"]:
     return np.stack([table[first].to_numpy(), table[second].to_numpy()], axis=1)
 
 
@@ -112,12 +105,12 @@ def _check_space(space: Any, dataset: str) -> None:
     """Raise `InputError` for observations without positions."""
     from gymnasium.spaces import Box, Dict
 
-    if isinstance(space, Dict) and "achieved_goal" not in space.spaces:
-        message = f"expected achieved_goal among the observations, found {', '.join(space.spaces)}"
-        raise InputError(message, source=dataset, field="observation_space")
+    spaces = space.spaces if isinstance(space, Dict) else {"achieved_goal": space}
+    message = f"expected achieved_goal among the observations, found {', '.join(spaces)}"
+    check("achieved_goal" in spaces, message, source=dataset, field="observation_space")
     for name, each in _places(space.spaces if isinstance(space, Dict) else space).items():
-        if not (isinstance(each, Box) and len(each.shape) == 1 and each.shape[0] >= 2):
-            raise InputError(f"expected a Box of at least two numbers x, y, found {each}", source=dataset, field=name)
+        fits = isinstance(each, Box) and len(each.shape) == 1 and each.shape[0] >= 2
+        check(fits, f"expected a Box of at least two numbers x, y, found {each}", source=dataset, field=name)
 
 
 def _places(observations: Any) -> dict[str, Any]:
@@ -139,14 +132,11 @@ def _labels(episodes: Sequence[Episode], dataset: str) -> list[Any]:
     return labels
 
 
-def _table(episode: Episode, label: object) -> "pa.Table":
+def _table(episode: Episode, label: object) -> pa.Table:
     """Return the table of one walk, one row per position."""
-    import pyarrow as pa
-
     rows = len(episode.rewards) + 1
-    places = {
-        name: _plane(values, rows, episode.source, name) for name, values in _places(episode.observations).items()
-    }
+    seen = _places(episode.observations)
+    places = {name: _plane(values, rows, episode.source, name) for name, values in seen.items()}
     positions, goal = next(iter(places.values())), _goal(episode, places.get("desired_goal"))
     columns = {"walk": pa.array([label] * rows), "step": np.arange(rows), "x": positions[:, 0], "y": positions[:, 1]}
     if goal is not None:
@@ -158,9 +148,8 @@ def _goal(episode: Episode, goals: Float[np.ndarray, "rows 2"] | None) -> Float[
     """Return the goal of an episode, if it has one."""
     if goals is not None:
         changed = (goals != goals[0]).any(axis=1)
-        if changed.any():
-            message = f"expected one goal, found another at step {int(np.argmax(changed))}"
-            raise InputError(message, source=episode.source, field="desired_goal")
+        message = f"expected one goal, found another at step {int(np.argmax(changed))}"
+        check(not changed.any(), message, source=episode.source, field="desired_goal")
         return goals[0]
     goal = episode.metadata.get("goal")
     return None if goal is None else _plane([goal], 1, episode.source, "goal")[0]
@@ -172,22 +161,17 @@ def _plane(values: Any, rows: int, source: str, field: str) -> Float[np.ndarray,
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"expected numbers: {error}", source=source, field=field) from error
-    if array.ndim != 2 or len(array) != rows or array.shape[1] < 2:
-        message = f"expected x and y in each of {rows} rows, found shape {array.shape}"
-        raise InputError(message, source=source, field=field)
+    message = f"expected x and y in each of {rows} rows, found shape {array.shape}"
+    check(array.ndim == 2 and len(array) == rows and array.shape[1] >= 2, message, source=source, field=field)
     places = array[:, :2]
-    wrong = ~np.isfinite(places).all(axis=1)
-    if wrong.any():
-        step = int(np.argmax(wrong))
-        message = f"expected finite numbers, found {places[step].tolist()} at step {step}"
-        raise InputError(message, source=source, field=field)
+    step = int(np.argmin(np.isfinite(places).all(axis=1)))
+    message = f"expected finite numbers, found {places[step].tolist()} at step {step}"
+    check(np.isfinite(places).all(), message, source=source, field=field)
     return places
 
 
-def _columns(infos: Mapping[str, Any], rows: int) -> "dict[str, pa.Array]":
+def _columns(infos: Mapping[str, Any], rows: int) -> dict[str, pa.Array]:
     """Return the infos with one number or text for every position; text is stored as bytes."""
-    import pyarrow as pa
-
     columns = {}
     for name, values in infos.items():
         if name in _OWN or not isinstance(values, np.ndarray) or values.shape != (rows,):
