@@ -1,6 +1,7 @@
 """All tests run in 64-bit numbers; `sidestep` itself never changes JAX's configuration.
 
-Import nothing of `sidestep` here: jaxtyping's checks must be switched on first.
+Import nothing of `sidestep` above `pytest_configure`: jaxtyping's checks must be switched on first.
+Compiled code is kept from run to run, in the folder that the environment variable `SIDESTEP_CACHE` names.
 """
 
 import os
@@ -16,6 +17,20 @@ jax.config.update("jax_enable_x64", True)
 
 settings.register_profile("sidestep", deadline=None, max_examples=25)
 settings.load_profile("sidestep")
+
+
+def pytest_configure():
+    """Keep what JAX compiles from run to run; numba's code is kept anyway.
+
+    Not by `keep_compiled_code`, which also keeps traces: tests trace the code that they test.
+    """
+    from sidestep._cache import cache_folder
+
+    folder = cache_folder()
+    if folder is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder / "jax"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 @pytest.fixture(scope="module", autouse=True)

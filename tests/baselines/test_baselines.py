@@ -193,3 +193,11 @@ def test_behavior_cloning_reports_convergence(walks, max_iterations, converged):
 
 def test_methods_begin_with_behavior_aware_modeling():
     assert list(METHODS) == ["behavior", *BASELINES]
+
+
+def test_constraint_inference_on_a_map_with_known_outer_walls():
+    """The corners of the outer walls lead only to themselves."""
+    known = np.ones((5, 6), dtype=int)
+    known[1:-1, 1:-1] = 0
+    demos = gather([Trajectory(np.array([7, 8, 9, 10]), np.array([3, 3, 3]), 0)], [reach(Grid(known), 10)])
+    assert np.isfinite(constraint_inference(Grid(known), demos, MapConfig()).ranking).all()

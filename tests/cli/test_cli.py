@@ -1,4 +1,4 @@
-"""The command line's manners: help, exit codes, and one line for everything that is wrong with the input."""
+"""Help, exit codes, and one line for every error in the input."""
 
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -35,7 +35,7 @@ def here(tmp_path, monkeypatch):
 
 
 def run(arguments: str) -> int:
-    """The exit code of `sidestep` with these arguments."""
+    """Return the exit code of `sidestep` with these arguments."""
     return main(arguments.split())
 
 
@@ -44,21 +44,21 @@ def written(folder: Path) -> set[str]:
 
 
 def refused(here: Path, capsys, arguments: str, *expected: str) -> None:
-    """Exit code 1, one line that says all that is expected, and nothing written."""
+    """Check for exit code 1, one line with all expected texts, and no new file."""
     before = written(here)
     assert run(arguments) == 1
-    told = capsys.readouterr()
-    lines = told.err.strip().splitlines()
-    assert len(lines) == 1, told.err
+    printed = capsys.readouterr()
+    lines = printed.err.strip().splitlines()
+    assert len(lines) == 1, printed.err
     for text in ("error: ", *expected):
         assert text in lines[0]
-    assert "Traceback" not in told.err
-    assert "sidestep failed" not in told.err
+    assert "Traceback" not in printed.err
+    assert "sidestep failed" not in printed.err
     assert written(here) == before
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_shows_an_example(command, capsys):
+def test_main_with_help_prints_an_example(command, capsys):
     assert main([command, "--help"]) == 0
     text = capsys.readouterr().out
     assert f"Example: sidestep {command}" in text
@@ -69,7 +69,7 @@ def test_help_shows_an_example(command, capsys):
     "",
     "explore",
     "learn walks.csv --out out",  # no map
-    "learn walks.csv --map map.yaml",  # nowhere to write to
+    "learn walks.csv --map map.yaml",  # no folder for the map
     "learn --map map.yaml --out out",  # no walks
     "learn walks.csv --map map.yaml --out out --beta much",
     "learn walks.csv --map map.yaml --out out --connectivity 6",
@@ -84,12 +84,12 @@ def test_help_shows_an_example(command, capsys):
     "simulate map.yaml",
     "demo --seed x",
 ])  # fmt: skip
-def test_wrong_usage_gives_exit_code_2(here, arguments, capsys):
+def test_main_with_wrong_usage_returns_2(here, arguments, capsys):
     before = written(here)
     assert run(arguments) == 2
-    told = capsys.readouterr()
-    assert "Traceback" not in told.err
-    assert told.err + told.out
+    printed = capsys.readouterr()
+    assert "Traceback" not in printed.err
+    assert printed.err + printed.out
     assert written(here) == before
 
 
@@ -113,7 +113,7 @@ ROWS = {
 
 
 @pytest.mark.parametrize("name", ROWS)
-def test_bad_walks(here, capsys, name):
+def test_learn_with_invalid_walks_names_row_and_field(here, capsys, name):
     good, bad, *expected = ROWS[name]
     assert good in WALKS
     Path("walks.csv").write_text(WALKS.replace(good, bad))
@@ -131,22 +131,22 @@ KEYS = {
 
 
 @pytest.mark.parametrize("key", KEYS)
-def test_bad_maps(here, capsys, key):
+def test_learn_and_simulate_with_an_invalid_map_name_the_field(here, capsys, key):
     value, expected = KEYS[key]
-    settings = yaml.safe_load(Path("map.yaml").read_text()) | {key: value}
-    Path("map.yaml").write_text(yaml.safe_dump({key: value for key, value in settings.items() if value is not None}))
+    entries = yaml.safe_load(Path("map.yaml").read_text()) | {key: value}
+    Path("map.yaml").write_text(yaml.safe_dump({key: value for key, value in entries.items() if value is not None}))
     refused(here, capsys, "learn walks.csv --map map.yaml --out out", "map.yaml", f"field '{key}'", expected)
     refused(here, capsys, "simulate map.yaml --out new.csv", "map.yaml", f"field '{key}'", expected)
 
 
 @pytest.mark.parametrize("image", ["../elsewhere.pgm", "/etc/hostname", "missing.pgm"])
-def test_images_outside_the_folder_of_the_map(here, capsys, image):
+def test_learn_with_an_image_outside_the_folder_of_the_map_is_refused(here, capsys, image):
     Image.new("L", (3, 2)).save(here.parent / "elsewhere.pgm")
     Path("map.yaml").write_text(Path("map.yaml").read_text().replace("map.pgm", image))
     refused(here, capsys, "learn walks.csv --map map.yaml --out out", "map.yaml", "field 'image'")
 
 
-def test_images_of_absurd_size(here, capsys):
+def test_learn_with_a_huge_image_is_refused(here, capsys):
     Path("map.pgm").write_bytes(b"P5 200000 200000 255\n")
     refused(here, capsys, "learn walks.csv --map map.yaml --out out", "map.pgm", "pixels")
 
@@ -166,15 +166,15 @@ def test_images_of_absurd_size(here, capsys):
     ("--max-walks 2", "field 'max_walks'"),
     ("--backup logsumexp --discount 1 --step-cost 1 --beta 1", "log-sum-exp"),
 ])  # fmt: skip
-def test_bad_settings(here, capsys, options, expected):
+def test_learn_with_invalid_settings_names_the_field(here, capsys, options, expected):
     refused(here, capsys, f"learn walks.csv --map map.yaml --out out {options}", expected)
 
 
-def test_walks_whose_goal_is_walled_off(here, capsys):
+def test_learn_with_an_unreachable_goal_names_the_row(here, capsys):
     write_map("map.yaml", np.array([[0.5, 1.0, 0.5], [0.5, 1.0, 0.0]]), Grid.unknown(2, 3))
     Path("walks.csv").write_text("walk,step,x,y,goal_x,goal_y\na,0,0.5,0.5,2.5,1.5\na,1,0.5,1.5,2.5,1.5\n")
-    walled_off = "learn walks.csv --map map.yaml --out out --discount 1 --step-cost 1"
-    refused(here, capsys, walled_off, "walks.csv, row 2", "cannot be reached")
+    command = "learn walks.csv --map map.yaml --out out --discount 1 --step-cost 1"
+    refused(here, capsys, command, "walks.csv, row 2", "cannot be reached")
 
 
 @pytest.mark.parametrize(("arguments", "expected"), [
@@ -188,20 +188,20 @@ def test_walks_whose_goal_is_walled_off(here, capsys):
     ("simulate map.yaml --out new.csv --walks 0", "field 'walks'"),
     ("simulate map.yaml --out new.csv --goals 0", "field 'goals'"),
 ])  # fmt: skip
-def test_bad_files_and_numbers(here, capsys, arguments, expected):
+def test_commands_with_missing_files_or_invalid_numbers_name_them(here, capsys, arguments, expected):
     if expected == "free cells":
         write_map("map.yaml", np.array([[0.0, 1.0, 0.0]]), Grid.unknown(1, 3))
         arguments += " --goals 1"
     refused(here, capsys, arguments, expected)
 
 
-def test_a_folder_that_cannot_be_written(here, capsys):
+def test_learn_into_a_folder_that_cannot_be_written_is_refused(here, capsys):
     Path("taken").write_text("a file, not a folder")
     refused(here, capsys, "learn walks.csv --map map.yaml --out taken/out", "taken", "cannot be written")
 
 
 class TestWithALearnedMap:
-    """`plan` and `evaluate` on a map that was learned from one walk."""
+    """`plan` and `evaluate` with a map that was learned from one walk."""
 
     @pytest.fixture
     def learned(self, here):
@@ -211,7 +211,7 @@ class TestWithALearnedMap:
         write_map("finer.yaml", np.zeros((2, 3)), Grid(np.zeros((2, 3), dtype=int), resolution=0.5))
         return here
 
-    def test_refusals(self, learned, capsys):
+    def test_plan_and_evaluate_with_other_maps_or_positions_are_refused(self, learned, capsys):
         capsys.readouterr()
         for arguments, *expected in (
             ("plan learned --start 0.5,0.5 --goal 9,0.5", "field 'goal'", "outside the map"),
@@ -227,7 +227,7 @@ class TestWithALearnedMap:
         refused(learned, capsys, "plan learned --start 0.5,0.5 --goal 2.5,0.5", "blocked.npy")
         refused(learned, capsys, "evaluate learned --true-map true.yaml", "blocked.npy")
 
-    def test_walled_off(self, learned, capsys):
+    def test_plan_without_a_path_is_refused(self, learned, capsys):
         capsys.readouterr()
         blocked = np.load("learned/blocked.npy")
         blocked[1, 1] = 1
@@ -259,8 +259,8 @@ def test_main_with_version_prints_the_version(capsys):
     ("--behavior auto", "--select-behavior"),
     ("--behavior=given", ""),
     ("--unknown sharpness --unknown=lapses", "--learn beta --learn lapse"),
-    ("--person who --candidates g.csv", "--person-column who --goal-candidates g.csv"),
+    ("--person name --candidates g.csv", "--person-column name --goal-candidates g.csv"),
     ("--lines 2 --sample 3 --iterations=4 --truth t", "--wall-prior 2 --max-walks 3 --max-iterations=4 --true-map t"),
 ])  # fmt: skip
-def test_present_spelling_of_version_0_1_options_is_theirs_of_today(old, present):
+def test_present_spelling_of_version_0_1_options_returns_those_of_today(old, present):
     assert present_spelling(old.split()) == present.split()

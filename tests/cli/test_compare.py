@@ -1,19 +1,22 @@
 """`sidestep compare`: one table for all methods, from files."""
 
 import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from helpers.office import call, summary, write_office
+from helpers.office import OFFICE, call, simulated, summary, write_office
 from sidestep.baselines import BASELINES
 from sidestep.baselines.comparison import compare_methods
 from sidestep.io.demonstrations import demonstrations_from_walks
 from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map, write_map
-from sidestep.io.walks import read_walks
-from sidestep.maps.config import BehaviorConfig, FitConfig, MapConfig
+from sidestep.io.walks import read_walks, write_walks
+from sidestep.maps.config import BehaviorConfig, MapConfig
 from sidestep.maps.learn import learn_map
 from sidestep.maps.selection import select_behavior
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
@@ -21,14 +24,20 @@ from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.reward import Reward
 
 METHODS = {"behavior", *BASELINES}
+README = Path(__file__).parents[2] / "README.md"
 
 
 @pytest.fixture(scope="module")
 def office(tmp_path_factory):
     folder = write_office(tmp_path_factory.mktemp("office"))
-    walked = ("--out", folder / "walks.csv", "--walks", 80, "--goals", 5)
-    assert call("simulate", folder / "true.yaml", *walked) == 0
+    write_walks(folder / "walks.csv", simulated(walks=80, goals=5))
     return folder
+
+
+@pytest.fixture(scope="module")
+def data(office):
+    """The half-known map, the true map, and the walks."""
+    return read_map(office / "half.yaml"), read_map(office / "true.yaml"), read_walks(office / "walks.csv")
 
 
 def compare(office, out, *options):
@@ -68,26 +77,27 @@ def test_compare_with_defaults_gives_every_method_every_score(office, compared):
     assert (office / "compared" / "compare.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_compare_without_held_out_walks_learns_the_map_of_learn(office, tmp_path):
-    """The one road: Python, `learn` and `compare` give the same numbers."""
-    options = ("--max-walks", 40, "--seed", 2, "--learn", "lapse")
-    assert compare(office, tmp_path / "compared", "--hold-out", 0, *options) == 0
-    arguments = ("learn", office / "walks.csv", "--map", office / "half.yaml", "--out", tmp_path / "learned")
-    assert call(*arguments, *options) == 0
-    config = MapConfig(behavior=BehaviorConfig(learn=("lapse",)), max_walks=40, seed=2)
-    learned = learn_map(read_map(office / "half.yaml"), read_walks(office / "walks.csv"), config)
-    by_learn = np.load(tmp_path / "learned" / "blocked.npy")
-    np.testing.assert_array_equal(np.load(tmp_path / "compared" / "behavior" / "blocked.npy"), by_learn)
-    np.testing.assert_array_equal(learned.blocked, by_learn)
+def test_readme_code_learn_and_compare_give_the_same_map(office, tmp_path, monkeypatch):
+    """The block of Python in README.md, in a folder with the files that it names."""
+    for name, file in (("office.yaml", "half.yaml"), ("half.pgm", "half.pgm"), ("walks.csv", "walks.csv")):
+        shutil.copy(office / file, tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    code = README.read_text().split("```python\n")[1].split("```")[0]
+    # a start and a goal in the office of this test
+    names: dict[str, Any] = {}
+    exec(code.replace("start=(0.5, 0.5), goal=(3.5, 6.5)", "start=(-0.75, 4.2), goal=(1.25, 4.25)"), names)
+    assert len(names["path"]) == 13
+    assert compare(office, tmp_path / "compared", "--hold-out", 0) == 0
+    assert call("learn", office / "walks.csv", "--map", office / "half.yaml", "--out", tmp_path / "by_learn") == 0
+    for folder in ("learned", "by_learn", "compared/behavior"):
+        np.testing.assert_array_equal(np.load(tmp_path / folder / "blocked.npy"), names["learned"].blocked)
     assert summary(tmp_path / "compared")["methods"]["behavior"]["heldout_log_likelihood"] is None
 
 
-def test_compare_methods_with_a_method_without_values_scores_the_others(office):
+def test_compare_methods_with_a_method_without_values_scores_the_others(data):
     """With a step cost below log(4)/β a log-sum-exp agent gains by walking on, so the costs have no values."""
-    grid, truth = read_map(office / "half.yaml"), read_map(office / "true.yaml")
     config = MapConfig(Reward(1.0, 1.0), BehaviorConfig(beta=0.5))
-    baselines = {"costs": BASELINES["costs"]}
-    comparison = compare_methods(grid, truth, read_walks(office / "walks.csv"), config, baselines=baselines)
+    comparison = compare_methods(*data, config=config, baselines={"costs": BASELINES["costs"]})
     behavior, costs = comparison.records
     assert (behavior.method, costs.method) == ("behavior", "costs")
     assert costs.failure is not None
@@ -109,51 +119,39 @@ def test_compare_with_few_iterations_names_the_methods_that_did_not_converge(off
     assert "visits" not in notes
 
 
-def test_compare_methods_with_selection_selects_by_the_walks_that_are_learned_from(office):
-    grid, truth, walks = (
-        read_map(office / "half.yaml"),
-        read_map(office / "true.yaml"),
-        read_walks(office / "walks.csv"),
-    )
+def test_compare_methods_with_selection_selects_by_the_walks_that_are_learned_from(data):
+    grid, _, walks = data
     config = MapConfig(behavior=BehaviorConfig(select=True), seed=3)
-    comparison = compare_methods(grid, truth, walks, config, baselines={"transitions": BASELINES["transitions"]})
+    comparison = compare_methods(*data, config=config, baselines={"transitions": BASELINES["transitions"]})
     train = walks.select(np.sort(np.random.default_rng(3).permutation(80)[16:]))
     selection = select_behavior(grid, grid_walks(train, grid), config)
     assert comparison.reasons == selection.reasons
     assert comparison.config == selection.config
     assert comparison.config.behavior.learn == ("lapse",)
     assert not comparison.config.behavior.select
-    told = json.loads(json.dumps(comparison.summary(), allow_nan=False))
-    assert told["behavior"]["reasons"] == selection.reasons
+    result = json.loads(json.dumps(comparison.summary(), allow_nan=False))
+    assert result["behavior"]["reasons"] == selection.reasons
 
 
-def test_compare_methods_with_goal_candidates_scores_held_out_walks(office, tmp_path):
-    """Walks that do not name their goals: the most probable goals are those of the walks."""
-    grid, truth, walks = (
-        read_map(office / "half.yaml"),
-        read_map(office / "true.yaml"),
-        read_walks(office / "walks.csv"),
-    )
-    (tmp_path / "goals.csv").write_text(
-        "goal_x,goal_y\n" + "".join(f"{x},{y}\n" for x, y in np.unique(walks.goals, axis=0).tolist())
-    )
+def test_compare_with_goal_candidates_scores_held_out_walks(office, data, tmp_path):
+    """Candidates are the goals of the walks."""
+    goals = np.unique(data[2].goals, axis=0)
+    np.savetxt(tmp_path / "goals.csv", goals, delimiter=",", header="goal_x,goal_y", comments="")
     options = ("--goal-candidates", tmp_path / "goals.csv", "--max-walks", 30)
     assert compare(office, tmp_path / "out", *options) == 0
     methods = summary(tmp_path / "out")["methods"]
     assert all(np.isfinite(methods[name]["heldout_log_likelihood"]) for name in METHODS)
     assert (tmp_path / "out" / "behavior" / "posterior.csv").exists()
-    assert truth.shape == grid.shape
 
 
 def test_compare_with_a_true_map_of_another_place_is_refused(office, tmp_path, capsys):
-    shifted = replace(read_map(office / "true.yaml"), origin=(0.0, 2.0, 0.0))
-    write_map(tmp_path / "far.yaml", np.zeros(shifted.shape), shifted)
+    write_map(tmp_path / "far.yaml", np.zeros((5, 5)), replace(OFFICE, origin=(0.0, 2.0, 0.0)))
     files = (office / "walks.csv", "--map", office / "half.yaml", "--true-map", tmp_path / "far.yaml")
     assert call("compare", *files, "--out", tmp_path / "out") == 1
     assert "far.yaml, field 'origin'" in capsys.readouterr().err
 
 
-def test_compare_finds_walls_that_transitions_alone_miss(compared):
+def test_compare_ranks_behavior_above_transitions_alone(compared):
     methods = compared["methods"]
     for name in ("behavior", "joint"):
         assert methods[name]["mean_obstacle"] > methods["transitions"]["mean_obstacle"] + 0.1
@@ -161,8 +159,8 @@ def test_compare_finds_walls_that_transitions_alone_miss(compared):
     assert methods["behavior"]["heldout_log_likelihood"] > methods["transitions"]["heldout_log_likelihood"]
 
 
-def test_compare_scores_held_out_walks_by_the_map_of_the_others(office, compared):
-    grid, walks = read_map(office / "half.yaml"), read_walks(office / "walks.csv")
+def test_compare_scores_held_out_walks_by_the_map_of_the_others(data, compared):
+    grid, _, walks = data
     drawn = np.random.default_rng(3).permutation(80)
     learned = learn_map(grid, walks.select(np.sort(drawn[16:])))
     heldout = demonstrations_from_walks(walks.select(np.sort(drawn[:16])), grid)
@@ -179,7 +177,7 @@ def test_compare_prints_a_row_for_every_method(table):
 
 
 @pytest.mark.parametrize("fraction", [-0.1, 1, 0.001])
-def test_compare_with_a_fraction_that_leaves_nothing_is_refused(office, fraction, capsys):
+def test_compare_without_walks_to_learn_or_to_hold_out_is_refused(office, fraction, capsys):
     assert compare(office, office / "none", "--hold-out", fraction) == 1
     assert "hold_out" in capsys.readouterr().err
     assert not (office / "none").exists()
@@ -191,4 +189,3 @@ def test_compare_takes_every_option_of_learn(capsys):
         assert call(command, "--help") == 0
         options.append({word for word in capsys.readouterr().out.split() if word.startswith("--")})
     assert options[0] <= options[1]
-    assert FitConfig.terms == "both"

@@ -42,22 +42,19 @@ def test_walkable_graph_leaves_out_unknown_cells():
     assert walkable_graph(grid_of(".?.")).nnz == 0
 
 
-@pytest.mark.parametrize(
-    ("drawing", "connectivity", "visited", "goal", "expected"),
-    [
-        ([".#.", "..."], 4, 0, 2, [1]),  # 4 moves round it, 2 through it
-        (["...", ".#.", "..."], 4, 0, 8, []),  # around is as short as through
-        (["...", ".#.", "..."], 8, 0, 8, [4]),  # 4 around (corners are not cut), 2√2 through
-        ([".#", ".."], 8, 0, 3, [1]),  # frees the diagonal past it
-        # opening 5 is no gain: 10 still prevents the diagonal
-        ([".....#", "....#.", "......"], 8, 11, 7, [10]),
-        ([".#.", ".#.", ".#."], 4, 3, 5, [1, 4, 7]),  # nothing else connects the two sides
-        ([".##."], 4, 0, 3, []),  # opening one of two is not enough
-        ([".?.", "..."], 4, 0, 2, []),  # unknown is no obstacle
-        ([".#."], 4, 1, 2, [1]),  # the visited state is in it
-        (["..#"], 4, 0, 2, [2]),  # the goal lies in it
-    ],
-)
+@pytest.mark.parametrize(("drawing", "connectivity", "visited", "goal", "expected"), [
+    ([".#.", "..."], 4, 0, 2, [1]),  # 4 moves round it, 2 through it
+    (["...", ".#.", "..."], 4, 0, 8, []),  # around is as short as through
+    (["...", ".#.", "..."], 8, 0, 8, [4]),  # 4 around (corners are not cut), 2√2 through
+    ([".#", ".."], 8, 0, 3, [1]),  # frees the diagonal past it
+    # opening 5 is no gain: 10 still prevents the diagonal
+    ([".....#", "....#.", "......"], 8, 11, 7, [10]),
+    ([".#.", ".#.", ".#."], 4, 3, 5, [1, 4, 7]),  # nothing else connects the two sides
+    ([".##."], 4, 0, 3, []),  # opening one of two is not enough
+    ([".?.", "..."], 4, 0, 2, []),  # unknown is no obstacle
+    ([".#."], 4, 1, 2, [1]),  # the visited state is in it
+    (["..#"], 4, 0, 2, [2]),  # the goal lies in it
+])  # fmt: skip
 def test_relevant_obstacles_in_a_drawing_are_those_worked_out(drawing, connectivity, visited, goal, expected):
     truth = grid_of(*drawing, connectivity=connectivity)
     relevant = relevant_obstacles(truth, array(visited), array(goal))
@@ -190,24 +187,21 @@ def test_score_paths_without_legal_paths_has_no_excess_length():
     assert score_paths([], [], grid_of(".")).legal_fraction is None
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (
-            lambda grid: score_paths([array(0), array()], [0, 0], grid),
-            "path, row 2: expected at least one state",
-        ),
-        (
-            lambda grid: score_paths([array(0)], [0, 1], grid),
-            "'goals': expected 1, one for each path, found 2",
-        ),
-        (lambda grid: score_paths([array(0, 3)], [0], grid), "'paths': expected states in 0…2"),
-        (lambda grid: score_paths([array(0)], [-1], grid), "'goals': expected states in 0…2"),
-        (lambda grid: relevant_obstacles(grid, array(3), array(0)), "'visited': expected states in 0…2"),
-        (lambda grid: relevant_obstacles(grid, array(0), array(3)), "'goals': expected states in 0…2"),
-        (lambda grid: visit_ranking(array(-1), grid), "'visited': expected states in 0…2"),
-    ],
-)
+@pytest.mark.parametrize(("call", "message"), [
+    (
+        lambda grid: score_paths([array(0), array()], [0, 0], grid),
+        "path, row 2: expected at least one state",
+    ),
+    (
+        lambda grid: score_paths([array(0)], [0, 1], grid),
+        "'goals': expected 1, one for each path, found 2",
+    ),
+    (lambda grid: score_paths([array(0, 3)], [0], grid), "'paths': expected states in 0…2"),
+    (lambda grid: score_paths([array(0)], [-1], grid), "'goals': expected states in 0…2"),
+    (lambda grid: relevant_obstacles(grid, array(3), array(0)), "'visited': expected states in 0…2"),
+    (lambda grid: relevant_obstacles(grid, array(0), array(3)), "'goals': expected states in 0…2"),
+    (lambda grid: visit_ranking(array(-1), grid), "'visited': expected states in 0…2"),
+])  # fmt: skip
 def test_metrics_with_invalid_arguments_raise(call, message):
     with pytest.raises(InputError) as caught:
         call(grid_of("..."))

@@ -29,19 +29,16 @@ REPRESENTATIONS = representations.RepresentationsConfig(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "run", "config", "keys"),
-    [
-        ("room", room.run, ROOM, {"auc", "mean_inside", "mean_outside", "transitions_only", "converged", "message"}),
-        ("pendulum", pendulum.run, PENDULUM, {"gravity_true", "gravity_estimate", "converged", "message"}),
-        (
-            "representations",
-            representations.run,
-            REPRESENTATIONS,
-            {"auc", "mean_inside", "mean_outside", "representations"},
-        ),
-    ],
-)
+@pytest.mark.parametrize(("name", "run", "config", "keys"), [
+    ("room", room.run, ROOM, {"auc", "mean_inside", "mean_outside", "transitions_only", "converged", "message"}),
+    ("pendulum", pendulum.run, PENDULUM, {"gravity_true", "gravity_estimate", "converged", "message"}),
+    (
+        "representations",
+        representations.run,
+        REPRESENTATIONS,
+        {"auc", "mean_inside", "mean_outside", "representations"},
+    ),
+])  # fmt: skip
 def test_run_writes_picture_and_summary(name, run, config, keys, tmp_path):
     reports = []
     summary = run(tmp_path, 1, reports.append, config)
@@ -64,16 +61,13 @@ def test_demonstrations_never_aim_at_the_wall():
     assert not world.inside(np.asarray(targets)).any()
 
 
-@pytest.mark.parametrize(
-    ("hits", "pieces"),
-    [
-        ("......", [range(7)]),
-        ("x....x", [range(1, 6)]),
-        ("..xx..", [range(3), range(4, 7)]),
-        (".x.x.x", [range(2), range(2, 4), range(4, 6)]),
-        ("xxxxxx", []),
-    ],
-)
+@pytest.mark.parametrize(("hits", "pieces"), [
+    ("......", [range(7)]),
+    ("x....x", [range(1, 6)]),
+    ("..xx..", [range(3), range(4, 7)]),
+    (".x.x.x", [range(2), range(2, 4), range(4, 6)]),
+    ("xxxxxx", []),
+])  # fmt: skip
 def test_without_moves_returns_the_pieces_between(hits, pieces):
     walk = Trajectory(np.arange(7)[:, None], np.arange(10, 16), 3)
     left = without_moves(walk, np.array([hit == "x" for hit in hits]))

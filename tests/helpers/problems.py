@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sidestep.tabular.backups import Backup, BoltzmannAverage, HardMax, LogSumExp, Mellowmax
+from sidestep.tabular.backups import Backup, Behavior, BoltzmannAverage, HardMax, LogSumExp, Mellowmax
 from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import (
@@ -28,7 +28,8 @@ from sidestep.tabular.models import (
     road_network,
     walled_grid,
 )
-from sidestep.tabular.solve import solve
+from sidestep.tabular.solve import Solution, SolveOptions, solve
+from sidestep.tabular.solvers.base import Solver
 from sidestep.tabular.tasks import Task
 
 BACKUPS: dict[str, Backup] = {
@@ -41,6 +42,11 @@ DISCOUNTS = (0.9, 0.95, 1.0)
 STEPS = ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1))
 
 solve_jit = eqx.filter_jit(solve)
+
+
+def solve_with(solver: Solver, model: TransitionModel, task: Task, behavior: Behavior, **others) -> Solution:
+    """The solution by a solver."""
+    return solve(model, task, behavior, options=SolveOptions(solver=solver), **others)
 
 
 NAMES = list(BACKUPS)
@@ -65,8 +71,8 @@ def plain_backup(name, q, beta):
     return values[name] if isinstance(name, str) else jnp.stack([values[each] for each in NAMES])[name]
 
 
-def plain_values(name, transitions, task: Task, beta, sweeps, at_most: int = 900):
-    """(V, Q) by value iteration from nothing, differentiable through every one of `sweeps` (which may be traced)."""
+def plain_values(name, transitions, task: Task, beta, sweeps: int):
+    """(V, Q) after some sweeps of value iteration from 0, differentiable through every sweep."""
 
     def q_of(values):
         return task.reward + task.discount * jnp.einsum("sat,t->sa", transitions, values)
@@ -74,11 +80,10 @@ def plain_values(name, transitions, task: Task, beta, sweeps, at_most: int = 900
     def ended(values):
         return jnp.where(task.terminal, task.terminal_reward, values)
 
-    def sweep(values, index):
-        swept = ended(plain_backup(name, q_of(values), beta))
-        return jnp.where(index < sweeps, swept, values), None
+    def sweep(values, _):
+        return ended(plain_backup(name, q_of(values), beta)), None
 
-    values, _ = jax.lax.scan(sweep, ended(jnp.zeros(len(transitions))), jnp.arange(at_most))
+    values, _ = jax.lax.scan(sweep, ended(jnp.zeros(len(transitions))), length=sweeps)
     return values, q_of(values)
 
 
@@ -227,7 +232,7 @@ SIDES = ((2, 3), (2, 3), (0, 1), (0, 1), (5, 6), (4, 7), (4, 7), (5, 6))
 """The two moves at a right angle to each."""
 
 
-def slippery_problem(connectivity, rows=3, columns=4) -> Problem:
+def slippery_problem(rows=3, columns=4) -> Problem:
     """A grid with two terrains, on which moves slip as often as each has it, and one row where they do not.
 
     A move is a mixture of moves of the obstacle grid: ahead, and to either side.
@@ -235,11 +240,11 @@ def slippery_problem(connectivity, rows=3, columns=4) -> Problem:
     theta = np.random.default_rng(8).normal(-1, 1.5, rows * columns + 2)
     terrain = np.arange(rows * columns).reshape(rows, columns) % 2
     terrain[1] = -1
-    model = SlipperyGrid(Grid.unknown(rows, columns, connectivity), theta[:-2], theta[-2:], terrain)
+    model = SlipperyGrid(Grid.unknown(rows, columns, 8), theta[:-2], theta[-2:], terrain)
 
     def dense(theta):
-        straight = dense_obstacles(theta[: rows * columns], rows, columns, connectivity)
-        aside = sum(straight[:, [sides[k] for sides in SIDES[:connectivity]]] for k in (0, 1)) / 2
+        straight = dense_obstacles(theta[: rows * columns], rows, columns, 8)
+        aside = sum(straight[:, [sides[k] for sides in SIDES]] for k in (0, 1)) / 2
         odds = jnp.where(terrain.ravel() < 0, 0.0, jnp.exp(theta[rows * columns :])[terrain.ravel()])
         slip = (odds / (1 + odds))[:, None, None]
         return (1 - slip) * straight + slip * aside
@@ -253,8 +258,7 @@ FAMILIES: dict[str, Problem] = {
     "links": road_problem(by_turn=False),
     "turns": road_problem(by_turn=True),
     "features": featured_problem(),
-    "slips": slippery_problem(4),
-    "slips, 8-connected": slippery_problem(8),
+    "slips": slippery_problem(),
 }
 """Models that are checked for their own gradients, not for every solver."""
 
@@ -269,8 +273,8 @@ def generic_task(problem: Problem, discount: float, seed: int = 0) -> Task:
     return Task(jnp.asarray(reward), jnp.asarray(final), jnp.asarray(terminal), jnp.asarray(discount))
 
 
-def relative_error(found, expected) -> float:
-    """|found − expected| over |expected|, as vectors; no expected gradient here is zero."""
-    found, expected = np.asarray(found), np.asarray(expected)
+def relative_error(result, expected) -> float:
+    """|result − expected| over |expected|, as vectors; no expected gradient here is zero."""
+    result, expected = np.asarray(result), np.asarray(expected)
     assert np.linalg.norm(expected) > 0
-    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+    return float(np.linalg.norm(result - expected) / np.linalg.norm(expected))

@@ -8,7 +8,7 @@ import pytest
 from helpers.walled import BLANK, walks
 from sidestep.inference.batching import BatchPlan
 from sidestep.inference.fit import fit
-from sidestep.inference.maximize import Status, maximize, solve_tolerances
+from sidestep.inference.maximize import Approximation, Status, maximize, solve_tolerances
 from sidestep.inference.objective import Objective, Problem
 from sidestep.inference.optimizers import LBFGS, Adam, Rprop
 from sidestep.inference.priors import Normal
@@ -62,17 +62,41 @@ def problem():
     return Problem(ObstacleGrid(truth.forget(), 0.0), behavior, demos, Normal(), ALL_TERMS, options)
 
 
-@pytest.mark.slow
-def test_maximize_solves_a_part_of_the_states_only_at_trial_points(problem):
+def maximized(problem, approximation=None):
+    """Maximize with a batch for each task; return the objective and the result."""
     optimizer, objective = Rprop(), Watched(problem)
-    result = maximize(objective, optimizer, tolerances=solve_tolerances(problem, optimizer, large_map=1))
+    tolerances = solve_tolerances(problem, optimizer, large_map=1)
+    return objective, maximize(objective, optimizer, tolerances=tolerances, approximation=approximation)
+
+
+@pytest.fixture(scope="module")
+def approximate(problem):
+    return maximized(problem)
+
+
+@pytest.mark.slow
+def test_maximize_solves_a_part_of_the_states_only_at_trial_points(approximate):
+    objective, result = approximate
     assert result.status is Status.CONVERGED
     # only approximate evaluations with the loose tolerance leave out states
     assert {evaluation for evaluation, all_states in objective.solves if not all_states} == {(LOOSE, True, True)}
-    assert {approximate for _, approximate, _ in objective.evaluations} == {False, True}
+    assert {near for _, near, _ in objective.evaluations} == {False, True}
     assert all(partial == (near and tolerance == LOOSE) for tolerance, near, partial in objective.evaluations)
     # exact evaluations follow approximate ones at the same point
     assert objective.reused == {False, True}
+
+
+@pytest.mark.slow
+def test_maximize_with_approximations_solves_less_and_ends_at_the_same_point(problem, approximate):
+    objective, result = approximate
+    exact, expected = maximized(problem, Approximation(0.0, 0.0))
+    assert len(objective.solves) < len(exact.solves)
+    assert len(result.history) == len(expected.history)
+    for one, other in zip(result.history, expected.history, strict=True):
+        assert one.objective == pytest.approx(other.objective, rel=1e-5)
+    np.testing.assert_allclose(
+        jax.nn.sigmoid(result.parameters.model), jax.nn.sigmoid(expected.parameters.model), atol=1e-3
+    )
 
 
 def test_fit_in_32_bits_advises_64_bits():

@@ -48,17 +48,14 @@ def test_gaussian_mrf_penalizes_differences_of_neighbors():
     assert float(prior.log_density(theta)) == pytest.approx(float(INDEPENDENT.log_density(theta)) - 0.3 * differences)
 
 
-@pytest.mark.parametrize(
-    ("drawing", "expected"),
-    [
-        ("### ... ...", 1),  # the middle cell of a row
-        ("#.. #.. #..", 1),  # and of a column
-        (".#. ### .#.", 1),  # a cross counts once
-        ("### ### ###", 5),  # the middle cell and those of the sides
-        ("##. ##. ...", 0),  # a block two cells wide
-        ("#.# ... #.#", 0),
-    ],
-)
+@pytest.mark.parametrize(("drawing", "expected"), [
+    ("### ... ...", 1),  # the middle cell of a row
+    ("#.. #.. #..", 1),  # and of a column
+    (".#. ### .#.", 1),  # a cross counts once
+    ("### ### ###", 5),  # the middle cell and those of the sides
+    ("##. ##. ...", 0),  # a block two cells wide
+    ("#.# ... #.#", 0),
+])  # fmt: skip
 def test_wall_prior_counts_blocked_cells_in_lines(drawing, expected):
     """The probabilities are almost 0 and 1, so that each cell in a line counts as one."""
     signs = np.array([list(row) for row in drawing.split()])
@@ -111,16 +108,13 @@ def test_sensor_prior_clips_certain_probabilities():
     np.testing.assert_allclose(jax.nn.sigmoid(prior.mean), [MIN_PROBABILITY, 1 - MIN_PROBABILITY], rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("probability", "variance", "match"),
-    [
-        (0.5, 0.0, "'sensor variance': expected numbers above 0, found 0.0"),
-        (0.5, -1.0, "'sensor variance'.*found -1.0"),
-        (0.5, -INF, "'sensor variance'"),
-        (1.1, 1.0, "'sensor map': expected numbers from 0 to 1"),
-        (-0.1, 1.0, "'sensor map'"),
-    ],
-)
+@pytest.mark.parametrize(("probability", "variance", "match"), [
+    (0.5, 0.0, "'sensor variance': expected numbers above 0, found 0.0"),
+    (0.5, -1.0, "'sensor variance'.*found -1.0"),
+    (0.5, -INF, "'sensor variance'"),
+    (1.1, 1.0, "'sensor map': expected numbers from 0 to 1"),
+    (-0.1, 1.0, "'sensor map'"),
+])  # fmt: skip
 def test_sensor_prior_refuses_impossible_numbers(probability, variance, match):
     with pytest.raises(InputError, match=match):
         sensor_prior(np.array([[0.5, probability]]), np.array([[1.0, variance]]), Normal())

@@ -1,4 +1,4 @@
-"""A learned map in its folder, there and back, and folders that hold none."""
+"""Saving and loading a learned map, and folders without one."""
 
 import json
 
@@ -24,18 +24,18 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_round_trip(folder):
-    found = load_map(folder)
-    np.testing.assert_array_equal(found.blocked, BLOCKED)
-    np.testing.assert_array_equal(found.visited, VISITED)
-    np.testing.assert_array_equal(found.grid.known, KNOWN)
-    assert (found.grid.resolution, found.grid.origin, found.grid.connectivity) == (0.05, (1.5, -2.0, 0.3), 8)
-    assert found.reward == Reward(0.9, 2.5)
-    np.testing.assert_array_equal(found.unknown, [[False, True, False], [True, True, True]])
+def test_load_map_returns_what_was_saved(folder):
+    loaded = load_map(folder)
+    np.testing.assert_array_equal(loaded.blocked, BLOCKED)
+    np.testing.assert_array_equal(loaded.visited, VISITED)
+    np.testing.assert_array_equal(loaded.grid.known, KNOWN)
+    assert (loaded.grid.resolution, loaded.grid.origin, loaded.grid.connectivity) == (0.05, (1.5, -2.0, 0.3), 8)
+    assert loaded.reward == Reward(0.9, 2.5)
+    np.testing.assert_array_equal(loaded.unknown, [[False, True, False], [True, True, True]])
     assert json.loads((folder / "summary.json").read_text()) == SUMMARY
 
 
-def test_the_model_has_the_probabilities_of_the_map(folder):
+def test_model_of_a_loaded_map_has_its_probabilities(folder):
     np.testing.assert_allclose(load_map(str(folder)).model.blocked, BLOCKED, rtol=1e-9)
 
 
@@ -49,7 +49,7 @@ def array_file(tmp_path, array) -> bytes:
 
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("content", [None, b"", b"{]garbage: [", bytes(range(128, 256))])
-def test_a_file_that_is_missing_or_garbled_is_named(folder, name, content):
+def test_load_map_names_a_missing_or_invalid_file(folder, name, content):
     if content is None:
         (folder / name).unlink()
     else:
@@ -78,7 +78,7 @@ BAD_ARRAYS = {
 
 
 @pytest.mark.parametrize(("name", "index"), [(name, i) for name, bad in BAD_ARRAYS.items() for i in range(len(bad))])
-def test_arrays_that_do_not_fit_the_map_are_refused(folder, tmp_path, name, index):
+def test_load_map_refuses_arrays_that_do_not_fit(folder, tmp_path, name, index):
     (folder / name).write_bytes(array_file(tmp_path, BAD_ARRAYS[name][index]))
     with pytest.raises(InputError, match=name.replace(".", r"\.")):
         load_map(folder)
@@ -96,7 +96,7 @@ def test_arrays_that_do_not_fit_the_map_are_refused(folder, tmp_path, name, inde
     {"connectivity": 4, "settings": {"reward": {"discount": 0.9, "step_cost": -1.0}}},
     {"connectivity": 4, "settings": {"reward": {"discount": 0.9, "step_cost": "a"}}},
 ])  # fmt: skip
-def test_settings_that_no_learning_has_written_are_refused(folder, summary):
+def test_load_map_refuses_invalid_summaries(folder, summary):
     (folder / "summary.json").write_text(json.dumps(summary))
     with pytest.raises(InputError, match=r"summary\.json"):
         load_map(folder)

@@ -1,19 +1,20 @@
-"""`sidestep learn --sensor-map`: what sensors saw is the prior, and behavior tells of the rest."""
+"""`sidestep learn --sensor-map`: a map of sensors is the prior of its cells."""
 
 from dataclasses import replace
 
 import jax
 import numpy as np
-import pyarrow.csv
 import pytest
 from PIL import Image
 from scipy.optimize import brentq
 from scipy.special import expit, logit
 
-from helpers.office import WALL, call, summary, write_office, written
-from sidestep.io.maps import read_map, write_map
+from helpers.office import OFFICE, WALL, call, simulated, summary, write_office, written
+from sidestep.io.maps import write_map
 from sidestep.io.trajectories import walks_from_trajectories
-from sidestep.io.walks import write_walks
+from sidestep.io.walks import read_walks, write_walks
+from sidestep.maps.config import MapConfig, PriorConfig
+from sidestep.maps.learn import learn_map
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import true_model
 from sidestep.tabular.simulation import simulate
@@ -21,19 +22,18 @@ from sidestep.tabular.tasks import reach
 from sidestep.worlds.rooms import two_rooms
 
 NORMAL = ("--prior-mean", 0.5, "--prior-variance", 4, "--wall-prior", 0)
-"""Each cell for itself: then what a sensor says of one cell moves no other."""
+"""Cells are independent, so that the observation of one cell moves no other."""
 
 SEEN = np.rint(255 * np.random.default_rng(3).uniform(0.05, 0.95, (5, 5))) / 255
-"""P(occupied) in whole grey levels."""
+"""P(occupied) in whole gray levels."""
 
 
 @pytest.fixture(scope="module")
 def office(tmp_path_factory):
-    """The office, walks in it, and what sensors saw of it: noise, so that it cannot be taken for the walls."""
+    """A folder with the office, walks in it, and a sensor map of noise, so that it differs from the walls."""
     folder = write_office(tmp_path_factory.mktemp("office"))
-    write_map(folder / "seen.yaml", SEEN, read_map(folder / "blank.yaml"))
-    simulate = ("simulate", folder / "true.yaml", "--out", folder / "walks.csv", "--walks", 30, "--goals", 3)
-    assert call(*simulate) == 0
+    write_map(folder / "seen.yaml", SEEN, OFFICE)
+    write_walks(folder / "walks.csv", simulated(walks=30, goals=3))
     return folder
 
 
@@ -41,33 +41,44 @@ def learn(office, out, *options):
     return call("learn", office / "walks.csv", "--map", office / "blank.yaml", "--out", out, *NORMAL, *options)
 
 
+@pytest.fixture(scope="module")
+def learned(office):
+    """The map that transitions alone give with the sensor map."""
+    out = office / "learned"
+    assert learn(office, out, "--terms", "transitions", "--sensor-map", office / "seen.yaml") == 0
+    return out
+
+
+def left_panel(folder):
+    """Return the part of a picture that shows what was known before."""
+    picture = np.asarray(Image.open(folder / "learned.png").convert("L"))
+    return picture[:, : picture.shape[1] // 4]
+
+
 def passed(office):
-    """How often somebody came into each cell or set out from it."""
-    table = pyarrow.csv.read_csv(office / "walks.csv")
-    grid = read_map(office / "blank.yaml")
-    states = grid.states(np.stack([table["x"].to_numpy(), table["y"].to_numpy()], axis=1))
+    """Count the positions of all walks in each cell."""
+    states = OFFICE.states(read_walks(office / "walks.csv").positions)
     return np.bincount(states, minlength=25).reshape(5, 5)
 
 
 def posterior(times, mean, variance):
-    """P(blocked) of a cell that was passed so often: where −n p − (θ − b)/σ² is 0."""
+    """Return P(blocked) of a cell that was passed n times: where −n p − (θ − b)/σ² is 0."""
     return expit(brentq(lambda logit: times * expit(logit) + (logit - mean) / variance, -50, 50))
 
 
-def test_where_nobody_went_the_posterior_is_the_map(office, tmp_path):
-    """By transitions alone, which say nothing of cells that nobody passed, and elsewhere only how often."""
-    assert learn(office, tmp_path, "--terms", "transitions", "--sensor-map", office / "seen.yaml") == 0
-    blocked, times = np.load(tmp_path / "blocked.npy"), passed(office)
+def test_learn_with_a_sensor_map_keeps_it_in_unvisited_cells(office, learned):
+    """Transitions depend on the number of passes only."""
+    blocked, times = np.load(learned / "blocked.npy"), passed(office)
     np.testing.assert_allclose(blocked[WALL], SEEN[WALL], atol=1e-6)
     expected = [posterior(n, logit(p), 0.5) for n, p in zip(times[~WALL], SEEN[~WALL], strict=True)]
     np.testing.assert_allclose(blocked[~WALL], expected, atol=1e-4)
-    told = summary(tmp_path)
-    assert told["data"]["sensed_cells"] == 25
-    assert told["sensor"] == f"{office / 'seen.yaml'}, variance 0.5"
+    result = summary(learned)
+    assert result["data"]["sensed_cells"] == 25
+    assert result["sensor"] == f"{office / 'seen.yaml'}, variance 0.5"
 
 
-def test_how_surely_each_cell_is_known(office, tmp_path):
-    """A variance a cell; what has none is as if no sensor had looked."""
+def test_learn_with_a_sensor_variance_file_takes_a_variance_per_cell(office, learned, tmp_path):
+    """Cells without a finite variance count as unseen."""
     variance = np.random.default_rng(4).uniform(0.05, 2.5, (5, 5))
     variance[:, 3] = np.nan
     variance[1, :3] = np.inf
@@ -78,12 +89,15 @@ def test_how_surely_each_cell_is_known(office, tmp_path):
     means, variances = np.where(seen, logit(SEEN), 0.5), np.where(seen, variance, 4.0)
     expected = [posterior(*each) for each in zip(passed(office).flat, means.flat, variances.flat, strict=True)]
     np.testing.assert_allclose(np.load(tmp_path / "out" / "blocked.npy").ravel(), expected, atol=1e-4)
-    told = summary(tmp_path / "out")
-    assert told["data"]["sensed_cells"] == seen.sum() == 17
-    assert told["sensor"].endswith(str(tmp_path / "variance.npy"))
+    result = summary(tmp_path / "out")
+    assert result["data"]["sensed_cells"] == seen.sum() == 17
+    assert result["sensor"].endswith(str(tmp_path / "variance.npy"))
+    # seen cells are drawn
+    assert left_panel(tmp_path / "out").shape == left_panel(learned).shape
+    assert (left_panel(tmp_path / "out") != left_panel(learned)).any()
 
 
-def test_what_the_map_knows_stays_known_whatever_the_sensors_say(office, tmp_path):
+def test_learn_with_a_sensor_map_keeps_known_cells(office, tmp_path):
     arguments = ("learn", office / "walks.csv", "--map", office / "half.yaml", "--out", tmp_path)
     assert call(*arguments, *NORMAL, "--terms", "transitions", "--sensor-map", office / "seen.yaml") == 0
     blocked = np.load(tmp_path / "blocked.npy")
@@ -91,12 +105,11 @@ def test_what_the_map_knows_stays_known_whatever_the_sensors_say(office, tmp_pat
     assert summary(tmp_path)["data"]["sensed_cells"] == 23
 
 
-def test_sensors_of_another_map_are_refused(office, tmp_path, capsys):
-    """One line that names file and field, and nothing written."""
+def test_learn_with_a_sensor_map_of_other_geometry_names_file_and_field(office, tmp_path, capsys):
     np.save(tmp_path / "small.npy", np.ones((2, 2)))
     np.save(tmp_path / "zero.npy", np.zeros((5, 5)))
     write_map(tmp_path / "small.yaml", np.full((2, 2), 0.5), Grid.unknown(2, 2))
-    write_map(tmp_path / "far.yaml", SEEN, replace(read_map(office / "blank.yaml"), origin=(0.0, 2.0, 0.0)))
+    write_map(tmp_path / "far.yaml", SEEN, replace(OFFICE, origin=(0.0, 2.0, 0.0)))
     seen = ("--sensor-map", office / "seen.yaml", "--sensor-variance")
     for options, expected in (
         (("--sensor-map", tmp_path / "none.yaml"), "none.yaml: cannot be read"),
@@ -116,32 +129,30 @@ def test_sensors_of_another_map_are_refused(office, tmp_path, capsys):
 
 FLAT = two_rooms(13, 9, door=12)
 UPPER, LOWER = slice(0, 5), slice(7, 12)
-"""The rows that sensors saw, and those of the wall that people walk around."""
+"""The rows that sensors saw, and rows of the wall that agents walk around."""
 
 
-def test_half_of_a_wall_is_sensed_and_the_other_half_found_by_behavior(tmp_path):
-    """Sensors saw the upper rows of two rooms; people live in the lower ones."""
+def test_learn_with_a_sensor_map_of_one_half_infers_the_other_half_from_behavior(tmp_path):
+    """Sensors saw the upper rows of two rooms; agents walk in the lower ones."""
     goals = [7 * 9 + 3, 7 * 9 + 5, 11 * 9, 11 * 9 + 8]
     tasks, random = [reach(FLAT, goal) for goal in goals], np.random.default_rng(0)
     lower = np.array([row * 9 + column for row in range(7, 13) for column in range(9) if column != 4])
     starts = [random.choice(np.setdiff1d(lower, [goal]), 15) for goal in goals]
-    walks = simulate(jax.random.key(0), true_model(FLAT), tasks, starts)
-    write_walks(tmp_path / "walks.csv", walks_from_trajectories(walks, goals, FLAT))
-    write_map(tmp_path / "blank.yaml", np.full(FLAT.shape, 0.5), FLAT)
-    write_map(tmp_path / "seen.yaml", np.where(FLAT.known == Cell.OCCUPIED, 0.9, 0.1), FLAT)
+    walks = walks_from_trajectories(simulate(jax.random.key(0), true_model(FLAT), tasks, starts), goals, FLAT)
+    wall = FLAT.known == Cell.OCCUPIED
     variance = np.full(FLAT.shape, np.nan)
     variance[UPPER] = 0.5
+    config = MapConfig(prior=PriorConfig(0.5, 4.0, wall_prior=0.0))
+    alone = learn_map(FLAT.forget(), walks, config).blocked
+    np.testing.assert_allclose(alone[UPPER], expit(0.5), atol=0.01)  # no walk depends on them
+    write_walks(tmp_path / "walks.csv", walks)
+    write_map(tmp_path / "blank.yaml", np.full(FLAT.shape, 0.5), FLAT)
+    write_map(tmp_path / "seen.yaml", np.where(wall, 0.9, 0.1), FLAT)
     np.save(tmp_path / "variance.npy", variance)
-    arguments = ("learn", tmp_path / "walks.csv", "--map", tmp_path / "blank.yaml", *NORMAL, "--out")
-    assert call(*arguments, tmp_path / "alone") == 0
     options = ("--sensor-map", tmp_path / "seen.yaml", "--sensor-variance", tmp_path / "variance.npy")
-    assert call(*arguments, tmp_path / "both", *options) == 0
-    alone, both = (np.load(tmp_path / name / "blocked.npy") for name in ("alone", "both"))
-    wall = FLAT.known == Cell.OCCUPIED
-    np.testing.assert_allclose(alone[UPPER], expit(0.5), atol=0.01)  # nobody's walks tell of it
+    files = (tmp_path / "walks.csv", "--map", tmp_path / "blank.yaml", "--out", tmp_path / "out")
+    assert call("learn", *files, *NORMAL, *options) == 0
+    both = np.load(tmp_path / "out" / "blocked.npy")
     assert min(alone[LOWER][wall[LOWER]].min(), both[LOWER][wall[LOWER]].min()) > 0.9
     np.testing.assert_allclose(both[UPPER][wall[UPPER]], 0.9, atol=0.01)
     np.testing.assert_allclose(both[UPPER][~wall[UPPER]], 0.1, atol=0.01)
-    picture = [np.asarray(Image.open(tmp_path / name / "learned.png").convert("L")) for name in ("alone", "both")]
-    assert picture[0].shape == picture[1].shape
-    assert (picture[0] != picture[1])[:, : picture[0].shape[1] // 4].any()  # what was known is drawn

@@ -19,15 +19,15 @@ def trajectory(states, actions, task=0) -> Trajectory:
     return Trajectory(np.array(states, dtype=np.int64), np.array(actions, dtype=np.int64), task)
 
 
-def test_moves_lie_one_after_another():
-    found = gather([trajectory([1, 2, 2, 3], [3, 3, 3]), trajectory([1, 0], [2], task=1)], TASKS)
-    assert len(found) == 4
-    assert found.states.tolist() == [1, 2, 2, 1]
-    assert found.actions.tolist() == [3, 3, 3, 2]
-    assert found.next_states.tolist() == [2, 2, 3, 0]
-    assert found.task.tolist() == [0, 0, 0, 1]
-    assert found.trajectory.tolist() == [0, 0, 0, 1]
-    np.testing.assert_allclose(found.tasks.discount, [0.95, 0.5])
+def test_gather_of_two_trajectories_concatenates_their_moves():
+    demos = gather([trajectory([1, 2, 2, 3], [3, 3, 3]), trajectory([1, 0], [2], task=1)], TASKS)
+    assert len(demos) == 4
+    assert demos.states.tolist() == [1, 2, 2, 1]
+    assert demos.actions.tolist() == [3, 3, 3, 2]
+    assert demos.next_states.tolist() == [2, 2, 3, 0]
+    assert demos.task.tolist() == [0, 0, 0, 1]
+    assert demos.trajectory.tolist() == [0, 0, 0, 1]
+    np.testing.assert_allclose(demos.tasks.discount, [0.95, 0.5])
 
 
 GOOD = trajectory([1, 2], [3])
@@ -43,12 +43,12 @@ GOOD = trajectory([1, 2], [3])
     (trajectory([1, 2], [-1]), ""),
     (trajectory([2, 3, 2], [3, 2]), "after a terminal state"),
 ])  # fmt: skip
-def test_gather_names_the_trajectory_that_it_refuses(bad, message):
+def test_gather_of_a_wrong_trajectory_raises_and_names_it(bad, message):
     with pytest.raises(InputError, match=rf"trajectory, row 2: .*{message}"):
         gather([GOOD, bad], TASKS)
 
 
-def test_gather_wants_trajectories():
+def test_gather_of_nothing_raises():
     with pytest.raises(InputError, match="at least one trajectory"):
         gather([], TASKS)
     with pytest.raises(InputError, match="at least one task"):
@@ -56,7 +56,7 @@ def test_gather_wants_trajectories():
 
 
 def walks(*lines, goals=None):
-    """Walks along lists of columns of `LINE`, at the centres of cells."""
+    """Walks along lists of columns of `LINE`, at the centers of cells."""
     xs = [x + 0.5 for line in lines for x in line]
     table = {
         "walk": [walk for walk, line in enumerate(lines) for _ in line],
@@ -70,34 +70,34 @@ def walks(*lines, goals=None):
     return walks_from_table(pa.table(table))
 
 
-def test_one_task_for_every_goal():
-    found = demonstrations_from_walks(walks([0, 1, 2, 3], [3, 2, 1], [1, 2, 3]), LINE, discount=0.9)
-    assert found.states.tolist() == [0, 1, 2, 3, 2, 1, 2]
-    assert found.next_states.tolist() == [1, 2, 3, 2, 1, 2, 3]
-    assert found.actions.tolist() == [3, 3, 3, 2, 2, 3, 3]
-    assert found.trajectory.tolist() == [0, 0, 0, 1, 1, 2, 2]
-    assert [int(np.argmax(terminal)) for terminal in found.tasks.terminal] == [1, 3]
-    assert found.task.tolist() == [1, 1, 1, 0, 0, 1, 1]
-    np.testing.assert_allclose(found.tasks.discount, 0.9)
+def test_demonstrations_from_walks_makes_one_task_for_each_goal():
+    demos = demonstrations_from_walks(walks([0, 1, 2, 3], [3, 2, 1], [1, 2, 3]), LINE, discount=0.9)
+    assert demos.states.tolist() == [0, 1, 2, 3, 2, 1, 2]
+    assert demos.next_states.tolist() == [1, 2, 3, 2, 1, 2, 3]
+    assert demos.actions.tolist() == [3, 3, 3, 2, 2, 3, 3]
+    assert demos.trajectory.tolist() == [0, 0, 0, 1, 1, 2, 2]
+    assert [int(np.argmax(terminal)) for terminal in demos.tasks.terminal] == [1, 3]
+    assert demos.task.tolist() == [1, 1, 1, 0, 0, 1, 1]
+    np.testing.assert_allclose(demos.tasks.discount, 0.9)
 
 
-def test_what_follows_the_goal_is_left_out():
+def test_demonstrations_from_walks_past_the_goal_leaves_out_what_follows():
     """The first walk passes its goal and goes on, the second starts there."""
-    found = demonstrations_from_walks(walks([0, 1, 2, 3, 2], [1, 2], [3, 2], goals=[2, 1, 0]), LINE)
-    assert found.states.tolist() == [0, 1, 3]
-    assert found.next_states.tolist() == [1, 2, 2]
-    assert found.trajectory.tolist() == [0, 0, 1]
-    assert [int(np.argmax(terminal)) for terminal in found.tasks.terminal] == [0, 2]
-    assert found.task.tolist() == [1, 1, 0]
+    demos = demonstrations_from_walks(walks([0, 1, 2, 3, 2], [1, 2], [3, 2], goals=[2, 1, 0]), LINE)
+    assert demos.states.tolist() == [0, 1, 3]
+    assert demos.next_states.tolist() == [1, 2, 2]
+    assert demos.trajectory.tolist() == [0, 0, 1]
+    assert [int(np.argmax(terminal)) for terminal in demos.tasks.terminal] == [0, 2]
+    assert demos.task.tolist() == [1, 1, 0]
 
 
-def test_the_form_of_the_task_is_that_of_reach():
-    found = demonstrations_from_walks(walks([0, 1]), LINE, discount=1.0, step_cost=2.0)
-    np.testing.assert_allclose(found.tasks.reward, np.full((1, 1, 4), -2.0))
-    assert found.tasks.discount.tolist() == [1.0]
+def test_demonstrations_from_walks_with_a_step_cost_charges_it():
+    demos = demonstrations_from_walks(walks([0, 1]), LINE, discount=1.0, step_cost=2.0)
+    np.testing.assert_allclose(demos.tasks.reward, np.full((1, 1, 4), -2.0))
+    assert demos.tasks.discount.tolist() == [1.0]
 
 
-def test_refusals():
+def test_demonstrations_from_walks_of_wrong_arguments_raises():
     with pytest.raises(InputError, match="starts at its goal"):
         demonstrations_from_walks(walks([1, 2], goals=[1]), LINE)
     with pytest.raises(InputError, match="discount"):
@@ -107,22 +107,22 @@ def test_refusals():
         demonstrations_from_walks(walks([0, 3]), wall)
 
 
-def test_moves_count_once_or_by_their_weight():
-    found = gather([trajectory([0, 1, 2], [3, 3]), trajectory([1, 2], [3])], TASKS)
-    assert found.weights.tolist() == [1, 1, 1]
-    assert found.with_only(np.array([False, True])).weights.tolist() == [0, 0, 1]
+def test_with_only_one_trajectory_sets_other_weights_to_0():
+    demos = gather([trajectory([0, 1, 2], [3, 3]), trajectory([1, 2], [3])], TASKS)
+    assert demos.weights.tolist() == [1, 1, 1]
+    assert demos.with_only(np.array([False, True])).weights.tolist() == [0, 0, 1]
 
 
 def test_pad_to_power_of_two_adds_moves_that_count_nothing_and_tasks_that_end_at_once():
-    found = gather([trajectory([1, 2, 2, 3], [3, 3, 3]), trajectory([2, 1, 0], [2, 2], task=1)], [*TASKS, TASKS[1]])
-    padded = pad_to_power_of_two(found)
-    assert (len(found), len(padded), len(padded.tasks.terminal)) == (5, 64, 8)
-    assert padded.states.tolist() == [*found.states.tolist(), *[1] * 59]
+    demos = gather([trajectory([1, 2, 2, 3], [3, 3, 3]), trajectory([2, 1, 0], [2, 2], task=1)], [*TASKS, TASKS[1]])
+    padded = pad_to_power_of_two(demos)
+    assert (len(demos), len(padded), len(padded.tasks.terminal)) == (5, 64, 8)
+    assert padded.states.tolist() == [*demos.states.tolist(), *[1] * 59]
     assert padded.weights.tolist() == [1] * 5 + [0] * 59
     np.testing.assert_allclose(padded.tasks.discount, [0.95, 0.5, 0.5, *[0.95] * 5])
     assert padded.tasks.terminal[3:].all()
 
 
 @pytest.mark.parametrize(("count", "expected"), [(1, 1), (2, 2), (3, 4), (16, 16), (17, 32)])
-def test_rounded_up(count, expected):
+def test_next_power_of_two_rounds_up(count, expected):
     assert next_power_of_two(count) == expected

@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sidestep.errors import InputError
 from sidestep.inference.calibration import score_statistics
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax
+from sidestep.tabular.behavior_model import behavior_model
 from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Grid
@@ -24,7 +26,7 @@ from sidestep.tabular.models import ObstacleGrid, TabularModel
 from sidestep.tabular.solve import SolveOptions, solve
 from sidestep.tabular.tasks import reach
 
-# In a corridor of three cells, each blocked with p = 1/4, at γ = 1/2, a walker at 0 tries left, right, right;
+# In a corridor of three cells, each blocked with p = 1/4, at γ = 1/2, an agent at 0 chooses left, right, right;
 # the first two fail; then right again. With g = γ(1−p)/(1−γp) = 3/7: V = g², g, 1.
 G = 3 / 7
 WALK = Trajectory(np.array([0, 0, 0, 1, 2]), np.array([2, 3, 3, 3]), 0)
@@ -53,14 +55,14 @@ TRANSITIONS = np.log(1) + np.log(1 / 4) + 2 * np.log(3 / 4)
     (("actions",), actions_by_hand(), 0),
     (("transitions",), 0, TRANSITIONS),
 ])  # fmt: skip
-def test_by_hand(terms, actions, transitions):
-    found = corridor_likelihood(terms=terms)
-    assert float(found.actions) == pytest.approx(actions, rel=1e-9)
-    assert float(found.transitions) == pytest.approx(transitions, rel=1e-12)
-    assert float(found.total) == pytest.approx(actions + transitions, rel=1e-9)
+def test_log_likelihood_of_a_corridor_equals_the_value_by_hand(terms, actions, transitions):
+    likelihood = corridor_likelihood(terms=terms)
+    assert float(likelihood.actions) == pytest.approx(actions, rel=1e-9)
+    assert float(likelihood.transitions) == pytest.approx(transitions, rel=1e-12)
+    assert float(likelihood.total) == pytest.approx(actions + transitions, rel=1e-9)
 
 
-def test_one_action_ahead_only_the_cell_before_the_goal_is_worth_something():
+def test_log_likelihood_at_horizon_1_equals_the_value_by_hand():
     """Horizon 1: V = 0 at 0, v = γ(1−p) at 1 and 1 at the goal; Q looks one action further."""
     v = 0.5 * 3 / 4
     right, stay = 0.5 * v * 3 / 4, 0.0
@@ -68,59 +70,57 @@ def test_one_action_ahead_only_the_cell_before_the_goal_is_worth_something():
     stay_1, left_1, right_1 = 0.5 * v, 0.5 * v / 4, 0.5 * (3 / 4 + v / 4)
     at_1 = np.log(2 * np.exp(BETA * stay_1) + np.exp(BETA * left_1) + np.exp(BETA * right_1))
     expected = BETA * (stay + 2 * right + right_1) - 3 * at_0 - at_1
-    found = corridor_likelihood(terms=("actions",), options=SolveOptions(horizon=1))
-    assert float(found.actions) == pytest.approx(expected, rel=1e-12)
+    likelihood = corridor_likelihood(terms=("actions",), options=SolveOptions(horizon=1))
+    assert float(likelihood.actions) == pytest.approx(expected, rel=1e-12)
 
 
-def test_outcomes_that_lead_to_the_same_state_add_up():
+def test_log_likelihood_of_outcomes_with_the_same_state_adds_them_up():
     world = graph(np.array([[[1, 1, 0]], [[0, 0, 1]]]))
     model = TabularModel(world, jnp.log(jnp.asarray([[[0.2, 0.3, 0.5]], [[0.6, 0.3, 0.1]]])))
     demos = gather([Trajectory(np.array([0, 0, 1]), np.array([0, 0]), 0)], [reach(world, 1)])
-    found = log_likelihood(model, demos, Behavior(HardMax(), 1.0))
-    assert float(found.transitions) == pytest.approx(2 * np.log(0.5), rel=1e-12)
-    assert float(found.actions) == 0  # a single action is no choice
+    likelihood = log_likelihood(model, demos, Behavior(HardMax(), 1.0))
+    assert float(likelihood.transitions) == pytest.approx(2 * np.log(0.5), rel=1e-12)
+    assert float(likelihood.actions) == 0  # a single action is no choice
 
 
-def test_each_trajectory_is_judged_by_its_own_task():
+def test_log_likelihood_of_several_tasks_uses_the_task_of_each_trajectory():
     grid = Grid.unknown(1, 3)
     tasks = [reach(grid, 0, discount=0.5), reach(grid, 2, discount=0.5)]
     model, behavior = ObstacleGrid(grid, -1.0), Behavior(HardMax(), BETA)
     right = Trajectory(np.array([1, 2]), np.array([3]), 1)
     left = Trajectory(np.array([1, 0]), np.array([2]), 0)
     wrong_way = Trajectory(np.array([1, 2]), np.array([3]), 0)
-    split_by_person = [
-        float(log_likelihood(model, gather([each], tasks), behavior).total) for each in (left, right, wrong_way)
-    ]
-    assert split_by_person[0] == pytest.approx(split_by_person[1], rel=1e-12)
-    assert split_by_person[2] < split_by_person[1]
+    alone = [float(log_likelihood(model, gather([each], tasks), behavior).total) for each in (left, right, wrong_way)]
+    assert alone[0] == pytest.approx(alone[1], rel=1e-12)
+    assert alone[2] < alone[1]
     together = log_likelihood(model, gather([left, wrong_way, right], tasks), behavior)
-    assert float(together.total) == pytest.approx(sum(split_by_person), rel=1e-12)
+    assert float(together.total) == pytest.approx(sum(alone), rel=1e-12)
 
 
-def test_transitions_that_cannot_happen_have_likelihood_0():
+def test_log_likelihood_of_an_impossible_transition_is_minus_infinity():
     grid = Grid.unknown(1, 3)
     demos = gather([Trajectory(np.array([0, 2]), np.array([3]), 0)], [reach(grid, 1)])
-    found = log_likelihood(ObstacleGrid(grid), demos, Behavior(HardMax(), 1.0), terms=("transitions",))
-    assert found.total == -jnp.inf
+    likelihood = log_likelihood(ObstacleGrid(grid), demos, Behavior(HardMax(), 1.0), terms=("transitions",))
+    assert likelihood.total == -jnp.inf
     assert arrival_log_likelihood(ObstacleGrid(grid), arrivals_of(demos)) == -jnp.inf
 
 
-def test_arrivals_are_the_moves_counted():
+def test_arrivals_of_equal_moves_adds_their_weights():
     """Equal moves of different tasks are one; each counts by its weight, and what fills up counts for nothing."""
     grid = Grid.unknown(1, 3)
     model = ObstacleGrid(grid, jnp.asarray([0.0, -1.0, -2.0]))
     walks = [WALK, Trajectory(np.array([0, 0, 1]), np.array([3, 3]), 1)]
-    shown = gather(walks, [reach(grid, 2, discount=0.5), reach(grid, 1)])
+    demos = gather(walks, [reach(grid, 2, discount=0.5), reach(grid, 1)])
     for weights, counts in ((np.ones(6), [1, 2, 2, 1]), (np.array([0.0, 1, 2, 0, 3, 0.5]), [0, 4, 2.5, 0])):
-        weighed = eqx.tree_at(lambda demos: demos.weights, shown, jnp.asarray(weights))
+        weighed = eqx.tree_at(lambda demos: demos.weights, demos, jnp.asarray(weights))
         arrivals = arrivals_of(weighed)
         kinds = zip(arrivals.states.tolist(), arrivals.actions.tolist(), arrivals.next_states.tolist(), strict=True)
         assert list(kinds)[:4] == [(0, 2, 0), (0, 3, 0), (0, 3, 1), (1, 3, 2)]
         assert arrivals.counts.tolist() == [*counts, *[0] * 12]
-        expected = np.log(transition_probabilities(model, shown)) @ weights
+        expected = np.log(transition_probabilities(model, demos)) @ weights
         assert float(arrival_log_likelihood(model, arrivals)) == pytest.approx(expected, rel=1e-12)
-        found = log_likelihood(model, weighed, Behavior(HardMax(), BETA), terms=("transitions",))
-        assert float(found.transitions) == pytest.approx(expected, rel=1e-12)
+        likelihood = log_likelihood(model, weighed, Behavior(HardMax(), BETA), terms=("transitions",))
+        assert float(likelihood.transitions) == pytest.approx(expected, rel=1e-12)
 
 
 @contextmanager
@@ -149,18 +149,18 @@ def test_solve_of_other_parameters_and_goals_compiles_once():
     assert not again
 
 
-def test_likelihoods_of_subjects_of_any_length_compile_once():
-    """Ten subjects of 1 to 41 moves towards one to five goals."""
+def test_likelihoods_of_persons_with_any_number_of_moves_compile_once():
+    """Ten persons with 1 to 41 moves towards one to five goals."""
     grid = Grid.unknown(2, 7)
     model, behavior = ObstacleGrid(grid, -1.0), Behavior(BoltzmannAverage(), 5.0)
 
     def look(moves: int, goals: int) -> tuple[np.ndarray, np.ndarray]:
         walk = np.resize([8, 9], moves + 1), np.resize([3, 2], moves)
         walks = [Trajectory(*walk, goal) for goal in range(goals)]
-        shown = gather(walks, [reach(grid, goal) for goal in range(goals)])
-        each, scored = np.asarray(log_policies(model, shown, behavior)), score_statistics(model, shown, behavior)
-        assert len(each) == len(scored.score) == len(transition_probabilities(model, shown)) == moves * goals
-        assert float(log_likelihood(model, shown, behavior).actions) == pytest.approx(each.sum(), rel=1e-12)
+        demos = gather(walks, [reach(grid, goal) for goal in range(goals)])
+        each, scored = np.asarray(log_policies(model, demos, behavior)), score_statistics(model, demos, behavior)
+        assert len(each) == len(scored.score) == len(transition_probabilities(model, demos)) == moves * goals
+        assert float(log_likelihood(model, demos, behavior).actions) == pytest.approx(each.sum(), rel=1e-12)
         np.testing.assert_allclose(scored.log_policy, each, rtol=1e-12)
         return each, scored.score
 
@@ -168,7 +168,14 @@ def test_likelihoods_of_subjects_of_any_length_compile_once():
         expected = look(41, 1)
     with compilations() as again:
         for moves, goals in ((1, 1), (2, 5), (3, 2), (7, 3), (11, 5), (12, 4), (18, 1), (29, 2), (33, 1), (41, 1)):
-            found = look(moves, goals)
+            likelihood = look(moves, goals)
     assert first
     assert not again
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(likelihood, expected)
+
+
+def test_log_likelihood_of_a_behavior_model_is_refused_with_advice():
+    grid = Grid.unknown(1, 3)
+    behavior = behavior_model(Behavior(BoltzmannAverage(), 5.0), ["beta"])
+    with pytest.raises(InputError, match=r"behavior_of\(person\)"):
+        log_likelihood(ObstacleGrid(grid), gather([WALK], [reach(grid, 2)]), behavior)  # pyright: ignore[reportArgumentType]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from helpers.problems import STEPS, dense_obstacles, dense_tabular, random_problem
+from helpers.problems import dense_obstacles, dense_tabular, random_problem
 from sidestep.errors import InputError
 from sidestep.tabular.graph import graph, grid_graph
 from sidestep.tabular.grid import Cell, Grid
@@ -26,8 +26,8 @@ def dense(model):
 # Grids
 
 
-def test_cells_lie_where_the_design_says():
-    """Cell (column c, row from the bottom r) has its centre at origin + ((c+.5), (r+.5))·resolution."""
+def test_centers_and_states_of_a_grid_follow_the_convention():
+    """Cell (column c, row from the bottom r) has its center at origin + ((c+.5), (r+.5))·resolution."""
     grid = Grid(np.full((3, 4), U), resolution=0.5, origin=(10.0, -2.0, 0.0))
     for row in range(3):
         for column in range(4):
@@ -36,7 +36,7 @@ def test_cells_lie_where_the_design_says():
             np.testing.assert_allclose(grid.centers(np.array([row * 4 + column])), center)
 
 
-def test_a_turned_map():
+def test_centers_of_a_rotated_grid_are_rotated():
     """A quarter turn: the map's columns run up, its rows (from the bottom) to the left."""
     grid = Grid(np.full((2, 3), U), origin=(1.0, 1.0, np.pi / 2))
     np.testing.assert_allclose(grid.centers(np.array([3, 5, 0])), [[0.5, 1.5], [0.5, 3.5], [-0.5, 1.5]])
@@ -44,7 +44,7 @@ def test_a_turned_map():
 
 
 @given(seed=seeds, yaw=st.floats(-4, 4), resolution=st.floats(0.01, 10))
-def test_centres_and_states_are_inverse(seed, yaw, resolution):
+def test_states_of_centers_are_the_inverse(seed, yaw, resolution):
     rng = np.random.default_rng(seed)
     grid = Grid(np.full(rng.integers(1, 9, 2), U), resolution, (*rng.normal(0, 20, 2).tolist(), yaw))
     states = np.arange(grid.size)
@@ -54,7 +54,7 @@ def test_centres_and_states_are_inverse(seed, yaw, resolution):
     assert grid.contains(grid.to_metres(inside)).all()
 
 
-def test_the_border_belongs_to_the_map_and_the_rest_does_not():
+def test_contains_includes_the_border_only():
     grid = Grid.unknown(2, 3)
     assert grid.states(np.array([[0.0, 0.0], [3.0, 2.0]])).tolist() == [3, 2]
     outside = np.array([[3.1, 1.0], [1.0, -0.1], [np.nan, 1.0], [np.inf, 1.0]])
@@ -71,17 +71,17 @@ def test_the_border_belongs_to_the_map_and_the_rest_does_not():
     ("origin", {"origin": (0.0, float("inf"), 0.0)}),
     ("connectivity", {"connectivity": 6}),
 ])  # fmt: skip
-def test_grids_refuse(field, change):
-    given = {"known": np.array([[-1]]), **change}
+def test_grid_of_a_wrong_field_raises(field, change):
+    fields = {"known": np.array([[-1]]), **change}
     if field == "connectivity":  # refused by its type before, where types are checked
         with pytest.raises(Exception, match="connectivity"):
-            Grid(**given)
+            Grid(**fields)
     else:
         with pytest.raises(InputError, match=field):
-            Grid(**given)
+            Grid(**fields)
 
 
-def test_forget():
+def test_forget_keeps_all_but_the_cells():
     grid = Grid(np.array([[F, O]]), 0.5, (1.0, 2.0, 0.1), 8)
     forgotten = grid.forget()
     assert (forgotten.known == U).all()
@@ -91,14 +91,14 @@ def test_forget():
 # Graphs
 
 
-def test_a_diagonal_is_longer():
+def test_grid_graph_lengths_of_diagonals_are_longer():
     root = np.sqrt(2)
     np.testing.assert_allclose(grid_graph(Grid.unknown(2, 2, 8)).lengths, [[1, 1, 1, 1, root, root, root, root]])
     np.testing.assert_array_equal(graph(np.zeros((1, 2, 1), dtype=np.int64)).lengths, [[1.0]])
 
 
 @pytest.mark.parametrize("successors", [np.zeros((0, 1, 1)), [[[2]], [[0]]], [[[-1]], [[0]]]])
-def test_graphs_refuse(successors):
+def test_graph_of_wrong_successors_raises(successors):
     with pytest.raises(InputError, match="successors"):
         graph(np.asarray(successors, dtype=np.int64))
 
@@ -108,7 +108,7 @@ def test_graphs_refuse(successors):
 
 @connectivities
 @given(seed=seeds)
-def test_obstacle_grid_is_the_product_over_needed_cells(connectivity, seed):
+def test_obstacle_grid_probabilities_are_products_over_needed_cells(connectivity, seed):
     rows, columns = 3, 4
     theta = np.random.default_rng(seed).normal(0, 3, rows * columns)
     model = ObstacleGrid(Grid.unknown(rows, columns, connectivity), jnp.asarray(theta))
@@ -117,33 +117,23 @@ def test_obstacle_grid_is_the_product_over_needed_cells(connectivity, seed):
     np.testing.assert_allclose(model.blocked, 1 / (1 + np.exp(-theta.reshape(rows, columns))), rtol=1e-12)
 
 
-@connectivities
-def test_moves_off_the_map_stay(connectivity):
-    """Whatever lies around: here every cell is free, so that only the edge of the map can hold a walker."""
-    model = true_model(Grid(np.full((2, 3), F), connectivity=connectivity))
-    for s, (r, c) in enumerate(np.ndindex(2, 3)):
-        for a, (down, right) in enumerate(STEPS[:connectivity]):
-            inside = 0 <= r + down < 2 and 0 <= c + right < 3
-            assert dense(model)[s, a, (r + down) * 3 + c + right if inside else s] == 1
-
-
 @pytest.mark.parametrize(("known", "passes"), [
     ([[F, F], [F, F]], 1.0),
     ([[F, O], [F, F]], 0.0),
     ([[F, F], [O, F]], 0.0),
     ([[F, F], [F, O]], 0.0),
-    ([[O, F], [F, F]], 1.0),  # where the walker stands does not matter
+    ([[O, F], [F, F]], 1.0),  # the cell of the agent does not matter
     ([[F, U], [U, U]], 0.5**3),
     ([[U, U], [F, U]], 0.5**2),
 ])  # fmt: skip
-def test_diagonals_do_not_cut_corners(known, passes):
-    """Down and right from the top left of a 2×2 map whose unknown cells are blocked at odds of one to one."""
+def test_obstacle_grid_diagonals_do_not_cut_corners(known, passes):
+    """Down and right from the top left of a 2×2 map; unknown cells are blocked with probability ½."""
     model = ObstacleGrid(Grid(np.array(known), connectivity=8), 0.0)
     assert float(model.probabilities()[0, 7, 0]) == passes
     assert float(model.probabilities()[0, 7, 1]) == 1 - passes
 
 
-def test_known_cells_are_held():
+def test_obstacle_grid_of_known_cells_keeps_them_constant():
     grid = Grid(np.array([[F, O, U]]))
     model = ObstacleGrid(grid, jnp.asarray([3.0, -3.0, 1.0]))
     assert model.blocked[0, :2].tolist() == [0, 1]
@@ -155,19 +145,19 @@ def test_known_cells_are_held():
 
 
 @pytest.mark.parametrize("theta", [-30.0, -100.0])
-def test_improbable_failures_keep_their_digits(theta):
+def test_obstacle_grid_improbable_failures_keep_their_digits(theta):
     """1 − (1 − σ)³ = 3σ − 3σ² + σ³ is far below the rounding of 1."""
     failure = float(ObstacleGrid(Grid.unknown(2, 2, 8), theta).probabilities()[0, 7, 1])
     sigma = np.exp(theta) / (1 + np.exp(theta))
     assert failure == pytest.approx(3 * sigma - 3 * sigma**2 + sigma**3, rel=1e-13, abs=0)
 
 
-def test_improbable_successes_keep_their_digits():
+def test_obstacle_grid_improbable_successes_keep_their_digits():
     success = float(ObstacleGrid(Grid.unknown(1, 2), 40.0).probabilities()[0, 3, 0])
     assert success == pytest.approx(np.exp(-40) / (1 + np.exp(-40)), rel=1e-13, abs=0)
 
 
-def test_the_true_model_blocks_what_it_does_not_know():
+def test_true_model_of_unknown_cells_blocks_them():
     assert true_model(Grid(np.array([[F, O, U]]))).blocked.tolist() == [[0, 1, 1]]
 
 
@@ -175,13 +165,13 @@ def test_the_true_model_blocks_what_it_does_not_know():
 
 
 @given(seed=seeds)
-def test_tabular_model_is_a_softmax_over_outcomes(seed):
+def test_tabular_model_probabilities_are_a_softmax_over_outcomes(seed):
     model = random_problem(seed=seed).model
     expected = dense_tabular(model.parameters, np.asarray(model.graph.successors))
     np.testing.assert_allclose(dense(model), expected, atol=1e-12)
 
 
-def test_impossible_outcomes_have_probability_0():
+def test_tabular_model_impossible_outcomes_have_probability_0():
     world = graph(np.array([[[0, 1, 1]], [[0, 1, 0]]]))
     possible = jnp.asarray([[[True, False, True]], [[False, False, True]]])
     model = TabularModel(world, jnp.asarray([[[0.0, 50.0, np.log(3)]], [[9.0, 9.0, -9.0]]]), possible)
@@ -191,7 +181,7 @@ def test_impossible_outcomes_have_probability_0():
     assert (slope[0, 0, :, 0, 0, 1] == 0).all()
 
 
-def test_tabular_models_refuse():
+def test_tabular_model_of_wrong_shapes_raises():
     world = graph(np.array([[[0, 1]], [[0, 1]]]))
     with pytest.raises(InputError, match=r"graph's shape \(2, 1, 2\)"):
         TabularModel(world, jnp.zeros((2, 1, 3)))
@@ -199,7 +189,7 @@ def test_tabular_models_refuse():
         TabularModel(world, jnp.zeros((2, 1, 2)), jnp.asarray([[[True, True]], [[False, False]]]))
 
 
-def test_other_parameters_same_family():
+def test_with_parameters_leaves_the_model_as_it_was():
     model = ObstacleGrid(Grid.unknown(1, 2), 0.0)
     moved = model.with_parameters(jnp.asarray([0.0, float(np.log(3))]))
     np.testing.assert_allclose(moved.blocked, [[0.5, 0.75]])

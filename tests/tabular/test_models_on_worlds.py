@@ -1,4 +1,4 @@
-"""Worlds that are not obstacle grids: what their rules say, and that the rules are found from what people do."""
+"""Worlds that are not obstacle grids: what their rules say, and that fits recover the rules from demonstrations."""
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.demonstrations import gather
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.likelihood import ALL_TERMS
 from sidestep.tabular.models import ObstacleGrid, SlipperyGrid, closed, road_network, true_model, walled_grid
 from sidestep.tabular.planning import plan
 from sidestep.tabular.simulation import simulate
@@ -19,7 +20,7 @@ from sidestep.tabular.solve import solve
 from sidestep.tabular.tasks import Task, reach
 from sidestep.worlds.farm import Farm
 from sidestep.worlds.gravity import DIRECTIONS, Gravity, most_probable_rule
-from sidestep.worlds.rooms import three_rooms, two_rooms
+from sidestep.worlds.rooms import two_rooms
 
 UP, DOWN, LEFT, RIGHT = range(4)
 
@@ -47,15 +48,24 @@ def anywhere(graph: Graph, states, discount=0.95) -> Task:
     return Task(jnp.zeros((1, 1)), jnp.ones(1), terminal, jnp.asarray(discount))
 
 
+def recovered(world, model, tasks, starts, prior=None, beta=10.0, terms=ALL_TERMS):
+    """The fit of a model to walks of optimal agents in a world, and the walks as demonstrations."""
+    demos = gather(simulate(jax.random.key(0), world, tasks, starts), tasks)
+    behavior = Behavior(BoltzmannAverage(), beta)
+    result = fit(model, demos, behavior, prior=prior or Normal(-2.0, 4.0), terms=terms)
+    assert result.converged
+    return result.model, demos
+
+
 # Gravity
 
-COLOURS = np.zeros((5, 5), int)
-COLOURS[1, 1], COLOURS[1, 3], COLOURS[3, 1], COLOURS[3, 3], COLOURS[0, 2], COLOURS[4, 2] = 1, 2, 3, 4, 1, 3
+COLORS = np.zeros((5, 5), int)
+COLORS[1, 1], COLORS[1, 3], COLORS[3, 1], COLORS[3, 3], COLORS[0, 2], COLORS[4, 2] = 1, 2, 3, 4, 1, 3
 RULE = np.array([UP, DOWN, LEFT, RIGHT])
-FALLING = Gravity(COLOURS)
+FALLING = Gravity(COLORS)
 
 
-def test_nobody_moves_against_gravity_and_colours_turn_it():
+def test_gravity_known_model_stops_moves_against_it_and_colors_turn_it():
     model = FALLING.known_model(RULE)
     middle = 4 * 12
     for gravity, against in zip(range(4), (DOWN, UP, RIGHT, LEFT), strict=True):
@@ -63,33 +73,32 @@ def test_nobody_moves_against_gravity_and_colours_turn_it():
             expected = middle + gravity if action == against else 4 * target + gravity
             assert surely(model, middle + gravity, action) == expected, (DIRECTIONS[gravity], action)
     assert surely(model, 4 * 5 + DOWN, RIGHT) == 4 * 6 + UP
-    assert surely(model, 4 * 8 + UP, LEFT) == 4 * 7 + UP  # away from a colour nothing turns
+    assert surely(model, 4 * 8 + UP, LEFT) == 4 * 7 + UP  # away from a color nothing turns
     assert surely(model, 4 * 2 + DOWN, UP) == 4 * 2 + DOWN  # nor at the border of the map
-    # every colour is the same everywhere
+    # every color is the same everywhere
     assert surely(model, 4 * 3 + LEFT, LEFT) == 4 * 2 + UP
 
 
-def test_before_anything_is_known_every_direction_is_as_probable():
+def test_gravity_model_at_first_has_uniform_directions():
     chances = FALLING.model().probabilities()[4 * 5 + DOWN, RIGHT]
     np.testing.assert_allclose(chances, 0.25)
     with pytest.raises(InputError, match="colors"):
         Gravity(np.zeros((2, 2), int)).model()
 
 
-def test_the_most_probable_rule_gravity_is_found_from_ten_demonstrations_a_goal():
-    """Of optimal people, who choose their colours by where these let them go."""
+@pytest.mark.slow
+def test_fit_of_gravity_to_ten_demonstrations_a_goal_recovers_the_rule():
+    """Optimal agents choose their colors by where these let them go."""
     world, random = FALLING.known_model(RULE), np.random.default_rng(1)
     goals = [0, 4, 20, 24]
     tasks = [anywhere(world.graph, 4 * goal + np.arange(4)) for goal in goals]
-    # in some corners one falls for ever
+    # in some corners an agent falls for ever
     arriving = [np.flatnonzero(np.asarray(plan(world, task).solution.values) > 1e-3) for task in tasks]
     starts = [
         random.choice(np.setdiff1d(own, 4 * goal + np.arange(4)), 10) for own, goal in zip(arriving, goals, strict=True)
     ]
-    demos = gather(simulate(jax.random.key(0), world, tasks, starts), tasks)
-    found = fit(FALLING.model(), demos, Behavior(BoltzmannAverage(), 10.0), prior=Normal(0.0, 2.0))
-    assert found.converged
-    assert most_probable_rule(found.model).tolist() == RULE.tolist()
+    learned, _ = recovered(world, FALLING.model(), tasks, starts, Normal(0.0, 2.0))
+    assert most_probable_rule(learned).tolist() == RULE.tolist()
 
 
 # The farm
@@ -101,7 +110,7 @@ ENTERS = np.array([[True, False, False], [False, True, False]])
 FARM = Farm(TERRAIN, MACHINE)
 
 
-def test_terrain_stops_the_wrong_machine_and_machines_are_swapped():
+def test_farm_known_model_stops_the_wrong_machine_and_swaps_machines():
     model = FARM.known_model(ENTERS)
     beside_first, beside_second = 3 * 1, 3 * 16
     assert surely(model, beside_first + 0, RIGHT) == 3 * 2 + 0
@@ -109,32 +118,29 @@ def test_terrain_stops_the_wrong_machine_and_machines_are_swapped():
     assert surely(model, beside_second + 0, RIGHT) == beside_second + 0
     assert surely(model, beside_second + 1, RIGHT) == 3 * 17 + 1
     assert surely(model, beside_first + 2, LEFT) == 3 * 0 + 0  # the first machine stands there
-    assert surely(model, 3 * 0 + 2, UP) == 3 * 0 + 2  # but nobody gets there by staying there
+    assert surely(model, 3 * 0 + 2, UP) == 3 * 0 + 2  # but not by staying there
     np.testing.assert_allclose(FARM.model().probabilities()[beside_first, RIGHT], 0.5)
     with pytest.raises(InputError, match="terrain"):
         Farm(np.zeros((2, 2), int), MACHINE).model()
 
 
-@pytest.mark.parametrize("terms", [("actions",), ("actions", "transitions")])
-def test_what_machines_can_enter_is_found_from_ten_demonstrations_a_goal(terms):
-    """Optimal people never try in vain; that they fetch another machine says what theirs cannot do."""
+@pytest.mark.slow
+def test_fit_of_the_farm_to_actions_of_ten_demonstrations_a_goal_recovers_what_machines_enter():
+    """Optimal agents never fail to enter; that they fetch another machine shows what theirs cannot enter."""
     world, random = FARM.known_model(ENTERS), np.random.default_rng(2)
     goals = [4, 14, 24, 5]
     tasks = [anywhere(world.graph, 3 * goal + np.arange(3)) for goal in goals]
     ground = np.setdiff1d(np.flatnonzero((TERRAIN == 0) & (MACHINE < 0)), goals)
     starts = [3 * random.choice(ground[ground % 5 < 2], 10) + random.integers(3, size=10) for _ in goals]
-    demos = gather(simulate(jax.random.key(0), world, tasks, starts), tasks)
-    bumped = demos.states == demos.next_states
-    assert not bumped.any()
-    found = fit(FARM.model(), demos, Behavior(BoltzmannAverage(), 10.0), prior=Normal(0.0, 2.0), terms=terms)
-    assert found.converged
-    assert ((np.asarray(FARM.stop_probabilities(found.model)) < 0.5) == ENTERS).all()
+    learned, demos = recovered(world, FARM.model(), tasks, starts, Normal(0.0, 2.0), terms=("actions",))
+    assert not (demos.states == demos.next_states).any()
+    assert ((np.asarray(FARM.stop_probabilities(learned)) < 0.5) == ENTERS).all()
 
 
 # Walls between cells, and roads
 
 
-def test_a_wall_between_cells_is_found_where_nobody_could_pass():
+def test_fit_of_walls_between_cells_recovers_the_wall():
     """A room of five by six; the wall runs between its third and fourth column but for the last row."""
     grid = ObstacleGrid(Grid.unknown(5, 6))
     shut = np.full(walled_grid(Grid.unknown(5, 6)).parameters.shape, -12.0)
@@ -144,17 +150,14 @@ def test_a_wall_between_cells_is_found_where_nobody_could_pass():
     goals = [0, 5, 12, 17]
     tasks = [reach(grid.graph, goal) for goal in goals]
     starts = [random.choice(np.setdiff1d(np.arange(30), [goal]), 15) for goal in goals]
-    demos = gather(simulate(jax.random.key(0), world, tasks, starts), tasks)
+    learned, demos = recovered(world, walled_grid(Grid.unknown(5, 6)), tasks, starts)
     assert not (demos.states == demos.next_states).any()
-    found = fit(walled_grid(Grid.unknown(5, 6)), demos, Behavior(BoltzmannAverage(), 10.0), prior=Normal(-2.0, 4.0))
-    chances = np.asarray(closed(found.model))
-    others = np.delete(chances, wall)
-    assert found.converged
+    chances = np.asarray(closed(learned))
     assert chances[wall].min() > 0.5
-    assert (others < 0.5).mean() > 0.95
+    assert (np.delete(chances, wall) < 0.5).mean() > 0.95
 
 
-def test_walls_stand_between_cells_that_are_free():
+def test_walled_grid_of_known_cells_blocks_occupied_ones():
     known = np.zeros((2, 3), int)
     known[0, 2] = 1
     model = walled_grid(Grid(known), -12.0)
@@ -165,8 +168,8 @@ def test_walls_stand_between_cells_that_are_free():
         walled_grid(Grid(known, connectivity=8))
 
 
-def test_a_closed_link_is_found_from_trips_around_it():
-    """A ring of eight links both ways; link 3 is closed, and trips that would use it go round the other way."""
+def test_fit_of_a_road_network_recovers_the_closed_link():
+    """A ring of eight links in both directions; link 3 is closed, so trips go around it."""
     forth = [[link, (link + 1) % 8] for link in range(8)]
     back = [[8 + (link + 1) % 8, 8 + link] for link in range(8)]
     across = [[link, 8 + (link - 1) % 8] for link in range(8)] + [[8 + link, (link + 1) % 8] for link in range(8)]
@@ -177,22 +180,19 @@ def test_a_closed_link_is_found_from_trips_around_it():
     goals = [4, 6, 1, 13]
     tasks = [reach(world.graph, goal) for goal in goals]
     starts = [random.choice(np.setdiff1d(np.arange(16), [goal, 3]), 12) for goal in goals]
-    demos = gather(simulate(jax.random.key(0), world, tasks, starts), tasks)
-    found = fit(road_network(turns, np.ones(16)), demos, Behavior(BoltzmannAverage(), 10.0), prior=Normal(-2.0, 4.0))
-    chances = np.asarray(closed(found.model))
-    assert found.converged
+    chances = np.asarray(closed(recovered(world, road_network(turns, np.ones(16)), tasks, starts)[0]))
     assert chances.argmax() == 3
     assert chances[3] > 0.5
 
 
-def test_who_pays_by_length_does_not_try_turns_that_are_not_there():
+def test_road_network_turns_that_do_not_exist_are_not_chosen():
     """Link 0 leads onto three links, link 1 onto the goal alone: its other two actions are no turns."""
     model = road_network(np.array([[0, 1], [0, 2], [0, 3], [1, 3], [2, 0]]), np.array([3.0, 1.0, 5.0, 0.5]), -20.0)
     behavior = Behavior(BoltzmannAverage(), 2.0)
-    found = solve(model, reach(model.graph, 3, discount=1.0, step_cost=1.0), behavior)
-    assert found.converged
-    np.testing.assert_allclose(found.values[1], -0.5, atol=1e-6)
-    np.testing.assert_allclose(np.exp(behavior.log_policy(found.action_values[1]))[1:], 0, atol=1e-6)
+    result = solve(model, reach(model.graph, 3, discount=1.0, step_cost=1.0), behavior)
+    assert result.converged
+    np.testing.assert_allclose(result.values[1], -0.5, atol=1e-6)
+    np.testing.assert_allclose(np.exp(behavior.log_policy(result.action_values[1]))[1:], 0, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_who_pays_by_length_does_not_try_turns_that_are_not_there():
         ([[0, 1]], [1.0, np.nan], "lengths"),
     ],
 )
-def test_roads_that_are_none_are_refused(turns, lengths, match):
+def test_road_network_of_wrong_arguments_raises(turns, lengths, match):
     with pytest.raises(InputError, match=match):
         road_network(np.array(turns), np.array(lengths))
 
@@ -212,7 +212,7 @@ def test_roads_that_are_none_are_refused(turns, lengths, match):
 # Slips
 
 
-def test_a_slip_leads_to_either_side_and_fails_where_something_is_in_the_way():
+def test_slippery_grid_slips_to_either_side_unless_blocked():
     """Along the lower of two rows, under a blocked cell."""
     model = SlipperyGrid(Grid(np.array([[0, 1, 0], [0, 0, 0]])), slip=logit(0.2))
     moves = dense(model)
@@ -222,7 +222,7 @@ def test_a_slip_leads_to_either_side_and_fails_where_something_is_in_the_way():
     assert float(model.slip[0]) == pytest.approx(0.2)
 
 
-def test_where_nobody_slips_a_grid_is_an_obstacle_grid():
+def test_slippery_grid_without_slips_equals_the_obstacle_grid():
     grid, theta = Grid.unknown(3, 3, connectivity=8), np.random.default_rng(0).normal(size=9)
     terrain = np.full((3, 3), -1)
     terrain[2, 2] = 0
@@ -232,42 +232,23 @@ def test_where_nobody_slips_a_grid_is_an_obstacle_grid():
 
 
 @pytest.mark.parametrize("terrain", [np.zeros((2, 3), int), np.full((2, 2), -1), np.full((2, 2), 1), -np.eye(2) * 2])
-def test_terrain_that_is_none_is_refused(terrain):
+def test_slippery_grid_of_a_wrong_terrain_raises(terrain):
     with pytest.raises(InputError, match="terrain"):
         SlipperyGrid(Grid.unknown(2, 2), terrain=terrain.astype(int))
 
 
-def learned_with_slips(flat, slips, terrain, goals):
-    """Walls and slips, from optimal walks of people who know both; and how often people moved on each terrain."""
-    world, random = SlipperyGrid(flat, slip=logit(slips), terrain=terrain), np.random.default_rng(0)
-    free = np.flatnonzero(flat.known.ravel() == Cell.FREE)
-    tasks = [reach(flat.forget(), goal, discount=1.0, step_cost=1.0) for goal in goals]
-    starts = [random.choice(np.setdiff1d(free, [goal]), 10) for goal in goals]
-    demos = gather(simulate(jax.random.key(0), world, tasks, starts), tasks)
-    behavior = Behavior(BoltzmannAverage(), 3.0)
-    found = fit(SlipperyGrid(flat.forget(), terrain=terrain), demos, behavior, prior=Normal(-2.0, 4.0))
-    assert found.converged
-    blocked, wall = np.asarray(found.model.blocked), flat.known == Cell.OCCUPIED
-    assert blocked[wall].min() > 0.8
-    assert blocked[wall].min() > blocked[~wall].max()
-    return np.asarray(found.model.slip), np.bincount(np.asarray(world.terrain)[np.asarray(demos.states)])
-
-
-def check_slips(found, slips, moves):
-    """Within four standard deviations of the share that moves on each terrain really slip."""
-    slips = np.asarray(slips)
-    assert (np.abs(found - slips) < 4 * np.sqrt(slips * (1 - slips) / moves)).all()
-
-
-def test_walls_and_slips_of_two_terrains_are_found_together():
+@pytest.mark.slow
+def test_fit_of_a_slippery_grid_with_two_terrains_recovers_walls_and_slips():
+    """Slips within four standard deviations of the fraction of moves that slip."""
+    rooms, slips = two_rooms(7, 9, door=6), np.array([0.1, 0.4])
     terrain = np.zeros((7, 9), int)
     terrain[:, 5:] = 1
-    slips, goals = [0.1, 0.4], [0, 21, 46, 8, 26, 62, 5]
-    found, moves = learned_with_slips(two_rooms(7, 9, door=6), slips, terrain, goals)
-    check_slips(found, slips, moves)
-
-
-def test_a_slip_that_all_cells_share_is_found_in_three_rooms():
-    goals = [0, 24, 4, 28, 10, 52, 31]
-    found, moves = learned_with_slips(three_rooms(5, 11, doors=(4, 0)), [0.2], None, goals)
-    check_slips(found, [0.2], moves)
+    world, random = SlipperyGrid(rooms, slip=logit(slips), terrain=terrain), np.random.default_rng(0)
+    goals, free = [0, 21, 46, 8, 26, 62, 5], np.flatnonzero(rooms.known.ravel() == Cell.FREE)
+    tasks = [reach(rooms.forget(), goal, discount=1.0, step_cost=1.0) for goal in goals]
+    starts = [random.choice(np.setdiff1d(free, [goal]), 10) for goal in goals]
+    learned, demos = recovered(world, SlipperyGrid(rooms.forget(), terrain=terrain), tasks, starts, beta=3.0)
+    blocked, wall = np.asarray(learned.blocked), rooms.known == Cell.OCCUPIED
+    assert blocked[wall].min() > max(0.8, blocked[~wall].max())
+    moves = np.bincount(np.asarray(world.terrain)[np.asarray(demos.states)])
+    assert (np.abs(learned.slip - slips) < 4 * np.sqrt(slips * (1 - slips) / moves)).all()

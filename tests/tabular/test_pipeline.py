@@ -106,39 +106,26 @@ def half_learned(plan, random):
     return ObstacleGrid(Grid.unknown(*plan.shape), jnp.asarray(logits))
 
 
-def two_tasks():
+@pytest.mark.parametrize("backup", [BoltzmannAverage(), LogSumExp()], ids=["Boltzmann", "log-sum-exp"])
+def test_solve_batch_equals_each_task_alone(backup):
+    """Values, and the gradient from an earlier adjoint: alone a task uses all cores, in a batch one."""
     model = half_learned(office(200, 200, 3), np.random.default_rng(0))
-    return model, [reach(model.graph, goal, discount=0.999, step_cost=1.0) for goal in (20_100, 5_050)]
-
-
-def test_solve_batch_equals_each_task_alone():
-    """Alone its sweeps use all cores; in a batch they come one after another."""
-    model, tasks = two_tasks()
-    behavior, options = Behavior(LogSumExp(), 5.0), SolveOptions(solver=GaussSeidel(tolerance=1e-9))
-    batch = solve(model, stack_tasks(tasks), behavior, options=options)
-    assert batch.converged.all()
-    for index, task in enumerate(tasks):
-        alone = solve(model, task, behavior, options=options)
-        for one, several in zip(jax.tree.leaves(alone), jax.tree.leaves(batch), strict=True):
-            np.testing.assert_array_equal(one, several[index])
-
-
-def test_solve_gradient_batch_equals_each_task_alone():
-    """From an earlier adjoint: alone, its rows are filled in on all cores."""
-    model, tasks = two_tasks()
-    behavior, solver = Behavior(BoltzmannAverage(), 5.0), GaussSeidel(tolerance=1e-7)
-    before = solver.cold_start(40_000, jnp.dtype(jnp.float64))._replace(adjoint=jnp.ones(40_000))
+    tasks = [reach(model.graph, goal, discount=0.999, step_cost=1.0) for goal in (20_100, 5_050)]
+    behavior, options = Behavior(backup, 5.0), SolveOptions(solver=GaussSeidel(tolerance=1e-7))
+    start = GaussSeidel().cold_start(40_000, jnp.dtype(jnp.float64))._replace(adjoint=jnp.ones(40_000))
 
     def total(parameters, task):
-        options = SolveOptions(solver=solver)
-        solution = solve(model.with_parameters(parameters), task, behavior, options=options, start=before)
-        return jnp.sum(jnp.cos(jnp.arange(40_000)) * solution.values)
+        solution = solve(model.with_parameters(parameters), task, behavior, options=options, start=start)
+        return jnp.sum(jnp.cos(jnp.arange(40_000)) * solution.values), solution
 
-    slope = jax.grad(total)
-    batch = jax.vmap(slope, (None, 0))(model.parameters, stack_tasks(tasks))
-    assert jnp.isfinite(batch).all()
+    gradient = jax.grad(total, has_aux=True)
+    batch = jax.vmap(gradient, (None, 0))(model.parameters, stack_tasks(tasks))
+    assert batch[1].converged.all()
+    assert jnp.isfinite(batch[0]).all()
     for index, task in enumerate(tasks):
-        np.testing.assert_array_equal(batch[index], slope(model.parameters, task))
+        alone = gradient(model.parameters, task)
+        for one, several in zip(jax.tree.leaves(alone), jax.tree.leaves(batch), strict=True):
+            np.testing.assert_array_equal(one, several[index])
 
 
 def test_run_parallel_with_a_failure_waits_for_the_others():

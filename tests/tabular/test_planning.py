@@ -1,4 +1,4 @@
-"""Plans on worlds small enough to plan by hand, and what happens to those who follow them."""
+"""Plans on worlds small enough to plan by hand, and rollouts of them."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from sidestep.tabular.tasks import reach
 OPEN = Grid(np.zeros((3, 3), dtype=int))
 BEND = Grid(np.array([[0, 0, 0], [1, 1, 0], [0, 0, 0]]))
 DIAGONAL = Grid(np.array([[0, 0, 0], [0, 1, 0], [0, 0, 0]]), connectivity=8)
-APART = Grid(np.array([[0, 0, 1, 0]]))
+SEPARATED = Grid(np.array([[0, 0, 1, 0]]))
 UP, DOWN, LEFT, RIGHT = range(4)
 
 
@@ -31,20 +31,20 @@ UP, DOWN, LEFT, RIGHT = range(4)
     (DIAGONAL, 0, 5, [0, 1, 2, 5]),  # no corner is cut
     (Grid(np.zeros((3, 3), dtype=int), connectivity=8), 0, 8, [0, 4, 8]),
 ])  # fmt: skip
-def test_paths_by_hand(world, start, goal, path, reward):
+def test_path_from_start_equals_the_path_by_hand(world, start, goal, path, reward):
     made = plan(true_model(world), reach(world.forget(), goal, **reward))
     assert made.path_from(start).tolist() == path
     assert bool(made.solution.converged)
 
 
-def test_an_optimal_plan_is_uniform_over_ties():
+def test_plan_optimal_is_uniform_over_ties():
     policy = np.asarray(plan(true_model(OPEN), reach(OPEN, 0)).policy)
     expected = {8: [UP, LEFT], 4: [UP, LEFT], 5: [UP, LEFT], 1: [LEFT], 2: [LEFT], 6: [UP]}
     for state, actions in expected.items():
         np.testing.assert_allclose(policy[state], np.isin(range(4), actions) / len(actions), atol=1e-12)
 
 
-def test_a_soft_plan_acts_by_the_action_values():
+def test_plan_with_a_behavior_follows_the_action_values():
     """A corridor of three cells, each blocked with p = 1/4, at γ = 1/2: V = g² and g for g = γ(1−p)/(1−γp) = 3/7."""
     grid, beta = Grid.unknown(1, 3), 2.0
     made = plan(ObstacleGrid(grid, -float(np.log(3))), reach(grid, 2, discount=0.5), Behavior(HardMax(), beta))
@@ -54,18 +54,18 @@ def test_a_soft_plan_acts_by_the_action_values():
     assert made.path_from(0).tolist() == [0, 1, 2]
 
 
-def test_a_learned_obstacle_is_walked_around_to_goals_that_nobody_had():
-    """P(blocked) = .9 in the middle column but for the lowest cell: the way through is dearer than the way around."""
+def test_plan_on_a_learned_model_goes_around_probable_obstacles():
+    """P(blocked) = .9 in the middle column but for the bottom cell: the path through costs more than around it."""
     logits = np.full((3, 3), -3.0)
     logits[:2, 1] = np.log(9)
     made = plan(ObstacleGrid(Grid.unknown(3, 3), logits.reshape(-1)), reach(OPEN, 2, discount=1.0, step_cost=1.0))
     assert made.path_from(0).tolist() == [0, 3, 6, 7, 8, 5, 2]
-    logits[:2, 1] = 0.0  # a coin toss costs one move more: the way through is now the shorter
+    logits[:2, 1] = 0.0  # probability ½ costs one move more: the path through is now the shorter
     made = plan(ObstacleGrid(Grid.unknown(3, 3), logits.reshape(-1)), reach(OPEN, 2, discount=1.0, step_cost=1.0))
     assert made.path_from(0).tolist() == [0, 1, 2]
 
 
-def test_an_action_is_meant_to_lead_to_its_most_probable_outcome_elsewhere():
+def test_plan_intended_is_the_most_probable_outcome_elsewhere():
     world = graph(np.array([[[0, 1, 2]], [[1, 1, 1]], [[2, 2, 2]]]))
     model = TabularModel(world, jnp.log(jnp.array([[[0.6, 0.1, 0.3]], [[1.0, 1.0, 1.0]], [[1.0, 1.0, 1.0]]])))
     made = plan(model, reach(world, 1))
@@ -73,60 +73,53 @@ def test_an_action_is_meant_to_lead_to_its_most_probable_outcome_elsewhere():
     assert made.path_from(0).tolist() == [0, 2]
 
 
-def test_paths_that_cannot_arrive_end_before_they_repeat():
-    path = plan(true_model(APART), reach(APART, 3)).path_from(0)
+def test_path_from_where_the_goal_cannot_be_reached_ends_or_raises():
+    path = plan(true_model(SEPARATED), reach(SEPARATED, 3)).path_from(0)
     assert 3 not in path
     assert len(set(path.tolist())) == len(path)
     with pytest.raises(InputError, match="'start': the goal cannot be reached from state 0"):
-        plan(true_model(APART), reach(APART, 3, discount=1.0, step_cost=1.0)).path_from(0)
+        plan(true_model(SEPARATED), reach(SEPARATED, 3, discount=1.0, step_cost=1.0)).path_from(0)
 
 
 @pytest.mark.parametrize("start", [-1, 9])
-def test_a_start_that_is_no_state_is_refused(start):
+def test_path_from_a_wrong_state_raises(start):
     with pytest.raises(InputError, match=r"'start': expected a state in 0…8"):
         plan(true_model(OPEN), reach(OPEN, 0)).path_from(start)
 
 
-def test_plans_without_values_are_refused():
+def test_plan_without_values_raises():
     with pytest.raises(ImproperTask):
         plan(true_model(OPEN), reach(OPEN, 0, discount=1.0, step_cost=0.1), Behavior(LogSumExp(), 1.0))
     with pytest.raises(NotConverged, match="sweep 1"):
         plan(true_model(OPEN), reach(OPEN, 0), options=SolveOptions(solver=Jacobi(max_sweeps=1)))
 
 
-def test_a_plan_bumps_for_ever_into_a_wall_that_it_does_not_know():
+def test_roll_out_against_an_unknown_wall_fails_until_the_last_move():
     corridor = Grid(np.array([[0, 0, 1, 0]]))
     made = plan(true_model(Grid(np.zeros((1, 4), dtype=int))), reach(corridor, 3))
-    walked = roll_out(
+    rollouts = roll_out(
         jax.random.key(0), true_model(corridor), made.policy, made.terminal, jnp.array([0, 1, 3]), max_moves=6
     )
-    assert walked.states.tolist() == [[0, 1, 1, 1, 1, 1, 1], [1] * 7, [3] * 7]
-    assert walked.actions.tolist() == [[RIGHT] * 6, [RIGHT] * 6, [-1] * 6]
-    assert walked.failed.tolist() == [5, 6, 0]
-    assert walked.moves.tolist() == [6, 6, 0]
-    assert walked.arrived.tolist() == [False, False, True]
+    assert rollouts.states.tolist() == [[0, 1, 1, 1, 1, 1, 1], [1] * 7, [3] * 7]
+    assert rollouts.actions.tolist() == [[RIGHT] * 6, [RIGHT] * 6, [-1] * 6]
+    assert rollouts.failed.tolist() == [5, 6, 0]
+    assert rollouts.moves.tolist() == [6, 6, 0]
+    assert rollouts.arrived.tolist() == [False, False, True]
 
 
-def test_nothing_is_done_after_arriving():
-    made = plan(true_model(OPEN), reach(OPEN, 2))
-    walked = roll_out(jax.random.key(1), true_model(OPEN), made.policy, made.terminal, jnp.array([0, 1]), max_moves=4)
-    assert walked.states.tolist() == [[0, 1, 2, 2, 2], [1, 2, 2, 2, 2]]
-    assert walked.actions.tolist() == [[RIGHT, RIGHT, -1, -1], [RIGHT, -1, -1, -1]]
-    assert walked.moves.tolist() == [2, 1]
-    assert walked.failed.tolist() == [0, 0]
-    assert walked.arrived.all()
-
-
-def test_walkers_stay_where_they_arrive_even_if_their_policy_would_lead_on():
+def test_roll_out_at_a_terminal_state_ignores_the_policy():
     always_right = jnp.zeros((9, 4)).at[:, RIGHT].set(1.0)
-    walked = roll_out(
+    rollouts = roll_out(
         jax.random.key(0), true_model(OPEN), always_right, jnp.arange(9) == 1, jnp.array([0, 3]), max_moves=3
     )
-    assert walked.states.tolist() == [[0, 1, 1, 1], [3, 4, 5, 5]]
-    assert walked.arrived.tolist() == [True, False]
+    assert rollouts.states.tolist() == [[0, 1, 1, 1], [3, 4, 5, 5]]
+    assert rollouts.actions.tolist() == [[RIGHT, -1, -1], [RIGHT] * 3]
+    assert rollouts.moves.tolist() == [1, 3]
+    assert rollouts.failed.tolist() == [0, 1]
+    assert rollouts.arrived.tolist() == [True, False]
 
 
-WALKERS = 4000
+AGENTS = 4000
 POLICY = np.array([[0.25, 0.75], [0.5, 0.5], [0.5, 0.5]])
 CHANCES = np.array([[[0.2, 0.3, 0.5], [0.7, 0.3, 0.0]]])
 
@@ -136,23 +129,23 @@ def stochastic(seed):
     with np.errstate(divide="ignore"):
         logits = np.log(np.broadcast_to(CHANCES, (3, 2, 3)))
     ends = jnp.array([False, True, True])
-    starts = jnp.zeros(WALKERS, dtype=int)
+    starts = jnp.zeros(AGENTS, dtype=int)
     return roll_out(
         jax.random.key(seed), TabularModel(world, jnp.asarray(logits)), jnp.asarray(POLICY), ends, starts, max_moves=1
     )
 
 
-def test_frequencies_are_the_probabilities():
+def test_roll_out_of_many_agents_has_the_probabilities_as_frequencies():
     """Within four standard errors, actions and outcomes alike."""
-    walked = stochastic(0)
-    action, outcome = np.asarray(walked.actions)[:, 0], np.asarray(walked.states)[:, 1]
+    rollouts = stochastic(0)
+    action, outcome = np.asarray(rollouts.actions)[:, 0], np.asarray(rollouts.states)[:, 1]
     for a in (0, 1):
         for k in (0, 1, 2):
             expected = POLICY[0, a] * CHANCES[0, a, k]
-            error = 4 * np.sqrt(expected * (1 - expected) / WALKERS)
+            error = 4 * np.sqrt(expected * (1 - expected) / AGENTS)
             assert abs(np.mean((action == a) & (outcome == k)) - expected) <= error, (a, k)
 
 
-def test_equal_keys_give_equal_walks():
+def test_roll_out_with_equal_keys_is_equal():
     np.testing.assert_array_equal(stochastic(1).states, stochastic(1).states)
     assert (stochastic(1).states != stochastic(2).states).any()

@@ -1,8 +1,5 @@
-"""What must hold for any map, any people and any task."""
+"""What must hold for any map, any behavior and any task."""
 
-from functools import partial
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,10 +8,8 @@ from hypothesis import strategies as st
 
 from helpers.problems import BACKUPS, random_problem, solve_jit
 from sidestep.tabular.backups import Behavior
-from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Grid
-from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import ObstacleGrid, TabularModel
 from sidestep.tabular.tasks import Task, reach
 
@@ -32,13 +27,13 @@ def some_map(rng, connectivity):
 
 def values_of(name, grid, theta, goal, form, beta=10.0):
     task = reach(grid, goal, **form)
-    found = solve_jit(ObstacleGrid(grid, jnp.asarray(theta.reshape(-1))), task, Behavior(BACKUPS[name], beta))
-    assert found.converged
-    return np.asarray(found.values).reshape(ROWS, COLUMNS)
+    solution = solve_jit(ObstacleGrid(grid, jnp.asarray(theta.reshape(-1))), task, Behavior(BACKUPS[name], beta))
+    assert solution.converged
+    return np.asarray(solution.values).reshape(ROWS, COLUMNS)
 
 
 @given(seed=seeds, connectivity=connectivities, form=forms)
-def test_values_fall_as_cells_block(seed, connectivity, form):
+def test_solve_with_more_blocked_cells_lowers_values(seed, connectivity, form):
     rng = np.random.default_rng(seed)
     grid, theta = some_map(rng, connectivity)
     before = values_of("hard max", grid, theta, 0, form)
@@ -48,7 +43,7 @@ def test_values_fall_as_cells_block(seed, connectivity, form):
 
 @each_backup
 @given(seed=seeds, connectivity=connectivities, form=forms)
-def test_mirrored_maps_have_mirrored_values(name, seed, connectivity, form):
+def test_solve_of_a_mirrored_map_mirrors_values(name, seed, connectivity, form):
     rng = np.random.default_rng(seed)
     grid, theta = some_map(rng, connectivity)
     row, column = divmod(int(rng.integers(grid.size)), COLUMNS)
@@ -61,7 +56,7 @@ def test_mirrored_maps_have_mirrored_values(name, seed, connectivity, form):
 
 @each_backup
 @given(seed=seeds)
-def test_relabelling_states_changes_nothing(name, seed):
+def test_solve_of_renumbered_states_renumbers_values(name, seed):
     rng = np.random.default_rng(seed)
     model = random_problem(seed=seed).model
     assert isinstance(model, TabularModel)
@@ -77,7 +72,7 @@ def test_relabelling_states_changes_nothing(name, seed):
 
 
 @given(seed=seeds, connectivity=connectivities, form=forms)
-def test_backups_in_order(seed, connectivity, form):
+def test_solve_with_each_backup_orders_values(seed, connectivity, form):
     """Log-sum-exp ≥ hard max ≥ Boltzmann average and mellowmax, as values of every state."""
     rng = np.random.default_rng(seed)
     grid, theta = some_map(rng, connectivity)
@@ -87,34 +82,3 @@ def test_backups_in_order(seed, connectivity, form):
     assert (value["log-sum-exp"] >= value["hard max"] - slack).all()
     assert (value["hard max"] >= value["Boltzmann"] - slack).all()
     assert (value["hard max"] >= value["mellowmax"] - slack).all()
-
-
-def random_demonstrations(rng, copies: int) -> Demonstrations:
-    model = random_problem(states=7).model
-    successors = np.asarray(model.graph.successors)
-    trajectories, tasks = [], [reach(model.graph, 0), reach(model.graph, 0, discount=0.8)]
-    for task in (0, 1, 1):
-        states, actions = [6], []
-        while len(actions) < 5 and states[-1] != 0:
-            actions.append(int(rng.integers(3)))
-            states.append(int(rng.choice(successors[states[-1], actions[-1]])))
-        trajectories.append(Trajectory(np.array(states), np.array(actions), task))
-    again = [Trajectory(t.states, t.actions, t.task + 2 * copy) for copy in range(copies) for t in trajectories]
-    return gather(again, tasks * copies)
-
-
-@each_backup
-def test_copies_of_tasks_and_trajectories_double_the_likelihood(name):
-    model, behavior = random_problem(states=7).model, Behavior(BACKUPS[name], 5.0)
-
-    @jax.jit
-    @partial(jax.value_and_grad, has_aux=True)
-    def likelihood(parameters, demos):
-        found = log_likelihood(model.with_parameters(parameters), demos, behavior)
-        return found.total, found
-
-    once, twice = (
-        likelihood(model.parameters, random_demonstrations(np.random.default_rng(0), copies)) for copies in (1, 2)
-    )
-    for single, double in zip(jax.tree.leaves(once), jax.tree.leaves(twice), strict=True):
-        np.testing.assert_allclose(double, 2 * np.asarray(single), rtol=1e-9, atol=1e-12)

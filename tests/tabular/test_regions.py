@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.problems import BACKUPS, generic_task, obstacle_problem, relative_error
+from helpers.problems import BACKUPS, generic_task, obstacle_problem, relative_error, solve_with
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.solve import SolveOptions, solve
@@ -42,9 +42,9 @@ def likelihood_like(model, behavior, visited, start, region, solver: Solver = SO
     def total(parameters, adjoint):
         begin = start._replace(adjoint=adjoint)
         varied, options = model.with_parameters(parameters), SolveOptions(solver=solver)
-        found = solve(varied, task(), behavior, options=options, start=begin, region=region)
-        wanted = found.action_values[visited]
-        return jnp.sum(jnp.cos(jnp.arange(wanted.size)) * wanted.ravel()), found
+        solution = solve(varied, task(), behavior, options=options, start=begin, region=region)
+        wanted = solution.action_values[visited]
+        return jnp.sum(jnp.cos(jnp.arange(wanted.size)) * wanted.ravel()), solution
 
     return jax.value_and_grad(total, (0, 1), has_aux=True)(model.parameters, start.adjoint)
 
@@ -56,11 +56,11 @@ def all_states():
 def solved_nearby(behavior, visited):
     """What a solve of the model nearby left to start from."""
     cold = SOLVER.cold_start(TRUTH.size, jnp.dtype(jnp.float64))
-    (_, found), (_, adjoint) = likelihood_like(NEARBY, behavior, visited, cold, all_states())
-    return found.start._replace(adjoint=adjoint)
+    (_, solution), (_, adjoint) = likelihood_like(NEARBY, behavior, visited, cold, all_states())
+    return solution.start._replace(adjoint=adjoint)
 
 
-def test_where_nothing_is_known_all_states_matter():
+def test_region_without_an_adjoint_is_all_states():
     start = SOLVER.cold_start(3, jnp.dtype(jnp.float64))
     assert start.region.tolist() == [True, True, True]
     assert start._replace(adjoint=jnp.asarray([0.0, -2.0, 1e-30])).region.tolist() == [False, True, True]
@@ -71,37 +71,37 @@ def test_where_nothing_is_known_all_states_matter():
 
 
 @pytest.mark.parametrize("name", [name for name in BACKUPS if name != "hard max"])
-def test_states_that_do_not_matter_are_not_solved_and_make_no_difference(name):
+def test_solve_with_a_region_gives_the_same_in_fewer_sweeps(name):
     behavior, visited = Behavior(BACKUPS[name], 5.0), near_the_goal()
     start = solved_nearby(behavior, visited)
     region = np.asarray(start.region)
     assert 0 < region.mean() < 0.7
     (whole, solved), (slope, adjoint) = likelihood_like(MODEL, behavior, visited, start, all_states())
-    (part, found), (its_slope, its_adjoint) = likelihood_like(MODEL, behavior, visited, start, start.region)
-    assert found.converged
+    (part, solution), (its_slope, its_adjoint) = likelihood_like(MODEL, behavior, visited, start, start.region)
+    assert solution.converged
     assert part == pytest.approx(float(whole), rel=1e-8)
     assert relative_error(its_slope, slope) < 1e-6
     assert relative_error(its_adjoint, adjoint) < 1e-6
-    assert found.sweeps < solved.sweeps
+    assert solution.sweeps < solved.sweeps
     # the others have moved along, but one sweep is not enough
-    behind, before = (jnp.abs(values - solved.values)[~region].mean() for values in (found.values, start.values))
+    behind, before = (jnp.abs(values - solved.values)[~region].mean() for values in (solution.values, start.values))
     assert behind < before / 3
-    equations = behavior.backup.value(found.action_values, behavior.beta) - found.values
+    equations = behavior.backup.value(solution.action_values, behavior.beta) - solution.values
     assert jnp.abs(equations)[~region].max() > 1e-6
 
 
-def test_from_values_of_no_use_all_states_are_solved():
+def test_solve_from_a_cold_start_ignores_the_region():
     behavior, visited = Behavior(BACKUPS["Boltzmann"], 5.0), near_the_goal()
     cold = SOLVER.cold_start(TRUTH.size, jnp.dtype(jnp.float64))
     (whole, solved), (slope, _) = likelihood_like(MODEL, behavior, visited, cold, all_states())
     for label, region in {"some": solved_nearby(behavior, visited).region, "none": ~all_states()}.items():
-        (part, found), (its_slope, _) = likelihood_like(MODEL, behavior, visited, cold, region)
-        np.testing.assert_array_equal(found.values, solved.values, err_msg=label)
+        (part, solution), (its_slope, _) = likelihood_like(MODEL, behavior, visited, cold, region)
+        np.testing.assert_array_equal(solution.values, solved.values, err_msg=label)
         assert part == whole, label
         assert relative_error(its_slope, slope) < 1e-9, label
 
 
-def test_sweeps_over_all_states_at_once_leave_none_out():
+def test_solve_with_jacobi_ignores_the_region():
     behavior, visited = Behavior(BACKUPS["Boltzmann"], 5.0), near_the_goal()
     start = solved_nearby(behavior, visited)._replace(order=jnp.zeros(0, jnp.int32))
     solver = Jacobi(tolerance=1e-9)
@@ -112,14 +112,12 @@ def test_sweeps_over_all_states_at_once_leave_none_out():
 
 
 @each_backup
-def test_what_leaving_a_state_out_costs(name):
+def test_vjp_with_a_region_above_the_tolerance_is_nan(name):
     """λ (B(Q) − V) is by how much a sum over values is wrong; beyond the tolerance there is no gradient."""
     problem, backup, beta = obstacle_problem(4), BACKUPS[name], jnp.asarray(5.0)
     wanted, weights = generic_task(problem, 0.9), jnp.cos(jnp.arange(12))
     left, moved = int(np.flatnonzero(~np.asarray(wanted.terminal))[3]), 1e-4
-    right = solve(
-        problem.model, wanted, Behavior(backup, beta), options=SolveOptions(solver=GaussSeidel(tolerance=1e-12))
-    ).values
+    right = solve_with(GaussSeidel(tolerance=1e-12), problem.model, wanted, Behavior(backup, beta)).values
 
     def backed_up(values):
         expected = jnp.einsum("sat,t->sa", problem.dense(problem.model.parameters), values)
@@ -140,14 +138,14 @@ def test_what_leaving_a_state_out_costs(name):
         wanted.terminal,
         wanted.discount,
     )
-    share = float(jnp.abs(cost) / jnp.abs(adjoint * values).sum())
+    error = float(jnp.abs(cost) / jnp.abs(adjoint * values).sum())
     start = WarmStart(values, jnp.zeros(12), jnp.arange(12, dtype=jnp.int32))
     for tolerance, others, converged in ((1.01, left, True), (0.99, left, False), (0.99, (left + 1) % 12, True)):
         region = jnp.arange(12) != others
-        solver = GaussSeidel(tolerance=tolerance * share)
-        by, found = solver.vjp(BellmanEquation(process, backup, beta), "exact", weights, start, region)
-        assert bool(found.converged) == converged
-        assert all(bool(jnp.isfinite(part).all()) == converged for part in (*by, found.values))
+        solver = GaussSeidel(tolerance=tolerance * error)
+        by, solution = solver.vjp(BellmanEquation(process, backup, beta), "exact", weights, start, region)
+        assert bool(solution.converged) == converged
+        assert all(bool(jnp.isfinite(part).all()) == converged for part in (*by, solution.values))
 
 
 def test_solve_gradient_after_too_many_sweeps_with_a_region_is_nan():
@@ -156,14 +154,13 @@ def test_solve_gradient_after_too_many_sweeps_with_a_region_is_nan():
     all_but_one = all_states().at[int(FREE[-1])].set(False)
     for most, region, given_up in ((100, all_but_one, False), (1, all_but_one, True), (1, all_states(), False)):
         solver = GaussSeidel(tolerance=1e-9, max_region_sweeps=most)
-        (_, found), (slope, _) = likelihood_like(MODEL, behavior, visited, start, region, solver)
-        assert found.converged
+        (_, solution), (slope, _) = likelihood_like(MODEL, behavior, visited, start, region, solver)
+        assert solution.converged
         assert bool(jnp.isnan(slope).all()) == given_up
 
 
-@pytest.mark.parametrize("gradient", ["exact", "fixed_policy"])
-@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
-def test_tasks_of_a_batch_have_regions_of_their_own(gradient, dtype):
+@pytest.mark.parametrize(("gradient", "dtype"), [("exact", jnp.float64), ("fixed_policy", jnp.float32)])
+def test_solve_gradient_in_a_batch_uses_the_region_of_each_task(gradient, dtype):
     """As each by itself; also with a discount below 1."""
     grid, behavior = TRUTH.forget(), Behavior(BACKUPS["log-sum-exp"], 5.0)
     model = MODEL.with_parameters(MODEL.parameters.astype(dtype))

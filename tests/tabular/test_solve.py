@@ -11,12 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
+from scipy.sparse.csgraph import dijkstra
 
-from helpers.problems import BACKUPS, plain_backup, random_problem, solve_jit
+from helpers.problems import BACKUPS, plain_backup, random_problem, solve_jit, solve_with
 from sidestep.errors import ImproperTask, InputError
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.demonstrations import Trajectory, gather
-from sidestep.tabular.graph import graph
+from sidestep.tabular.graph import graph, walkable_graph
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import ObstacleGrid, TabularModel, true_model
@@ -47,42 +48,38 @@ def corridor(cells: int, logits) -> ObstacleGrid:
 @pytest.mark.parametrize(
     ("blocked", "gamma", "cells"), [(0.1, 0.95, 12), (0.7, 0.9, 12), (0.98, 0.99, 12), (0.2, 0.999, 500)]
 )
-def test_corridor_with_a_goal_that_pays(blocked, gamma, cells):
+def test_solve_corridor_with_a_goal_that_pays_equals_the_closed_form(blocked, gamma, cells):
     """V = (γ(1−p)/(1−γp))^d."""
     model = corridor(cells, logit(blocked))
-    found = solve_jit(model, reach(model_grid(cells), 0, discount=gamma), agent("hard max"))
+    solution = solve_jit(model, reach(Grid.unknown(1, cells), 0, discount=gamma), agent("hard max"))
     distance = np.arange(cells)
-    assert found.converged
-    np.testing.assert_allclose(found.values, (gamma * (1 - blocked) / (1 - gamma * blocked)) ** distance, rtol=1e-8)
-
-
-def model_grid(cells: int) -> Grid:
-    return Grid.unknown(1, cells)
+    assert solution.converged
+    np.testing.assert_allclose(solution.values, (gamma * (1 - blocked) / (1 - gamma * blocked)) ** distance, rtol=1e-8)
 
 
 @pytest.mark.parametrize(("blocked", "cells"), [(0.1, 12), (0.98, 12), (0.5, 500)])
 @pytest.mark.parametrize("beta", [10.0, 1e4])
-def test_corridor_with_a_step_cost(blocked, cells, beta):
+def test_solve_corridor_with_a_step_cost_equals_the_closed_form(blocked, cells, beta):
     """V = −d/(1−p) at discount 1."""
     model = corridor(cells, logit(blocked))
-    found = solve_jit(model, reach(model_grid(cells), 0, discount=1.0, step_cost=1.0), agent("hard max", beta))
-    assert found.converged
-    np.testing.assert_allclose(found.values, -np.arange(cells) / (1 - blocked), rtol=1e-8)
+    solution = solve_jit(model, reach(Grid.unknown(1, cells), 0, discount=1.0, step_cost=1.0), agent("hard max", beta))
+    assert solution.converged
+    np.testing.assert_allclose(solution.values, -np.arange(cells) / (1 - blocked), rtol=1e-8)
 
 
 @each_backup
-def test_equal_actions(name):
+def test_solve_equal_actions_equals_the_closed_form(name):
     """n equal actions that pay r and reach F, or stay with p: V = (r + γ(1−p)F [+ log n/β]) / (1 − γp)."""
     n, r, final, gamma, p, beta = 5, -0.3, 2.0, 0.8, 0.6, 3.0
     successors = np.tile([1, 0], (2, n, 1))
     logits = jnp.tile(jnp.log(jnp.asarray([1 - p, p])), (2, n, 1))
     ends = Task(jnp.full((1, 1), r), jnp.asarray([0.0, final]), jnp.asarray([False, True]), jnp.asarray(gamma))
-    found = solve_jit(TabularModel(graph(successors), logits), ends, agent(name, beta))
+    solution = solve_jit(TabularModel(graph(successors), logits), ends, agent(name, beta))
     bonus = np.log(n) / beta if name == "log-sum-exp" else 0
-    assert float(found.values[0]) == pytest.approx((r + gamma * (1 - p) * final + bonus) / (1 - gamma * p), rel=1e-9)
+    assert float(solution.values[0]) == pytest.approx((r + gamma * (1 - p) * final + bonus) / (1 - gamma * p), rel=1e-9)
 
 
-ESCAPE_OR_STAY = {
+LEAVE_OR_STAY = {
     "hard max": lambda go, stay, _: max(go, stay),
     "Boltzmann": lambda go, stay, beta: stay + (go - stay) / (1 + np.exp(beta * (stay - go))),
     "log-sum-exp": lambda go, stay, beta: np.log(np.exp(beta * go) + np.exp(beta * stay)) / beta,
@@ -91,23 +88,22 @@ ESCAPE_OR_STAY = {
 
 
 @each_backup
-def test_leaving_or_staying(name):
+def test_solve_leaving_or_staying_solves_the_scalar_equation(name):
     """One action reaches the goal, the other stays for good: V = B(γ, γV), a scalar equation."""
     gamma, beta = 0.9, 4.0
     model = TabularModel(graph(np.array([[[1], [0]], [[1], [1]]])), jnp.zeros((2, 2, 1)))
-    found = solve_jit(model, reach(model.graph, 1, discount=gamma), agent(name, beta))
-    expected = brentq(lambda v: ESCAPE_OR_STAY[name](gamma, gamma * v, beta) - v, 0, 5, xtol=1e-14)
-    assert float(found.values[0]) == pytest.approx(expected, rel=1e-9)
+    solution = solve_jit(model, reach(model.graph, 1, discount=gamma), agent(name, beta))
+    expected = brentq(lambda v: LEAVE_OR_STAY[name](gamma, gamma * v, beta) - v, 0, 5, xtol=1e-14)
+    assert float(solution.values[0]) == pytest.approx(expected, rel=1e-9)
 
 
 # Enumeration
 
 
 @pytest.mark.parametrize(("gamma", "cost"), [(0.95, None), (0.9, 0.5), (1.0, 1.0)])
-@pytest.mark.parametrize(("rows", "columns"), [(2, 2), (2, 3)])
-def test_hard_max_is_the_best_of_all_policies(rows, columns, gamma, cost):
+def test_solve_hard_max_equals_the_best_of_all_policies(gamma, cost):
     """Every deterministic policy of a small grid, each by a linear solve."""
-    grid = Grid.unknown(rows, columns)
+    grid = Grid.unknown(2, 3)
     theta = np.random.default_rng(1).normal(-0.5, 1.5, grid.size)
     model, goal = ObstacleGrid(grid, jnp.asarray(theta)), reach(grid, 0, discount=gamma, step_cost=cost)
     probabilities, successors = np.asarray(model.probabilities()), np.asarray(model.graph.successors)
@@ -123,12 +119,12 @@ def test_hard_max_is_the_best_of_all_policies(rows, columns, gamma, cost):
     np.testing.assert_allclose(solve(model, goal, agent("hard max")).values, values.max(axis=0), rtol=1e-9)
 
 
-def test_log_sum_exp_sums_over_paths():
+def test_solve_log_sum_exp_equals_the_sum_over_paths():
     """Deterministic dynamics at discount 1: exp βV(s) = Σ_paths exp β(reward), and so are paths drawn."""
     grid = Grid(np.zeros((2, 3), dtype=np.int64))
     beta, cost = 8.0, 1.0
     wanted = reach(grid, 5, discount=1.0, step_cost=cost)
-    found = solve_jit(true_model(grid), wanted, agent("log-sum-exp", beta))
+    solution = solve_jit(true_model(grid), wanted, agent("log-sum-exp", beta))
     successors = np.asarray(true_model(grid).graph.successors)[:, :, 0]
 
     def weight(state: int, left: int) -> float:
@@ -140,21 +136,21 @@ def test_log_sum_exp_sums_over_paths():
         return sum(np.exp(-beta * cost) * weight(int(s), left - 1) for s in successors[state])
 
     sums = np.array([weight(state, 8) for state in range(6)])
-    np.testing.assert_allclose(found.values, np.log(sums) / beta, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(solution.values, np.log(sums) / beta, rtol=1e-9, atol=1e-12)
     along = [(0, 3), (1, 3), (2, 1)]  # right, right, down
-    log_policy = agent("log-sum-exp", beta).log_policy(found.action_values)
+    log_policy = agent("log-sum-exp", beta).log_policy(solution.action_values)
     chance = sum(float(log_policy[s, a]) for s, a in along)
     assert chance == pytest.approx(-3 * beta * cost - np.log(sums[0]), rel=1e-9)
 
 
-def test_finite_horizon_sums_over_action_sequences():
-    """What log-sum-exp people can get within 4 actions, over all 4⁴ of them."""
+def test_solve_with_a_horizon_equals_the_best_action_sequence():
+    """The best return within 4 actions, over all 4⁴ sequences."""
     grid = Grid(np.zeros((2, 2), dtype=np.int64))
     beta, gamma, horizon = 3.0, 0.9, 4
     reward = np.random.default_rng(2).normal(size=(4, 4))
     wanted = task(reward, gamma, np.arange(4) == 3)
     successors = np.asarray(true_model(grid).graph.successors)[:, :, 0]
-    found = solve_jit(true_model(grid), wanted, agent("hard max", beta), options=SolveOptions(horizon=horizon))
+    solution = solve_jit(true_model(grid), wanted, agent("hard max", beta), options=SolveOptions(horizon=horizon))
 
     def best(state: int) -> float:
         returns = []
@@ -166,7 +162,7 @@ def test_finite_horizon_sums_over_action_sequences():
             returns.append(total)
         return max(returns)
 
-    np.testing.assert_allclose(found.values, [best(state) for state in range(4)], rtol=1e-12)
+    np.testing.assert_allclose(solution.values, [best(state) for state in range(4)], rtol=1e-12)
 
 
 # Hard cases
@@ -175,17 +171,16 @@ def test_finite_horizon_sums_over_action_sequences():
 @each_backup
 @pytest.mark.parametrize("beta", [10.0, 1e3, 1e4])
 @pytest.mark.parametrize(("spread", "gamma", "cost"), [(3.0, 0.95, None), (3.0, 1.0, 1.0), (40.0, 0.95, None)])
-def test_extremes_are_finite_and_solve_the_bellman_equation(name, beta, spread, gamma, cost):
+def test_solve_extreme_logits_and_beta_is_finite_and_solves_the_bellman_equation(name, beta, spread, gamma, cost):
     """Logits up to ±40: cells all but surely blocked, or free."""
     grid = Grid.unknown(5, 5)
     theta = jnp.asarray(np.random.default_rng(4).uniform(-spread, spread, grid.size))
     wanted = reach(grid, 12, discount=gamma, step_cost=cost)
-    values, slope = value_and_gradient(ObstacleGrid(grid), theta, wanted, agent(name, beta))
-    assert np.isfinite(values).all()
+    solution, slope = solution_and_gradient(ObstacleGrid(grid), theta, wanted, agent(name, beta))
+    assert np.isfinite(solution.values).all()
     assert np.isfinite(slope).all()
-    found = solve_jit(ObstacleGrid(grid, theta), wanted, agent(name, beta))
-    assert found.converged
-    assert residual(name, found, wanted, beta) < 1e-8
+    assert solution.converged
+    assert residual(name, solution, wanted, beta) < 1e-8
 
 
 WALLS = np.array([[0, 0, 0, 1, 0], [1, 1, 0, 1, 0], [0, 0, 0, 1, 0], [0, 1, 1, 1, 0], [0, 0, 0, 0, 0]])
@@ -193,90 +188,76 @@ WALLS = np.array([[0, 0, 0, 1, 0], [1, 1, 0, 1, 0], [0, 0, 0, 1, 0], [0, 1, 1, 1
 
 @each_backup
 @pytest.mark.parametrize("beta", [1e3, 1e4])
-def test_walls_of_logit_40_are_walls(name, beta):
-    """Sharp people need as many steps as the map says (a walker inside a wall walks out)."""
+def test_solve_walls_of_logit_40_equals_shortest_paths(name, beta):
+    """At large β values count the steps on the map (walls can be left)."""
     grid = Grid.unknown(5, 5)
     theta = jnp.where(WALLS.reshape(-1) == 1, 40.0, -40.0)
     wanted = reach(grid, 0, discount=1.0, step_cost=1.0)
-    values, slope = value_and_gradient(ObstacleGrid(grid), theta, wanted, agent(name, beta))
-    free = WALLS == 0
-    steps = shortest_paths(free)
-    np.testing.assert_allclose(-values.reshape(5, 5)[free], steps[free], atol=np.log(4) / beta * 20)
-    assert np.isfinite(values).all()
-    assert np.isfinite(slope).all()
-
-
-def shortest_paths(free: np.ndarray) -> np.ndarray:
-    """Steps to the top left cell of a 5×5 map, by flooding it."""
-    steps = np.full(free.shape, np.inf)
-    steps[0, 0] = 0
-    for _ in range(free.size):
-        around = np.pad(steps, 1, constant_values=np.inf)
-        nearest = np.min([around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:]], axis=0)
-        steps = np.where(free, np.minimum(steps, nearest + 1), np.inf)
-    return steps
+    solution, slope = solution_and_gradient(ObstacleGrid(grid), theta, wanted, agent(name, beta))
+    free, steps = WALLS.ravel() == 0, dijkstra(walkable_graph(Grid(WALLS)), indices=0)
+    np.testing.assert_allclose(-solution.values[free], steps[free], atol=np.log(4) / beta * 20)
+    assert np.isfinite([solution.values, slope]).all()
 
 
 @eqx.filter_jit
-def value_and_gradient(model, theta, wanted, behavior):
+def solution_and_gradient(model, theta, wanted, behavior):
     def total(theta):
-        values = solve(model.with_parameters(theta), wanted, behavior).values
-        return jnp.where(values > -1e100, values, 0).sum(), values
+        solution = solve(model.with_parameters(theta), wanted, behavior)
+        return jnp.where(solution.values > -1e100, solution.values, 0).sum(), solution
 
-    slope, values = jax.grad(total, has_aux=True)(theta)
-    return values, slope
+    slope, solution = jax.grad(total, has_aux=True)(theta)
+    return solution, slope
 
 
-def residual(name: str, found, wanted, beta) -> float:
+def residual(name: str, solution, wanted, beta) -> float:
     """How far V is from B(Q(V)) at states that act, relative to the size of V and Q."""
     acting = ~np.asarray(wanted.terminal)
-    backed_up = np.asarray(plain_backup(name, found.action_values, beta))[acting]
-    values = np.asarray(found.values)[acting]
+    backed_up = np.asarray(plain_backup(name, solution.action_values, beta))[acting]
+    values = np.asarray(solution.values)[acting]
     return float(np.max(np.abs(values - backed_up) / np.maximum(np.abs(values), 1)))
 
 
-def test_nearly_blocked_corridor():
+def test_solve_nearly_blocked_corridor_equals_the_closed_form():
     """P(free) = 1e−9: each of 20 cells takes 1e9 tries; dV/dθ = −P(blocked)/P(free)."""
     theta = jnp.full(20, logit(1 - 1e-9))
-    wanted = reach(model_grid(20), 0, discount=1.0, step_cost=1.0)
-    values, slope = value_and_gradient(corridor(20, 0.0), theta, wanted, agent("hard max"))
+    wanted = reach(Grid.unknown(1, 20), 0, discount=1.0, step_cost=1.0)
+    solution, slope = solution_and_gradient(corridor(20, 0.0), theta, wanted, agent("hard max"))
     tries = 1 + np.exp(float(theta[0]))
-    np.testing.assert_allclose(values, -np.arange(20) * tries, rtol=1e-9)
+    np.testing.assert_allclose(solution.values, -np.arange(20) * tries, rtol=1e-9)
     np.testing.assert_allclose(slope, -(tries - 1) * np.arange(19, -1, -1), rtol=1e-8)
 
 
 @each_backup
 @pytest.mark.parametrize("theta", [4.0, 12.0])
-def test_nearly_blocked_grid_takes_few_sweeps(name, theta):
+def test_solve_nearly_blocked_grid_takes_few_sweeps(name, theta):
     """The longest path has 18 steps; plain sweeps would need thousands."""
     grid = Grid.unknown(10, 10)
-    found = solve_jit(ObstacleGrid(grid, theta), reach(grid, 0, discount=1.0, step_cost=1.0), agent(name))
-    assert found.converged
-    assert found.sweeps <= 40
+    solution = solve_jit(ObstacleGrid(grid, theta), reach(grid, 0, discount=1.0, step_cost=1.0), agent(name))
+    assert solution.converged
+    assert solution.sweeps <= 40
 
 
 @pytest.mark.parametrize("solver", [Jacobi(max_sweeps=3), None], ids=["stopped", "ample"])
-def test_a_solve_that_did_not_converge_is_never_used(solver):
+def test_log_likelihood_without_convergence_is_nan(solver):
     """The likelihood and its gradient are NaN; with sweeps enough they are not."""
     grid = Grid.unknown(1, 12)
     demos = gather([Trajectory(np.arange(12), np.full(11, 3), 0)], [reach(grid, 11, discount=0.95)])
+    options = SolveOptions(solver=solver)
 
     @jax.jit
     @jax.value_and_grad
     def likelihood(theta):
-        return log_likelihood(
-            ObstacleGrid(grid, theta), demos, agent("Boltzmann"), options=SolveOptions(solver=solver)
-        ).total
+        return log_likelihood(ObstacleGrid(grid, theta), demos, agent("Boltzmann"), options=options).total
 
     value, slope = likelihood(jnp.zeros(12))
-    found = solve_jit(ObstacleGrid(grid, 0.0), demos.tasks, agent("Boltzmann"), options=SolveOptions(solver=solver))
+    solution = solve_jit(ObstacleGrid(grid, 0.0), demos.tasks, agent("Boltzmann"), options=options)
     stopped = solver is not None
-    assert bool(found.converged.all()) is not stopped
+    assert bool(solution.converged.all()) is not stopped
     assert bool(jnp.isnan(value)) is stopped
     assert bool(jnp.isnan(slope).any()) is stopped
 
 
-def test_an_adjoint_that_did_not_converge_gives_nan():
+def test_solve_gradient_without_convergence_is_nan():
     """Values that are right from the start need two sweeps, their adjoint in this corridor many more."""
     wanted = task(np.ones((12, 4)), 0.9, np.zeros(12, dtype=bool))  # V = 10 everywhere
     solver = Jacobi(max_sweeps=3)
@@ -284,8 +265,8 @@ def test_an_adjoint_that_did_not_converge_gives_nan():
     @jax.jit
     @partial(jax.grad, has_aux=True)
     def slope_and_converged(theta):
-        found = solve(corridor(12, theta), wanted, agent("hard max"), options=SolveOptions(solver=solver))
-        return found.values.sum(), found.converged
+        solution = solve_with(solver, corridor(12, theta), wanted, agent("hard max"))
+        return solution.values.sum(), solution.converged
 
     slope, converged = slope_and_converged(jnp.zeros(12))
     assert converged
@@ -293,15 +274,15 @@ def test_an_adjoint_that_did_not_converge_gives_nan():
 
 
 @each_backup
-def test_enclosed_cells_at_discount_1(name):
+def test_solve_enclosed_cells_at_discount_1_have_no_effect_on_others(name):
     """Two cells behind known walls are worth about `neg_inf`; the others and the gradient do not notice."""
     known = np.full((4, 5), Cell.UNKNOWN, dtype=np.int64)
     known[:3, 2] = known[2, :3] = Cell.OCCUPIED
     grid = Grid(known, connectivity=8)
     enclosed, walls = np.array([0, 1, 5, 6]), np.flatnonzero(known == Cell.OCCUPIED)
     wanted = reach(grid, 19, discount=1.0, step_cost=1.0)
-    theta = jnp.zeros(grid.size)
-    values, slope = value_and_gradient(ObstacleGrid(grid), theta, wanted, agent(name))
+    solution, slope = solution_and_gradient(ObstacleGrid(grid), jnp.zeros(grid.size), wanted, agent(name))
+    values = solution.values
     assert (values[enclosed] <= 0.9 * neg_inf(jnp.dtype(jnp.float64))).all()
     others = np.setdiff1d(np.arange(grid.size), [*enclosed, *walls])
     assert (values[others] > -100).all()
@@ -310,20 +291,17 @@ def test_enclosed_cells_at_discount_1(name):
     assert (slope[others] != 0).sum() > 5
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @each_backup
-def test_numbers_keep_their_precision(name, dtype):
-    """A model, a task and people in 32-bit numbers give good 32-bit values, 64-bit switched on."""
+def test_solve_of_32_bit_inputs_gives_32_bit_values(name):
+    """32-bit inputs give accurate 32-bit values with 64 bits switched on."""
     problem = random_problem()
     wanted = reach(problem.model.graph, 0)
     exact = solve_jit(problem.model, wanted, agent(name))
-    inputs = jax.tree.map(
-        lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, (problem.model, wanted, agent(name))
-    )
-    found = solve_jit(*inputs)
-    assert found.values.dtype == found.action_values.dtype == found.residual.dtype == dtype
-    assert found.converged
-    np.testing.assert_allclose(found.values, exact.values, rtol=1e-3 if dtype == jnp.float32 else 1e-12)
+    inputs = (problem.model, wanted, agent(name))
+    solution = solve_jit(*jax.tree.map(lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, inputs))
+    assert solution.values.dtype == solution.action_values.dtype == solution.residual.dtype == jnp.float32
+    assert solution.converged
+    np.testing.assert_allclose(solution.values, exact.values, rtol=1e-3)
 
 
 # Improper problems, bad settings
@@ -336,7 +314,7 @@ def test_numbers_keep_their_precision(name, dtype):
     ("Boltzmann", 0.9, False),
     ("hard max", 0.9, False),
 ])  # fmt: skip
-def test_improper_soft_tasks(name, cost, refused):
+def test_check_proper_of_log_sum_exp_with_a_low_cost_raises(name, cost, refused):
     """log(4)/β = 1 is what a choice among four is worth; a stack is refused for one such task in it."""
     behavior = agent(name, float(np.log(4)))
     grid = Grid.unknown(2, 2)
@@ -351,7 +329,7 @@ def test_improper_soft_tasks(name, cost, refused):
     check_proper(tasks[1], behavior, actions=4, horizon=3)
 
 
-def test_discount_1_needs_an_end_and_a_cost():
+def test_check_proper_at_discount_1_without_end_or_cost_raises():
     nowhere = task(np.full(3, -1.0), 1.0, np.zeros(3, dtype=bool))
     with pytest.raises(ImproperTask, match="terminal"):
         check_proper(nowhere, agent("hard max"), actions=2)
@@ -360,7 +338,7 @@ def test_discount_1_needs_an_end_and_a_cost():
         check_proper(one_free, agent("hard max"), actions=2)
 
 
-def test_horizon_must_be_an_action_at_least():
+def test_solve_with_horizon_0_raises():
     grid = Grid.unknown(2, 2)
     with pytest.raises(InputError, match="horizon"):
         solve(ObstacleGrid(grid), reach(grid, 0), agent("hard max"), options=SolveOptions(horizon=0))
@@ -371,9 +349,9 @@ def test_horizon_must_be_an_action_at_least():
 
 @each_backup
 @given(seed=st.integers(0, 2**32 - 1), cost=st.booleans(), kind=st.sampled_from([4, 8, "tabular"]))
-def test_values_solve_the_bellman_equation(name, seed, cost, kind):
+def test_solve_random_problems_solves_the_bellman_equation(name, seed, cost, kind):
     rng = np.random.default_rng(seed)
-    # of those who choose less sharply in nearly closed worlds, Jacobi does not always find values (see there)
+    # at smaller β in nearly closed worlds, Jacobi does not always converge (see there)
     beta = float(10 ** rng.uniform(0.7, 3))
     if kind == "tabular":
         model = random_problem(seed=seed).model
@@ -384,56 +362,50 @@ def test_values_solve_the_bellman_equation(name, seed, cost, kind):
         model = ObstacleGrid(world, jnp.asarray(rng.normal(0, 4, 12).clip(max=5)))
     gamma = float(rng.uniform(0.5, 0.99))
     wanted = reach(world, goal, discount=1.0 if cost else gamma, step_cost=1.0 if cost else None)
-    found = solve_jit(model, wanted, agent(name, beta))
-    assert found.converged
-    assert residual(name, found, wanted, beta) < 1e-8
+    solution = solve_jit(model, wanted, agent(name, beta))
+    assert solution.converged
+    assert residual(name, solution, wanted, beta) < 1e-8
 
 
 @pytest.mark.parametrize(("dtype", "close"), [("float64", 1e-6), ("float32", 1e-3)])
-def test_values_that_swing_come_to_rest(dtype, close):
-    """In this world of nearly closed cells, full steps of Jacobi swing for ever, and the adjoint's grow without end."""
+def test_solve_with_jacobi_of_oscillating_values_converges(dtype, close):
+    """Among nearly closed cells full Jacobi steps oscillate for ever, and the adjoint's diverge."""
     random = np.random.default_rng(83498)
     beta, grid, goal = 10 ** random.uniform(0.5, 3), Grid.unknown(3, 4), int(random.integers(12))
     logits = jnp.asarray(random.normal(0, 4, 12).clip(max=5), dtype)
     wanted = reach(grid, goal, discount=1.0, step_cost=1.0)
 
     def total(logits, solver):
-        found = solve(ObstacleGrid(grid, logits), wanted, agent("Boltzmann", beta), options=SolveOptions(solver=solver))
-        return found.values.sum(), found
+        solution = solve_with(solver, ObstacleGrid(grid, logits), wanted, agent("Boltzmann", beta))
+        return solution.values.sum(), solution
 
-    (_, found), slope = jax.value_and_grad(total, has_aux=True)(logits, Jacobi())
+    (_, solution), slope = jax.value_and_grad(total, has_aux=True)(logits, Jacobi())
     (_, expected), slope_expected = jax.value_and_grad(total, has_aux=True)(logits, GaussSeidel())
-    assert found.converged
-    assert found.sweeps > 400
-    np.testing.assert_allclose(found.values, expected.values, rtol=close)
+    assert solution.converged
+    assert solution.sweeps > 400
+    np.testing.assert_allclose(solution.values, expected.values, rtol=close)
     np.testing.assert_allclose(slope, slope_expected, rtol=close, atol=close * jnp.abs(slope_expected).max())
 
 
-@each_backup
-def test_a_long_way_takes_no_more_sweeps_than_steps(name):
-    """News of the goal takes its time; that nothing seems to get better meanwhile is no reason to begin anew."""
+@pytest.mark.parametrize("name", ["hard max", "Boltzmann"])
+def test_solve_with_jacobi_of_a_long_path_takes_few_more_sweeps_than_steps(name):
+    """The goal's value spreads one step a sweep; a residual that stays must not restart the solve."""
     grid = Grid.unknown(3, 1_500)
-    found = solve(
-        ObstacleGrid(grid),
-        reach(grid, 0, discount=1.0, step_cost=1.0),
-        agent(name, 5.0),
-        options=SolveOptions(solver=Jacobi()),
-    )
-    assert found.converged
-    assert found.sweeps < 1_700
+    solution = solve_with(Jacobi(), ObstacleGrid(grid), reach(grid, 0, discount=1.0, step_cost=1.0), agent(name, 5.0))
+    assert solution.converged
+    assert solution.sweeps < 1_700
 
 
 @pytest.mark.parametrize("solver", [Jacobi(), GaussSeidel()], ids=["Jacobi", "GaussSeidel"])
-@each_backup
-def test_values_that_were_far_too_high_come_down(name, solver):
-    """Where places come to cost four times as much: of the log-sum-exp, neighbours took turns in being too high."""
+def test_solve_from_values_that_are_too_high_converges(solver):
+    """States come to cost four times as much; with log-sum-exp, neighbors took turns in being too high."""
     grid = Grid.unknown(5, 5)
     model, costs = true_model(grid.passable()), jnp.asarray(np.random.default_rng(17).uniform(0, 1, 25))
     cheap, dear = (
-        with_state_costs(reach(grid, 0), share * costs, model.graph.successors[..., 0]) for share in (0.2, 0.8)
+        with_state_costs(reach(grid, 0), factor * costs, model.graph.successors[..., 0]) for factor in (0.2, 0.8)
     )
-    before = solve(model, cheap, agent(name, 7.0), options=SolveOptions(solver=solver))
-    warm = solve(model, dear, agent(name, 7.0), options=SolveOptions(solver=solver), start=before.start)
-    cold = solve(model, dear, agent(name, 7.0), options=SolveOptions(solver=solver))
+    behavior = agent("log-sum-exp", 7.0)
+    before = solve_with(solver, model, cheap, behavior)
+    warm, cold = (solve_with(solver, model, dear, behavior, start=start) for start in (before.start, None))
     assert warm.converged
     np.testing.assert_allclose(warm.values, cold.values, rtol=1e-6, atol=1e-8)

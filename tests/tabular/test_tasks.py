@@ -15,29 +15,29 @@ WORLD = graph(np.array([[[0], [1]], [[1], [0]]]))
 TERMINAL = np.array([False, True])
 
 
-def test_a_goal_that_pays():
-    found = reach(Grid.unknown(2, 3), 4, discount=0.9)
-    assert found.terminal.tolist() == [False] * 4 + [True, False]
-    assert (np.broadcast_to(found.terminal_reward, 6) == 1).all()
-    assert (found.reward == 0).all()
-    assert float(found.discount) == 0.9
+def test_reach_without_a_step_cost_pays_at_the_goal():
+    result = reach(Grid.unknown(2, 3), 4, discount=0.9)
+    assert result.terminal.tolist() == [False] * 4 + [True, False]
+    assert (np.broadcast_to(result.terminal_reward, 6) == 1).all()
+    assert (result.reward == 0).all()
+    assert float(result.discount) == 0.9
 
 
 @pytest.mark.parametrize("connectivity", [4, 8])
-def test_a_step_cost_is_paid_by_length(connectivity):
-    found = reach(Grid.unknown(2, 3, connectivity), 4, discount=1.0, step_cost=0.5)
+def test_reach_with_a_step_cost_charges_by_length(connectivity):
+    result = reach(Grid.unknown(2, 3, connectivity), 4, discount=1.0, step_cost=0.5)
     lengths = np.array([1, 1, 1, 1] + [np.sqrt(2)] * 4)[:connectivity]
-    np.testing.assert_allclose(np.broadcast_to(found.reward, (6, connectivity))[0], -0.5 * lengths)
-    assert (found.terminal_reward == 0).all()
+    np.testing.assert_allclose(np.broadcast_to(result.reward, (6, connectivity))[0], -0.5 * lengths)
+    assert (result.terminal_reward == 0).all()
 
 
-def test_goals_in_metres_and_on_graphs():
+def test_reach_of_a_position_or_a_state_ends_there():
     grid = Grid(np.full((2, 3), -1), resolution=2.0, origin=(10.0, 20.0, 0.0))
     assert jnp.flatnonzero(reach(grid, (15.0, 21.0)).terminal).tolist() == [5]  # right column, bottom row
     assert jnp.flatnonzero(reach(WORLD, 1, discount=1.0, step_cost=1.0).terminal).tolist() == [1]
 
 
-def test_rewards_per_state_and_per_action():
+def test_task_of_rewards_by_state_or_action_keeps_them():
     per_state = task(np.array([-1.0, 5.0]), 0.9, TERMINAL)
     assert per_state.reward.tolist() == [[-1], [5]]
     assert per_state.terminal_reward.tolist() == [-1, 5]
@@ -46,7 +46,7 @@ def test_rewards_per_state_and_per_action():
     assert np.broadcast_to(per_action.terminal_reward, 2)[1] == 0
 
 
-def test_stacks_broadcast():
+def test_stack_tasks_of_different_shapes_broadcasts():
     tasks = [reach(WORLD, 0), task(np.array([[-1.0, -2.0], [7.0, 8.0]]), 0.9, TERMINAL)]
     stacked = stack_tasks(tasks)
     assert stacked.reward.shape == (2, 2, 2)
@@ -77,7 +77,7 @@ def test_stacks_broadcast():
     (lambda: task(np.ones(2), 0.9, TERMINAL.astype(int)), "reward, terminal|Type-check"),
     (lambda: stack_tasks([]), "tasks.*at least one"),
 ])  # fmt: skip
-def test_refusals(make, message):
+def test_tasks_of_wrong_arguments_raise(make, message):
     with pytest.raises(Exception, match=message) as caught:
         make()
     assert isinstance(caught.value, InputError) or "Type-check" in str(caught.value)

@@ -1,4 +1,4 @@
-"""Worlds to try: the paper's grids cell by cell, and what every random office must be."""
+"""The paper's grids cell by cell, and properties of random offices and rooms."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from sidestep.worlds.offices import office, places
 from sidestep.worlds.rooms import three_rooms, two_rooms
 
 
-def test_block_and_wall_are_the_maps_they_are_said_to_be():
+def test_block_and_wall_have_the_obstacles_of_the_paper():
     expected = np.zeros((9, 9), dtype=int)
     expected[3:6, 3:6] = 1
     np.testing.assert_array_equal(block().truth.known, expected)
@@ -23,14 +23,14 @@ def test_block_and_wall_are_the_maps_they_are_said_to_be():
     np.testing.assert_array_equal(wall().truth.known, expected)
 
 
-def test_the_places_of_the_block():
+def test_block_has_the_starts_and_goals_of_the_paper():
     world = block()
     assert world.starts == (0, 36, 76)
     assert world.goals == (4, 8, 44, 72, 80)
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_every_start_of_a_world_reaches_every_goal(name):
+def test_worlds_connect_every_start_with_every_goal(name):
     world = WORLDS[name]()
     assert world.name == name
     assert world.source
@@ -40,21 +40,21 @@ def test_every_start_of_a_world_reaches_every_goal(name):
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_optimal_walks_pass_around_every_obstacle_that_can_be_seen(name):
-    """Beside each obstacle that borders a free cell lies a cell on a shortest way from a start to a goal."""
+def test_worlds_have_optimal_walks_beside_every_visible_obstacle(name):
+    """Beside each obstacle that borders a free cell lies a cell on a shortest path from a start to a goal."""
     world = WORLDS[name]()
     graph = walkable_graph(world.truth)
     from_start, to_goal = dijkstra(graph, indices=world.starts), dijkstra(graph, indices=world.goals)
     length = from_start[:, list(world.goals)]
-    on_way = (from_start[:, None] + to_goal[None] == length[..., None]).any(axis=(0, 1))
-    near = dilated(on_way.reshape(world.truth.shape))
+    on_path = (from_start[:, None] + to_goal[None] == length[..., None]).any(axis=(0, 1))
+    near = dilated(on_path.reshape(world.truth.shape))
     seen = dilated(world.truth.known == Cell.FREE) & (world.truth.known == Cell.OCCUPIED)
     assert seen.any()
     assert near[seen].all()
 
 
 def dilated(cells):
-    """The cells and their neighbours on four sides."""
+    """Return the cells and their neighbors on four sides."""
     padded = np.pad(cells, 1)
     return cells | padded[2:, 1:-1] | padded[:-2, 1:-1] | padded[1:-1, 2:] | padded[1:-1, :-2]
 
@@ -63,7 +63,7 @@ def dilated(cells):
 @example(rows=10, columns=8, seed=0)
 @example(rows=28, columns=8, seed=0)
 @example(rows=300, columns=9, seed=0)
-def test_offices_of_any_size_are_walled_in_and_connected(rows, columns, seed):
+def test_office_of_any_size_is_walled_in_and_connected(rows, columns, seed):
     grid = office(rows, columns, seed=seed)
     free = grid.known == Cell.FREE
     assert grid.shape == (rows, columns)
@@ -74,7 +74,7 @@ def test_offices_of_any_size_are_walled_in_and_connected(rows, columns, seed):
     assert 0.3 < free.mean() < 0.9
 
 
-def test_an_office_of_20_by_30_has_rooms_on_both_sides_of_a_corridor():
+def test_office_of_20_by_30_has_rooms_on_both_sides_of_a_corridor():
     for seed in range(25):
         free = office(20, 30, seed=seed).known == Cell.FREE
         corridor = np.flatnonzero(free[:, 1:-1].all(axis=1))
@@ -83,7 +83,7 @@ def test_an_office_of_20_by_30_has_rooms_on_both_sides_of_a_corridor():
         assert ((walls_of_rooms >= 2) & (walls_of_rooms <= 6)).all()
 
 
-def test_offices_repeat_by_seed():
+def test_office_repeats_by_seed():
     first = office(20, 30, seed=3)
     np.testing.assert_array_equal(first.known, office(20, 30, seed=3).known)
     assert (first.known != office(20, 30, seed=4).known).any()
@@ -92,19 +92,19 @@ def test_offices_repeat_by_seed():
 
 
 @pytest.mark.parametrize("shape", [(9, 30), (20, 7)])
-def test_offices_too_small_are_refused(shape):
+def test_office_of_a_few_cells_is_refused(shape):
     with pytest.raises(InputError, match="at least 10 rows and 8 columns"):
         office(*shape, seed=0)
 
 
-def test_places_are_free_different_and_well_apart():
+def test_places_are_free_different_and_distant():
     for seed in range(10):
         grid = office(20, 30, seed=seed)
-        chosen = places(grid, 8, seed=seed)
-        assert len(set(chosen.tolist())) == 8
-        assert (grid.known.reshape(-1)[chosen] == Cell.FREE).all()
-        split_by_person = dijkstra(walkable_graph(grid), indices=chosen)[:, chosen] + 1e9 * np.eye(8)
-        assert split_by_person.min() >= 6
+        states = places(grid, 8, seed=seed)
+        assert len(set(states.tolist())) == 8
+        assert (grid.known.reshape(-1)[states] == Cell.FREE).all()
+        distances = dijkstra(walkable_graph(grid), indices=states)[:, states] + 1e9 * np.eye(8)
+        assert distances.min() >= 6
 
 
 def test_places_repeat_by_seed():
@@ -122,7 +122,7 @@ def test_places_lie_in_the_largest_connected_part():
 
 
 @pytest.mark.parametrize("connectivity", [4, 8])
-def test_rooms_in_a_row_are_joined_by_their_doors_alone(connectivity):
+def test_rooms_are_connected_by_their_doors_only(connectivity):
     for rows, columns in ((1, 3), (4, 6), (7, 13)):
         for door in range(rows):
             check_rooms(two_rooms(rows, columns, door, connectivity), {(columns + 1) // 2 - 1: door})
@@ -136,7 +136,7 @@ def test_rooms_in_a_row_are_joined_by_their_doors_alone(connectivity):
 
 
 def check_rooms(grid, doors):
-    """Free but for walls in some columns, which have one free cell each; closing a door parts the rooms beside it."""
+    """Check walls in some columns, with one free cell each, without which the rooms beside it are separate."""
     expected = np.zeros(grid.shape, dtype=int)
     for column, row in doors.items():
         expected[:, column] = 1
@@ -154,16 +154,13 @@ def rooms_of(grid):
     return len(np.unique(label[grid.known.reshape(-1) == Cell.FREE]))
 
 
-@pytest.mark.parametrize(
-    ("make", "arguments", "match"),
-    [
-        (two_rooms, (3, 2, 0), "'columns': expected at least 3, found 2"),
-        (two_rooms, (0, 3, 0), "'rows': expected at least 1, found 0"),
-        (two_rooms, (3, 3, 3), "'door': expected a row in 0…2, found 3"),
-        (three_rooms, (3, 4, (0, 0)), "'columns': expected at least 5, found 4"),
-        (three_rooms, (3, 5, (0, -1)), "'door': expected a row in 0…2, found -1"),
-    ],
-)
-def test_rooms_that_cannot_be_are_refused(make, arguments, match):
+@pytest.mark.parametrize(("make", "arguments", "match"), [
+    (two_rooms, (3, 2, 0), "'columns': expected at least 3, found 2"),
+    (two_rooms, (0, 3, 0), "'rows': expected at least 1, found 0"),
+    (two_rooms, (3, 3, 3), "'door': expected a row in 0…2, found 3"),
+    (three_rooms, (3, 4, (0, 0)), "'columns': expected at least 5, found 4"),
+    (three_rooms, (3, 5, (0, -1)), "'door': expected a row in 0…2, found -1"),
+])  # fmt: skip
+def test_rooms_of_impossible_sizes_are_refused(make, arguments, match):
     with pytest.raises(InputError, match=match):
         make(*arguments)

@@ -99,5 +99,12 @@ def _expected_visits(
     probabilities = (np.asarray(agents.policy)[..., None] * np.asarray(model.probabilities()))[active]
     origin = np.broadcast_to(np.flatnonzero(active)[:, None, None], probabilities.shape)
     target = np.asarray(model.graph.successors)[active]
-    moves = coo_array((probabilities.ravel(), (target.ravel(), origin.ravel())), shape=(len(active),) * 2)
-    return np.asarray(spsolve((eye_array(len(active)) - moves).tocsc(), starts))
+    moves = coo_array((probabilities.ravel(), (target.ravel(), origin.ravel())), shape=(len(active),) * 2).tocsr()
+    reached, before = starts > 0, 0
+    while reached.sum() > before:
+        before = reached.sum()
+        reached |= moves @ reached.astype(np.float64) > 0
+    # of other cells, those between obstacles lead only to themselves, and would make the matrix singular
+    cells, visits = np.flatnonzero(reached), np.zeros(len(active))
+    visits[cells] = np.asarray(spsolve((eye_array(len(cells)) - moves[cells][:, cells]).tocsc(), starts[cells]))
+    return visits

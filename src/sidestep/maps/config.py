@@ -72,6 +72,7 @@ class FitConfig:
         gradient: "exact" (L-BFGS, on large maps Rprop) or the paper's "fixed_policy" (Adam).
         max_iterations: The most iterations, at least 1; None for the optimizer's own limit.
         memory: About how many GiB the arrays of the fit may take, above 0.
+        large_map: The number of cells from which a map counts as large.
 
     Raises:
         InputError: For a value out of these ranges.
@@ -81,6 +82,7 @@ class FitConfig:
     gradient: GradientName = "exact"
     max_iterations: int | None = None
     memory: float = 2.0
+    large_map: int = 10_000
 
     def __post_init__(self) -> None:
         _check_choice(self.terms, Terms, "terms")

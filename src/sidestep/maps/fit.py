@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sidestep.inference.batching import LARGE_MAP
 from sidestep.inference.fit import Fit, fit
 from sidestep.inference.maximize import Progress
 from sidestep.inference.optimizers import LBFGS, Adam, Optimizer, Rprop
@@ -105,7 +104,7 @@ def fit_map(
         options=SolveOptions(gradient=config.fit.gradient, horizon=config.behavior.horizon),
         optimizer=optimizer,
         memory=config.fit.memory * 2**30,
-        large_map=LARGE_MAP,
+        large_map=config.fit.large_map,
         report=callback,
         checkpoint=checkpoint,
         resume=resume,
@@ -126,14 +125,14 @@ def optimizer_for(config: FitConfig, cells: int, moves: int) -> Optimizer:
     limit = {} if config.max_iterations is None else {"max_iterations": config.max_iterations}
     if config.gradient == "fixed_policy":
         return Adam(**limit)
-    if cells < LARGE_MAP or config.terms == "transitions":
+    if cells < config.large_map or config.terms == "transitions":
         return LBFGS(**limit)
     return Rprop(tolerance=_TOLERANCE_PER_MOVE * moves, **limit)
 
 
 def max_iterations(config: FitConfig) -> int:
     """Return the most iterations that a fit may take, whatever the map."""
-    return max(optimizer_for(config, cells, moves=1).max_iterations for cells in (0, LARGE_MAP))
+    return max(optimizer_for(config, cells, moves=1).max_iterations for cells in (0, config.large_map))
 
 
 def _first_cells(

@@ -97,7 +97,7 @@ def learn_map(
         data=_counts(grid, moves, result.demonstrations, sensor),
         selection=selection,
         sensor=sensor,
-        notes=_notes(result.demonstrations, config, resume and not resumed),
+        notes=_notes(grid, result.demonstrations, config, resume and not resumed),
         resumed=resumed,
         seconds=round(time.monotonic() - started, 3),
         peak_memory_bytes=peak_memory(),
@@ -194,9 +194,14 @@ def _counts(grid: Grid, moves: Moves, demonstrations: Demonstrations, sensor: Se
     )
 
 
-def _notes(demonstrations: Demonstrations, config: MapConfig, nothing_to_resume: bool) -> tuple[str, ...]:
+def _notes(grid: Grid, demonstrations: Demonstrations, config: MapConfig, nothing_to_resume: bool) -> tuple[str, ...]:
     """Return what one should know before one trusts the numbers."""
     notes = ["there was no checkpoint to resume from, so the fit started anew"] if nothing_to_resume else []
+    if not (grid.known == Cell.UNKNOWN).any():
+        notes.append(
+            "the map knows every cell, so there are none to learn; a gray pixel of 205 is unknown only if "
+            "free_thresh in the map's YAML is .196 or less (many mappers write .25)"
+        )
     moves = int(np.median(np.bincount(np.asarray(demonstrations.trajectory))))
     discount = config.reward.discount
     preference = config.behavior.beta * (1 - discount**2) * discount**moves

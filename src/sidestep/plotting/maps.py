@@ -29,6 +29,8 @@ _MOST_CELL_LINES = 25
 """Maps with at most this many rows and columns show thin lines between cells."""
 _PANEL, _FIT, _PLAN = 2.9, 4.2, 5.5
 """The longer side of a map in inches, in each kind of figure."""
+_OBJECTIVE_SPAN = 1.0
+"""The least height of the objective's axis, in nats: smaller changes look as small as they are."""
 
 Values = Float[np.ndarray, "rows columns"]
 Places = Integer[np.ndarray, " _"] | Float[np.ndarray, "_ 2"]
@@ -190,6 +192,10 @@ def figure_fit(
     progress.plot(np.arange(len(objective)), objective, color=palette.BLUE, marker=marker)
     progress.set(title="Objective", xlabel="iteration", ylabel="log posterior (nats)")
     progress.locator_params(axis="x", integer=True)
+    progress.ticklabel_format(axis="y", useOffset=False)
+    low, high = progress.get_ylim()
+    if high - low < _OBJECTIVE_SPAN:
+        progress.set_ylim((low + high - _OBJECTIVE_SPAN) / 2, (low + high + _OBJECTIVE_SPAN) / 2)
     progress.grid(color="0.9")
     arrange(figure, [width, width, 2.8], height, ColorBar(image, column=1))
     return figure

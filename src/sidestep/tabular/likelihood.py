@@ -14,6 +14,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
+from sidestep.errors import InputError
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.demonstrations import Demonstrations, next_power_of_two, pad_to_power_of_two
@@ -62,12 +63,15 @@ def log_likelihood(
     Args:
         model: the transition model; differentiable in its parameters θ.
         demonstrations: moves and tasks. One compiled function serves demonstrations of many lengths.
-        behavior: the policy that values of actions lead to.
+        behavior: the policy that values of actions lead to; after a fit, `fit.behavior.behavior_of(person)`.
         terms: the terms that count, "actions", "transitions" or both.
         options: how values are computed; by default `SolveOptions()`.
 
     Returns:
         Both terms. The actions' term is NaN if the values of a task did not converge.
+
+    Raises:
+        InputError: for a `BehaviorModel`, which has a behavior of each person.
 
     Example:
         >>> from sidestep.tabular.backups import BoltzmannAverage
@@ -84,6 +88,10 @@ def log_likelihood(
     References:
         Equations 1 and 6 of the behavior-aware modeling paper.
     """
+    if not isinstance(behavior, Behavior):
+        raise InputError(
+            "expected a Behavior; a BehaviorModel has one of each person: `behavior_of(person)`", field="behavior"
+        )
     return _log_likelihood(model, pad_to_power_of_two(demonstrations), behavior, terms, options or SolveOptions())
 
 

@@ -231,7 +231,10 @@ def check_proper(task: Task, behavior: Behavior, actions: int, horizon: int | No
     if (endless & ~terminal.any(axis=-1)).any():
         raise ImproperTask("a task with discount 1 needs a terminal state: expected one, or a discount below 1")
     if (endless & (acting >= 0)).any():
-        raise ImproperTask("at discount 1 every action must cost something: expected rewards below 0")
+        raise ImproperTask(
+            "at discount 1 every action must cost something: expected rewards below 0, a discount below 1 (.99, say), "
+            "or for tasks of few actions `SolveOptions(horizon=…)`"
+        )
     bonus = np.log(actions) / float(behavior.beta)
     if isinstance(behavior.backup, LogSumExp) and (endless & (acting >= -bonus)).any():
         raise ImproperTask(
