@@ -17,7 +17,7 @@ from sidestep.evaluation.study import mean_log_likelihood
 from sidestep.maps.config import BehaviorConfig, MapConfig, PriorConfig
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
 from sidestep.tabular.demonstrations import Trajectory, gather
-from sidestep.tabular.grid import Grid
+from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, true_model
 from sidestep.tabular.planning import plan
 from sidestep.tabular.reward import Reward
@@ -198,6 +198,6 @@ def test_methods_begin_with_behavior_aware_modeling():
 def test_constraint_inference_on_a_map_with_known_outer_walls():
     """The corners of the outer walls lead only to themselves."""
     known = np.ones((5, 6), dtype=int)
-    known[1:-1, 1:-1] = 0
+    known[1:-1, 1:-1] = Cell.UNKNOWN
     demos = gather([Trajectory(np.array([7, 8, 9, 10]), np.array([3, 3, 3]), 0)], [reach(Grid(known), 10)])
     assert np.isfinite(constraint_inference(Grid(known), demos, MapConfig()).ranking).all()
