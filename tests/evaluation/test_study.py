@@ -17,7 +17,7 @@ TRUTH, GRID = Grid(np.zeros((1, 4), dtype=int)), Grid.unknown(rows=1, columns=4)
 
 @dataclass
 class AlwaysRight:
-    """A method's result in a corridor: a policy to the right, which the moves follow with a given log π."""
+    """A method's result in a corridor: a policy to the right, which the moves follow with a constant log π."""
 
     log_policy: float
     ranking: np.ndarray | None = None

@@ -87,10 +87,11 @@ def test_maximize_solves_a_part_of_the_states_only_at_trial_points(approximate):
 
 
 @pytest.mark.slow
-def test_maximize_with_approximations_solves_less_and_ends_at_the_same_point(problem, approximate):
+def test_maximize_with_approximations_solves_all_states_less_often_and_ends_at_the_same_point(problem, approximate):
     objective, result = approximate
     exact, expected = maximized(problem, Approximation(0.0, 0.0))
-    assert len(objective.solves) < len(exact.solves)
+    # solves of a part of the states come in addition
+    assert sum(all_states for _, all_states in objective.solves) < len(exact.solves)
     assert len(result.history) == len(expected.history)
     for one, other in zip(result.history, expected.history, strict=True):
         assert one.objective == pytest.approx(other.objective, rel=1e-5)
