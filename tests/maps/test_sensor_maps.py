@@ -74,7 +74,7 @@ def test_learn_with_a_sensor_map_keeps_it_in_unvisited_cells(office, learned):
     np.testing.assert_allclose(blocked[~WALL], expected, atol=1e-4)
     result = summary(learned)
     assert result["data"]["sensed_cells"] == 25
-    assert result["sensor"] == f"{office / 'seen.yaml'}, variance 0.5"
+    assert result["sensor"] == {"map": str(office / "seen.yaml"), "variance": 0.5}
 
 
 def test_learn_with_a_sensor_variance_file_takes_a_variance_per_cell(office, learned, tmp_path):
@@ -91,7 +91,7 @@ def test_learn_with_a_sensor_variance_file_takes_a_variance_per_cell(office, lea
     np.testing.assert_allclose(np.load(tmp_path / "out" / "blocked.npy").ravel(), expected, atol=1e-4)
     result = summary(tmp_path / "out")
     assert result["data"]["sensed_cells"] == seen.sum() == 17
-    assert result["sensor"].endswith(str(tmp_path / "variance.npy"))
+    assert result["sensor"]["variance"] == str(tmp_path / "variance.npy")
     # seen cells are drawn
     assert left_panel(tmp_path / "out").shape == left_panel(learned).shape
     assert (left_panel(tmp_path / "out") != left_panel(learned)).any()

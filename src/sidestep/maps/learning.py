@@ -71,7 +71,7 @@ class Learning:
         final, behavior = self.fit.final, self.fit.behavior.behavior_of()
         return {
             "settings": asdict(self.config),
-            "sensor": self.sensor.source if self.sensor else None,
+            "sensor": self.sensor.summary() if self.sensor else None,
             "behavior": {
                 "beta": float(behavior.beta),
                 "lapse": None if behavior.lapse is None else float(behavior.lapse),

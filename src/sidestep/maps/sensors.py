@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -19,12 +20,19 @@ class SensorMap:
     Attributes:
         probability: P(occupied), row 0 at the top; NaN where the sensors saw nothing.
         variance: The variance of each cell's logit, above 0; one number or one a cell.
-        source: Where it comes from, for the summary.
+        source: The file of the map, for the summary.
+        variance_source: The file of the variances, for the summary.
     """
 
     probability: Float[np.ndarray, "rows columns"]
     variance: float | Float[np.ndarray, "rows columns"] = 0.5
-    source: str = ""
+    source: str | None = None
+    variance_source: str | None = None
+
+    def summary(self) -> dict[str, Any]:
+        """Return the entries of `summary.json`: the file of the map, and the variance or its file."""
+        variance = float(self.variance) if isinstance(self.variance, float | int) else self.variance_source
+        return {"map": self.source, "variance": variance}
 
 
 def read_sensor(map_file: str | Path, grid: Grid, variance: float | str | Path = 0.5) -> SensorMap:
@@ -38,8 +46,10 @@ def read_sensor(map_file: str | Path, grid: Grid, variance: float | str | Path =
     Raises:
         InputError: For files that do not fit the grid.
     """
-    certainty = float(variance) if isinstance(variance, float | int) else read_sensor_variance(variance, grid)
-    return SensorMap(read_sensor_map(map_file, grid), certainty, source=f"{map_file}, variance {variance}")
+    probability = read_sensor_map(map_file, grid)
+    if isinstance(variance, float | int):
+        return SensorMap(probability, float(variance), str(map_file))
+    return SensorMap(probability, read_sensor_variance(variance, grid), str(map_file), str(variance))
 
 
 def seen_cells(sensor: SensorMap | None, grid: Grid) -> Float[np.ndarray, "rows columns"]:
