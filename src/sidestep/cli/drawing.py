@@ -47,7 +47,8 @@ def draw(name: str, path: Path, *arguments: Any) -> None:
 
 @cache
 def _worker() -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "sidestep.plotting.worker"]
+    # -P: the present folder may hold a file with the name of a module
+    command = [sys.executable, "-P", "-m", "sidestep.plotting.worker"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     return subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment
