@@ -4,7 +4,8 @@ JAX keeps compiled code (`_cache.keep_compiled_code`), but a new process has to 
 look its code up. For a fit of a small map the trace takes longer than the fit. `keep_trace` stores the traced program
 (`jax.export`); `python -m benchmarks startup` shows the time of whole processes.
 
-An entry belongs to the files of this package, to a version of JAX, and to the types of all arguments. A function that
+An entry belongs to the files of this package, to the versions of JAX and of the libraries whose functions are traced,
+and to the types of all arguments. A function that
 calls back into Python cannot be stored; it is traced anew. A damaged entry is replaced.
 """
 
@@ -20,6 +21,7 @@ from sidestep._files import read_whole, write_whole
 from sidestep.errors import InputError
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
+_TRACED_LIBRARIES = ("jax", "equinox", "optax", "numpy")
 _DIGEST = 32
 """The bytes of a SHA-256 digest, which an entry begins with."""
 
@@ -119,10 +121,13 @@ def _store(path: Path, entry: Any) -> None:
 
 @cache
 def _package() -> str:
-    """Return the versions that an entry belongs to: of JAX, its settings, and the files of this package."""
+    """Return what every entry belongs to: versions of libraries, settings of JAX, and the files of this package."""
+    from importlib import metadata
+
     import jax
 
     files = sorted(Path(__file__).parent.rglob("*.py"))
     stats = [(str(file), stat.st_size, stat.st_mtime_ns) for file in files for stat in [file.stat()]]
     settings = jax.config.read("jax_enable_x64"), jax.default_backend(), jax.device_count()
-    return f"{jax.__version__} {settings} {hashlib.sha256(str(stats).encode()).hexdigest()}"
+    versions = [metadata.version(name) for name in _TRACED_LIBRARIES]
+    return f"{versions} {settings} {hashlib.sha256(str(stats).encode()).hexdigest()}"
