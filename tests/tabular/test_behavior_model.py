@@ -161,7 +161,7 @@ def test_behavior_model_of_wrong_arguments_raises():
         behavior_model(behavior, features=np.zeros((3, 1, 1)), reward_weights=np.full(1, np.inf))
     with pytest.raises(InputError, match=r"'aimed_at': expected states 0…29"):
         behavior_model(behavior, aimed_at=np.full((30, 4), 30))
-    with pytest.raises(InputError, match=r"'lapse': expected a share"):
+    with pytest.raises(InputError, match=r"'lapse': expected a probability"):
         Behavior(LogSumExp(), 5.0, lapse=1.0)
     with pytest.raises(InputError, match=r"'tempering': expected a number above 0"):
         fit(OPEN, walks(Behavior(BoltzmannAverage(), 20.0), 2), behavior, tempering=0.0)

@@ -219,7 +219,7 @@ class Behavior(eqx.Module):
         if not isinstance(self.beta, Tracer) and not 0 < float(self.beta) < np.inf:
             raise InputError(f"expected a finite number above 0, found {beta}", field="beta")
         if self.lapse is not None and not isinstance(self.lapse, Tracer) and not 0 <= float(self.lapse) < 1:
-            raise InputError(f"expected a share, at least 0 and below 1, found {lapse}", field="lapse")
+            raise InputError(f"expected a probability, at least 0 and below 1, found {lapse}", field="lapse")
 
     def log_policy(self, q: ActionValues) -> ActionValues:
         """Return log π(a | s) from action values.

@@ -238,7 +238,7 @@ def check_proper(task: Task, behavior: Behavior, actions: int, horizon: int | No
     bonus = np.log(actions) / float(behavior.beta)
     if isinstance(behavior.backup, LogSumExp) and (endless & (acting >= -bonus)).any():
         raise ImproperTask(
-            f"at discount 1 a log-sum-exp walker with β = {float(behavior.beta):g} and {actions} actions gains "
+            f"at discount 1 a log-sum-exp agent with β = {float(behavior.beta):g} and {actions} actions gains "
             f"log(actions)/β = {bonus:.4g} with every action and never wants to arrive: expected a step cost "
             "above that, a larger β, a discount below 1 or another backup"
         )

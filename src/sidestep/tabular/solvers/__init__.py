@@ -1,1 +1,1 @@
-"""Solvers of the Bellman equation and of its adjoint; `process` holds the mathematics that they share."""
+"""Solvers of the Bellman equation and of its adjoint; `base` holds the mathematics that they share."""
