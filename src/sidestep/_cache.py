@@ -6,6 +6,7 @@ user's caches.
 
 import os
 import warnings
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,7 @@ def keep_compiled_code() -> None:
     jax.config.update("jax_compilation_cache_dir", str(folder / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    show = warnings.showwarning
+    show = getattr(warnings.showwarning, "shows_by", warnings.showwarning)
 
     def remove_damaged(message: Warning | str, *arguments: Any, **options: Any) -> None:
         text = str(message)
@@ -63,6 +64,8 @@ def keep_compiled_code() -> None:
             return
         name = text.removeprefix(_UNREADABLE).partition("'")[0]
         for entry in (folder / "jax").glob(f"{name}-*"):
-            entry.unlink(missing_ok=True)
+            with suppress(OSError):
+                entry.unlink()
 
+    remove_damaged.shows_by = show  # pyright: ignore[reportFunctionMemberAccess]
     warnings.showwarning = remove_damaged

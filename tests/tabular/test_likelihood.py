@@ -8,10 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.errors import InputError
 from sidestep.inference.calibration import score_statistics
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax
-from sidestep.tabular.behavior_model import behavior_model
 from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Grid
@@ -172,10 +170,3 @@ def test_likelihoods_of_persons_with_any_number_of_moves_compile_once():
     assert first
     assert not again
     np.testing.assert_array_equal(likelihood, expected)
-
-
-def test_log_likelihood_of_a_behavior_model_is_refused_with_advice():
-    grid = Grid.unknown(1, 3)
-    behavior = behavior_model(Behavior(BoltzmannAverage(), 5.0), ["beta"])
-    with pytest.raises(InputError, match=r"behavior_of\(person\)"):
-        log_likelihood(ObstacleGrid(grid), gather([WALK], [reach(grid, 2)]), behavior)  # pyright: ignore[reportArgumentType]

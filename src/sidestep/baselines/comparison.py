@@ -103,6 +103,7 @@ def compare_methods(
     Raises:
         InputError: For a fraction that leaves no walk to learn from, or none to score though it is above 0; and as
             `learn_map` does.
+        ImproperTask, NotConverged: Where the selection of the behavior fails.
     """
     walks, config = sample_walks(walks, config), replace(config, max_walks=None)
     train, test = _split(walks, hold_out, config.seed)
@@ -112,6 +113,8 @@ def compare_methods(
     try:
         learned = learn_map(grid, train, config, sensor=sensor, annotations=annotations, **options)
     except (ImproperTask, NotConverged) as error:
+        if config.behavior.select:
+            raise  # the baselines need the selected behavior too
         failure = str(error)
     learning = learned.learning if learned else None
     moves = learning.goals.moves if learning and learning.goals else grid_walks(train, grid)
@@ -150,8 +153,13 @@ def _result_of(learned: LearnedMap, demonstrations: Demonstrations) -> ModelResu
     learning = learned.learning
     assert learning is not None
     result = model_result(learned.model, demonstrations, learning.config)
-    behavior = learning.fit.behavior.behavior_of()
-    return result._replace(behavior=behavior, converged=learning.fit.converged, planner=learned.robot())
+    agents = learning.fit.behavior
+    logit, reward = agents.parameters.logit_discount, learning.config.reward
+    if logit is not None:
+        reward = replace(reward, discount=float(1 / (1 + np.exp(-np.asarray(logit)))))
+    return result._replace(
+        behavior=agents.behavior_of(), reward=reward, converged=learning.fit.converged, planner=learned.robot()
+    )
 
 
 def _with_probable_goals(moves: Moves, learned: LearnedMap | None) -> Moves:

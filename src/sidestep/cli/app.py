@@ -2,6 +2,7 @@
 
 import os
 import sys
+import traceback
 from collections.abc import Callable
 from functools import wraps
 from typing import Annotated, Any
@@ -104,7 +105,7 @@ def main(arguments: list[str] | None = None) -> int:
     except Exception as error:
         # a defect of the program: one line, and the details on request
         if os.environ.get("SIDESTEP_DEBUG"):
-            raise
+            traceback.print_exc()
         message = (
             f"error: sidestep failed ({type(error).__name__}: {error}); set SIDESTEP_DEBUG=1 for details to report"
         )

@@ -45,7 +45,7 @@ def learn(walks: Walks, map_file: MapFile, out: Folder, options: LearnOptions) -
     print_notes(*(f"note: {note}" for note in learning.notes))
     print_lines(f"objective {final.objective:.4f} after {final.iteration} iterations; {learning.fit.message}")
     if not learned.converged:
-        print_notes("warning: the fit has not converged; more --max-iterations may help")
+        print_notes(f"warning: the fit has not converged: {learning.fit.status.advice or learning.fit.message}")
     print_lines(f"learned map in {out}")
 
 
