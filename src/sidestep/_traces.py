@@ -4,8 +4,9 @@ JAX keeps compiled code (`_cache.keep_compiled_code`), but a new process has to 
 look its code up. For a fit of a small map the trace takes longer than the fit. `keep_trace` stores the traced program
 (`jax.export`); `python -m benchmarks startup` shows the time of whole processes.
 
-An entry belongs to the files of this package, to the versions of JAX and of the other traced libraries, and to the types
-of all arguments. A function that calls back into Python cannot be stored; it is traced anew. A damaged entry is replaced.
+An entry belongs to the files of this package, to the versions of JAX and of the other traced libraries, and to the
+types of all arguments. A function that calls back into Python cannot be stored; it is traced anew. A damaged entry is
+replaced.
 """
 
 import hashlib
