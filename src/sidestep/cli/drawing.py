@@ -1,8 +1,7 @@
 """Pictures by a second process, which loads matplotlib while the first one computes.
 
-matplotlib takes as long to load as JAX. In a process of its own it saves a quarter of the time of a short command
-(`python -m benchmarks startup`). A process that has loaded matplotlib already draws by itself, and so does the first
-one if the second fails.
+matplotlib takes nearly as long to load as JAX, and both can load at once on two cores. A process that has loaded
+matplotlib already draws by itself, and so does the first one if the second fails.
 """
 
 import os
