@@ -25,7 +25,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep._traces import keep_trace
+from sidestep._programs import keep_program
 from sidestep._typing import Tree
 from sidestep.errors import InputError
 from sidestep.inference.batching import Batch, BatchPlan, make_batches, plan_batches
@@ -281,7 +281,7 @@ def tasks_mesh(devices: Sequence[Any] | None = None) -> Mesh:
     return Mesh(np.asarray(jax.devices() if devices is None else devices), (AXIS,))
 
 
-@keep_trace
+@keep_program
 def _transitions_and_prior(
     prior: Prior, model: TransitionModel, behavior: BehaviorModel, arrivals: Arrivals | None, parameters: Parameters
 ) -> tuple[Tree, tuple[Array, Array]]:
@@ -298,7 +298,7 @@ def _transitions_and_prior(
     return jax.grad(loss, has_aux=True)(parameters)
 
 
-@keep_trace
+@keep_program
 def _batch_result(
     problem: Problem, parameters: Parameters, batch: Batch, starts: WarmStart, all_states: Bool[Array | np.ndarray, ""]
 ) -> BatchResult:

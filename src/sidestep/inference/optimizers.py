@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sidestep._traces import keep_trace
+from sidestep._programs import keep_program
 from sidestep._typing import Tree
 
 Vector = Float[np.ndarray, " parameters"]
@@ -254,7 +254,7 @@ class _Trial(NamedTuple):
         return bool(self.value < value and self.overshoot.sum() <= _MAX_OVERSHOOT * predicted.sum())
 
 
-@keep_trace
+@keep_program
 def _lbfgs_direction(
     memory_size: int,
     gradient: Float[Array | np.ndarray, " parameters"],

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from sidestep._traces import keep_trace
+from sidestep._programs import keep_program
 from sidestep.errors import InputError, NotConverged
 from sidestep.tabular.backups import Behavior, HardMax
 from sidestep.tabular.models import TransitionModel
@@ -109,7 +109,7 @@ def plan(
     return made
 
 
-@keep_trace
+@keep_program
 def _plan(model: TransitionModel, task: Task, behavior: Behavior, optimal: bool, options: SolveOptions) -> Plan:
     solution = solve(model, task, behavior, options=options)
     q = solution.action_values

@@ -1,4 +1,4 @@
-"""Traced programs are kept from process to process."""
+"""Compiled programs are kept from process to process."""
 
 import os
 import subprocess
@@ -10,18 +10,18 @@ PROGRAM = """
 import jax, jax.numpy as jnp, numpy as np
 from typing import NamedTuple
 from sidestep._cache import keep_compiled_code
-from sidestep._traces import keep_trace
+from sidestep._programs import keep_program
 
 class Result(NamedTuple):
     total: jax.Array
     parts: dict
 
-@keep_trace
+@keep_program
 def scaled(values, factor, name):
     print("traces", name)
     return Result(factor * values.sum(), {name: factor * values})
 
-@keep_trace
+@keep_program
 def calls_back(values):
     print("traces the callback")
     return jax.pure_callback(np.sin, jax.ShapeDtypeStruct(values.shape, values.dtype), values)
@@ -50,7 +50,7 @@ def run(tmp_path):
     return run
 
 
-def test_keep_trace_in_a_second_process_traces_nothing_but_callbacks(run, tmp_path):
+def test_keep_program_in_a_second_process_traces_nothing_but_callbacks(run, tmp_path):
     numbers, traced = run()
     assert numbers == NUMBERS
     assert traced.count("traces a") == 2  # three and four numbers
@@ -58,12 +58,12 @@ def test_keep_trace_in_a_second_process_traces_nothing_but_callbacks(run, tmp_pa
     assert numbers == NUMBERS
     # a gradient is traced as a whole
     assert set(traced) == {"traces the callback", "traces b"}
-    assert len(list((tmp_path / "cache" / "traces").iterdir())) == 3
+    assert len(list((tmp_path / "cache" / "programs").iterdir())) == 2
 
 
-def test_keep_trace_with_damaged_entries_replaces_them(run, tmp_path):
+def test_keep_program_with_damaged_entries_replaces_them(run, tmp_path):
     run()
-    for entry in (tmp_path / "cache" / "traces").iterdir():
+    for entry in (tmp_path / "cache" / "programs").iterdir():
         entry.write_bytes(entry.read_bytes()[:-1] + b"?")
     numbers, traced = run()
     assert numbers == NUMBERS
@@ -79,6 +79,6 @@ metadata.version = lambda name: version(name) + "+" * (name == "optax")
 """
 
 
-def test_keep_trace_with_another_version_of_a_library_traces_anew(run):
+def test_keep_program_with_another_version_of_a_library_traces_anew(run):
     run()
     assert run(ANOTHER_OPTAX)[1].count("traces a") == 2

@@ -1,0 +1,130 @@
+"""Compiled programs that are kept from process to process.
+
+JAX keeps compiled code (`_cache.keep_compiled_code`), but a new process has to trace a function in Python and lower it
+before it can look its code up. For a fit of a small map that takes longer than the fit. `keep_program` stores the whole
+executable (`jax.experimental.serialize_executable`); `python -m benchmarks startup` shows the time of whole processes.
+
+An entry belongs to the files of this package, to the versions of JAX and of the other traced libraries, and to the
+types of all arguments. A function that calls back into Python cannot be stored; where there are several devices, nothing
+is. An entry that is damaged, or that XLA refuses because it was made for another kind of processor, is replaced.
+"""
+
+import hashlib
+import os
+import pickle
+from collections.abc import Callable
+from contextlib import suppress
+from functools import cache, wraps
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+from sidestep import _cache
+from sidestep._files import read_whole, write_whole
+from sidestep.errors import InputError
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+_Program = tuple[Callable[..., Any], Any]
+"""A function of arrays that returns a tuple of arrays, and the structure of the result."""
+_TRACED_LIBRARIES = ("jax", "jaxlib", "equinox", "optax", "numpy")
+_DIGEST = 32
+"""The bytes of a SHA-256 digest, which an entry begins with."""
+
+
+def keep_program(function: _Function) -> _Function:
+    """Compile a function as `eqx.filter_jit` does, and keep the program where compiled code is kept.
+
+    The function takes positional arguments only.
+    """
+    import equinox as eqx
+
+    compiled = eqx.filter_jit(function)
+    programs: dict[str, _Program] = {}
+
+    @wraps(function)
+    def run(*arguments: Any) -> Any:
+        import jax
+
+        folder = _cache.kept_in()
+        if folder is None or jax.device_count() > 1:
+            return compiled(*arguments)
+        import numpy as np
+        from jax.core import Tracer
+
+        dynamic, static = eqx.partition(arguments, lambda leaf: eqx.is_array(leaf) or isinstance(leaf, np.ndarray))
+        leaves, structure = jax.tree.flatten(dynamic)
+        others = f"{structure} {jax.tree.flatten(static)}"
+        if any(isinstance(leaf, Tracer) for leaf in leaves) or " at 0x" in others:
+            return compiled(*arguments)
+        types = [(leaf.shape, str(leaf.dtype), bool(getattr(leaf, "weak_type", False))) for leaf in leaves]
+        key = hashlib.sha256(f"{_package()} {function.__qualname__} {others} {types}".encode()).hexdigest()
+        if key not in programs:
+            path = folder / "programs" / f"{function.__qualname__}-{key}"
+            programs[key] = _load(path) or _compile(path, function, leaves, structure, static)
+        call, result = programs[key]
+        return jax.tree.unflatten(result, call(*leaves))
+
+    return cast(_Function, run)
+
+
+def _load(path: Path) -> _Program | None:
+    """Return the program of an entry; None if it is missing, damaged or made for another kind of processor."""
+    if not path.exists():
+        return None
+    import jax
+    from jax.errors import JaxRuntimeError
+    from jax.experimental.serialize_executable import deserialize_and_load
+
+    try:
+        content = read_whole(path)
+        if hashlib.sha256(content[_DIGEST:]).digest() != content[:_DIGEST]:
+            return None
+        program, skeleton = pickle.loads(content[_DIGEST:])
+        return deserialize_and_load(*program), jax.tree.structure(skeleton)
+    except (InputError, JaxRuntimeError, ValueError, AttributeError, ImportError, pickle.UnpicklingError):
+        return None
+
+
+def _compile(path: Path, function: Callable[..., Any], leaves: list[Any], structure: Any, static: Any) -> _Program:
+    """Compile a function, and store the program if it does not call back into Python."""
+    import equinox as eqx
+    import jax
+    from jax.experimental.serialize_executable import serialize
+
+    result = None
+
+    def program_of_sidestep(*leaves: Any) -> tuple[Any, ...]:
+        nonlocal result
+        outputs, result = jax.tree.flatten(function(*eqx.combine(jax.tree.unflatten(structure, leaves), static)))
+        return tuple(outputs)
+
+    # an executable that comes from JAX's own cache cannot be stored again; so JAX must not keep this one
+    written_after = jax.config.jax_persistent_cache_min_compile_time_secs
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", float("inf"))
+    try:
+        program = jax.jit(program_of_sidestep).lower(*leaves).compile()
+    finally:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", written_after)
+    assert result is not None
+    skeleton = jax.tree.unflatten(result, range(result.num_leaves))
+    try:
+        content = pickle.dumps((serialize(program), skeleton))
+    except (AttributeError, NotImplementedError, TypeError, ValueError, pickle.PicklingError):
+        return program, result
+    # a folder that cannot be written is no reason to stop
+    with suppress(InputError):
+        write_whole(path, lambda file: file.write(hashlib.sha256(content).digest() + content))
+    return program, result
+
+
+@cache
+def _package() -> str:
+    """Return what every entry belongs to: versions of libraries, settings of JAX, and the files of this package."""
+    from importlib import metadata
+
+    import jax
+
+    files = sorted(Path(__file__).parent.rglob("*.py"))
+    stats = [(str(file), stat.st_size, stat.st_mtime_ns) for file in files for stat in [file.stat()]]
+    settings = jax.config.read("jax_enable_x64"), jax.default_backend(), jax.device_count(), os.environ.get("XLA_FLAGS")
+    versions = [metadata.version(name) for name in _TRACED_LIBRARIES]
+    return f"{versions} {settings} {hashlib.sha256(str(stats).encode()).hexdigest()}"
