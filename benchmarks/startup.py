@@ -28,8 +28,13 @@ from sidestep.tabular.grid import Grid
 UNIT = "import jax; jax.jit(lambda x: x + x)(1.0)"
 ASKED = {"help": 0.3, "plan": 1.6, "learn": 2.6, "evaluate": 2.6, "first-learn": 5.0}
 """The most units that each process may take."""
-CACHES = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "JAX_ENABLE_COMPILATION_CACHE")
-"""Variables that would help a process of JAX's, and are taken out of the environment."""
+CACHES = (
+    "JAX_COMPILATION_CACHE_DIR",
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS",
+    "JAX_ENABLE_COMPILATION_CACHE",
+    "PYTHONDONTWRITEBYTECODE",
+)
+"""Variables that change what processes keep; they are taken out of the environment."""
 PLAN = [(0.5, 0.5), (8.5, 8.5)]
 
 

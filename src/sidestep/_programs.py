@@ -39,7 +39,7 @@ def keep_program(function: _Function) -> _Function:
     import equinox as eqx
 
     compiled = eqx.filter_jit(function)
-    programs: dict[str, _Program] = {}
+    programs: dict[Any, _Program] = {}
 
     @wraps(function)
     def run(*arguments: Any) -> Any:
@@ -53,13 +53,16 @@ def keep_program(function: _Function) -> _Function:
 
         dynamic, static = eqx.partition(arguments, lambda leaf: eqx.is_array(leaf) or isinstance(leaf, np.ndarray))
         leaves, structure = jax.tree.flatten(dynamic)
-        others = f"{structure} {jax.tree.flatten(static)}"
-        if any(isinstance(leaf, Tracer) for leaf in leaves) or " at 0x" in others:
+        if any(isinstance(leaf, Tracer) for leaf in leaves):
             return compiled(*arguments)
-        types = [(leaf.shape, str(leaf.dtype), bool(getattr(leaf, "weak_type", False))) for leaf in leaves]
-        key = hashlib.sha256(f"{_package()} {function.__qualname__} {others} {types}".encode()).hexdigest()
+        others, static_structure = jax.tree.flatten(static)
+        types = tuple((leaf.shape, leaf.dtype, bool(getattr(leaf, "weak_type", False))) for leaf in leaves)
+        key = structure, tuple(others), static_structure, types
         if key not in programs:
-            path = folder / "programs" / f"{function.__qualname__}-{key}"
+            text = f"{_package()} {function.__qualname__} {key}"
+            if " at 0x" in text:  # an address is another one in every process
+                return compiled(*arguments)
+            path = folder / "programs" / f"{function.__qualname__}-{hashlib.sha256(text.encode()).hexdigest()}"
             programs[key] = _load(path) or _compile(path, function, leaves, structure, static)
         call, result = programs[key]
         return jax.tree.unflatten(result, call(*leaves))

@@ -114,7 +114,8 @@ class LBFGS(Optimizer):
 
     def step(self, loss: Loss, x: Vector, value: float, gradient: Vector, state: Tree) -> tuple[Vector, Tree] | None:
         """Return the best point along the L-BFGS direction, or None if no point is better than x."""
-        for memory in (state, self.init(x)):
+        for restart in (False, True):
+            memory = self.init(x) if restart else state
             direction, updated = _lbfgs_direction(self.memory_size, gradient, memory, x)
             best = _line_search(-np.asarray(direction, dtype=x.dtype), loss, x, value, gradient)
             if best is not None:

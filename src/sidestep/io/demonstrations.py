@@ -8,7 +8,7 @@ from sidestep.io.gridding import Moves, grid_walks
 from sidestep.io.walks import Walks
 from sidestep.tabular.demonstrations import Demonstrations, gather
 from sidestep.tabular.graph import walkable_graph
-from sidestep.tabular.grid import Grid
+from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.tasks import reach
 
 
@@ -66,6 +66,8 @@ def demonstrations_from_moves(
 
 def connected_regions(grid: Grid) -> Int[np.ndarray, " states"]:
     """Return the number of the region of each state; walks are possible within a region, around known obstacles."""
+    if not (grid.known == Cell.OCCUPIED).any():
+        return np.zeros(grid.size, dtype=np.int64)
     from scipy.sparse.csgraph import connected_components
 
     return connected_components(walkable_graph(grid.passable()), directed=False)[1]

@@ -17,6 +17,7 @@ from sidestep.inference.maximize import Progress
 from sidestep.inference.optimizers import LBFGS, Adam, Optimizer, Rprop
 from sidestep.inference.priors import FreeCellEvidence, Normal, Prior, WallPrior
 from sidestep.maps.config import BehaviorConfig, FitConfig, MapConfig, PriorConfig, Terms
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import BACKUPS, Behavior
 from sidestep.tabular.behavior_model import BehaviorModel, behavior_model
 from sidestep.tabular.demonstrations import Demonstrations
@@ -88,7 +89,7 @@ def fit_map(
     weights = np.asarray(demonstrations.weights)
     prior = _prior(config.prior, model, cell_prior)
     if config.fit.terms != "actions":
-        prior = FreeCellEvidence(prior, jnp.asarray(_first_cells(model, demonstrations, weights)))
+        prior = FreeCellEvidence(prior, to_jax(_first_cells(model, demonstrations, weights)))
     optimizer = optimizer_for(config.fit, model.graph.states, round(float(weights.sum())))
     if initialize and config.fit.terms == "both":
         model = fit(model, demonstrations, behavior, prior=prior, terms=("transitions",)).model

@@ -1,6 +1,7 @@
 """NumPy arrays as JAX arrays, without a compilation."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Shaped
 
@@ -9,7 +10,9 @@ def to_jax(array: Shaped[ArrayLike, "..."], dtype: type | np.dtype | None = None
     """Return a NumPy array as a JAX array; unlike `jnp.asarray`, this compiles nothing, whatever the shape.
 
     Args:
-        array: anything that NumPy makes an array of; do not change it afterwards, memory may be shared.
+        array: anything that NumPy makes an array of, or a JAX array; do not change it afterwards, memory may be shared.
         dtype: the type of its numbers, by default that of `array` (32-bit unless `jax_enable_x64` is set).
     """
+    if isinstance(array, jax.Array):
+        return jnp.asarray(array, dtype)
     return jax.device_put(np.asarray(array, dtype))

@@ -25,6 +25,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Scalar
 
 from sidestep.errors import InputError
+from sidestep.tabular.arrays import to_jax
 
 Gradient = Literal["exact", "fixed_policy"]
 """The derivative of a backup: its own, or that of the average under the policy held fixed (eqs. 9 and 10)."""
@@ -214,8 +215,8 @@ class Behavior(eqx.Module):
         self, backup: Backup, beta: float | Float[Array, ""] = 10.0, lapse: float | Float[Array, ""] | None = None
     ):
         self.backup = backup
-        self.beta = jnp.asarray(beta, dtype=jnp.result_type(float))
-        self.lapse = None if lapse is None else jnp.asarray(lapse, dtype=jnp.result_type(float))
+        self.beta = to_jax(beta, jnp.result_type(float))
+        self.lapse = None if lapse is None else to_jax(lapse, jnp.result_type(float))
         if not isinstance(self.beta, Tracer) and not 0 < float(self.beta) < np.inf:
             raise InputError(f"expected a finite number above 0, found {beta}", field="beta")
         if self.lapse is not None and not isinstance(self.lapse, Tracer) and not 0 <= float(self.lapse) < 1:

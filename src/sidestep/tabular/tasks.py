@@ -153,7 +153,7 @@ def _task(
     terminal: Bool[np.ndarray, " states"],
     discount: float,
 ) -> Task:
-    gamma = jnp.asarray(discount, jnp.result_type(float))
+    gamma = to_jax(discount, jnp.result_type(float))
     return Task(to_jax(reward), to_jax(terminal_reward), to_jax(terminal), gamma)
 
 

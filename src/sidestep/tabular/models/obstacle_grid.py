@@ -10,7 +10,6 @@ are learned. In a **walled grid** it is the border between two cells that may be
 """
 
 from collections.abc import Callable
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -18,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sidestep._programs import keep_program
 from sidestep._typing import FloatTree
 from sidestep.errors import InputError
 from sidestep.tabular.arrays import to_jax
@@ -175,14 +175,14 @@ def walled_grid(grid: Grid, logits: Float[Array | np.ndarray, " borders"] | floa
     return TiedModel(graph, index, logit_array(logits, (len(between),)))
 
 
-@jax.jit
+@keep_program
 def blocked_of(logits: Float[Array, " cells"], known: Int[Array, "rows columns"]) -> Float[Array, "rows columns"]:
     """Return P(blocked), exactly 0 or 1 for known cells."""
     learned = jax.nn.sigmoid(logits).reshape(known.shape)
     return jnp.where(known == Cell.UNKNOWN, learned, (known == Cell.OCCUPIED).astype(learned.dtype))
 
 
-@partial(jax.jit, static_argnames="actions")
+@keep_program
 def chances_of_moves(
     logits: Float[Array, " cells"], known: Int[Array, "rows columns"], actions: int
 ) -> Float[Array, "states actions outcomes"]:

@@ -20,8 +20,10 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Backup, Gradient
 from sidestep.tabular.solvers import base
 
@@ -60,9 +62,8 @@ class Jacobi(base.Solver):
 
     def cold_start(self, states: int, dtype: jnp.dtype) -> base.WarmStart:
         """Return a start without values and adjoint; an order is not used."""
-        return base.WarmStart(
-            jnp.full(states, base.neg_inf(dtype), dtype), jnp.zeros(states, dtype), jnp.zeros(0, jnp.int32)
-        )
+        values, adjoint = np.full(states, base.neg_inf(dtype), dtype), np.zeros(states, dtype)
+        return base.WarmStart(to_jax(values), to_jax(adjoint), to_jax(np.zeros(0, np.int32)))
 
     def values(self, equation: base.BellmanEquation, start: base.WarmStart, region: base.Region) -> base.SolveResult:
         """Return V of the fixed point, of all states whatever the region."""
