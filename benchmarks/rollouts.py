@@ -85,12 +85,10 @@ def measure(options: Options) -> Iterator[Record]:
 
 
 class Case(NamedTuple):
-    """A fit: its dynamics, demonstrations, agents, policy, planner, moves in a batch and estimator."""
+    """A fit: its agent, demonstrations, planner, moves in a batch and estimator."""
 
-    dynamics: ct.Dynamics
+    agent: ct.Agent[ct.FinitePolicy]
     demonstrations: Demonstrations
-    behavior: Behavior
-    policy: ct.FinitePolicy
     planner: ct.Planner
     moves: int
     estimator: Estimator
@@ -99,10 +97,8 @@ class Case(NamedTuple):
 class Batch(eqx.Module):
     """What one update looks at."""
 
-    tasks: ct.ContinuousTask
-    states: Array
+    starts: ct.Starts
     chosen: Array
-    choices: Array
     weights: Array
 
 
@@ -112,9 +108,8 @@ def case_of(name: str) -> Case:
     random, config = np.random.default_rng(0), RoomConfig() if world == "room" else PendulumConfig()
     if isinstance(config, RoomConfig):
         rooms = room(config.lattice_points)
-        known, tasks, actions = rooms.dynamics, rooms.tasks, rooms.actions
-        begins = random_starts(rooms, WALKERS, random)
-        dynamics = ct.ObstacleMotion(config.radial_field(rooms), known.low, known.high, known.noise)
+        tasks, actions, begins = rooms.tasks, rooms.actions, random_starts(rooms, WALKERS, random)
+        dynamics = rooms.with_field(config.radial_field(rooms))
     else:
         dynamics, tasks, actions = ct.Pendulum(noise=config.noise), config.tasks, config.actions
         begins = [np.array([goal, 0.0]) + random.uniform(-1, 1, (WALKERS, 2)) for goal in config.goals]
@@ -127,7 +122,7 @@ def case_of(name: str) -> Case:
     ]
     by: Estimator = "pathwise" if estimator == "pathwise" else "score"
     demonstrations, moves = ct.gather_trajectories(trajectories, tasks), config.schedule.batch_size
-    return Case(dynamics, demonstrations, config.behavior, policy, config.planner, moves, by)
+    return Case(ct.Agent(dynamics, policy, config.behavior), demonstrations, config.planner, moves, by)
 
 
 def speed(name: str, options: Options) -> Record:
@@ -138,8 +133,8 @@ def speed(name: str, options: Options) -> Record:
     tasks, states = ct.task_at(demos.tasks, demos.task[drawn]), demos.states[drawn]
     note(f"{name}: compiling")
     planning, _ = _fitted(case, options.iterations)
-    choices, weights = planner.candidate_actions(key, case.policy, tasks, states)
-    batch = Batch(tasks, states, demos.actions[drawn], choices, weights)
+    choices, weights = planner.candidate_actions(key, case.agent.policy, tasks, states)
+    batch = Batch(ct.Starts(tasks, states, choices), demos.actions[drawn], weights)
     rolled = _roll(case, batch, key)
 
     def timed(function: Callable, *inputs: object) -> Callable[[], float]:
@@ -172,10 +167,10 @@ def _fitted(case: Case, iterations: int) -> tuple[ct.PlannerState[ct.FinitePolic
     """Return what a fit knows in the end, and the median time between reports (the first comes after compiling)."""
     reported: list[float] = []
     result = ct.fit_dynamics(
-        case.dynamics,
+        case.agent.dynamics,
         case.demonstrations,
-        case.behavior,
-        case.policy,
+        case.agent.behavior,
+        case.agent.policy,
         case.planner,
         estimator=case.estimator,
         schedule=ct.Schedule(iterations=1 + iterations, policy_warmup=0, batch_size=case.moves),
@@ -186,45 +181,44 @@ def _fitted(case: Case, iterations: int) -> tuple[ct.PlannerState[ct.FinitePolic
 
 @eqx.filter_jit
 def _roll(case: Case, batch: Batch, key: PRNGKeyArray) -> ct.Rollout:
-    inputs = (case.dynamics, case.policy, batch.tasks, case.behavior, key, batch.states)
-    return ct.sample_rollouts(*inputs, case.planner.horizon, batch.choices, case.planner.samples)
+    return ct.sample_rollouts(case.agent, batch.starts, key, case.planner.horizon, case.planner.samples)
 
 
 @eqx.filter_jit
 def _model_gradient(case: Case, planning: ct.PlannerState[ct.FinitePolicy], batch: Batch, key: PRNGKeyArray) -> PyTree:
     """Return ∇ of the actions' log-likelihood, with the roll-outs that it takes."""
-    behavior, planner = case.behavior, case.planner
+    agent, planner = replace(case.agent, policy=planning.policy), case.planner
+    behavior = agent.behavior
 
     def weigh(q: Array) -> Array:
         return behavior.beta * (jax.nn.one_hot(batch.chosen, q.shape[1]) - jnp.exp(behavior.log_policy(q)))
 
-    inputs = (case.dynamics, planning.policy, batch.tasks, behavior, key, batch.states, batch.choices, weigh)
     keywords = {"critic": planning.critic, "estimator": case.estimator}
-    return ct.value_gradient(*inputs, horizon=planner.horizon, samples=planner.samples, **keywords)[0]
+    size = {"horizon": planner.horizon, "samples": planner.samples}
+    return ct.value_gradient(agent, batch.starts, key, weigh, **size, **keywords)[0]
 
 
 @eqx.filter_jit
 def _policy_step(case: Case, planning: ct.PlannerState, batch: Batch, rolled: ct.Rollout) -> PyTree:
     """Return the policy after a step; the compiler leaves out the critic's."""
-    return case.planner.update(planning, case.behavior, rolled, batch.weights)[0].policy
+    return case.planner.update(planning, case.agent.behavior, rolled, batch.weights)[0].policy
 
 
 @eqx.filter_jit
 def _critic_step(case: Case, planning: ct.PlannerState, batch: Batch, rolled: ct.Rollout) -> ct.Critic:
     """Return the critic after a step; the compiler leaves out the policy's."""
-    return case.planner.update(planning, case.behavior, rolled, batch.weights)[0].critic
+    return case.planner.update(planning, case.agent.behavior, rolled, batch.weights)[0].critic
 
 
 # ---------------------------------------------------------------------------------------------------- noise
 
 
 class Problem(eqx.Module):
-    """Dynamics with a gradient to estimate, a task in them, states where roll-outs may start, and a policy."""
+    """An agent in dynamics with a gradient to estimate, a task, and states where roll-outs may start."""
 
-    dynamics: ct.Dynamics
+    agent: ct.Agent
     task: ct.ContinuousTask
     states: Array
-    policy: ct.Policy
 
 
 class Noise(NamedTuple):
@@ -261,19 +255,21 @@ def problem_of(name: str) -> Problem:
         task = ct.QuadraticTask(jnp.zeros(2), jnp.eye(2), 0.1 * jnp.eye(1), discount)
         states = jnp.asarray(random.uniform(-1, 1, (STARTS, 2)))
         examples = jax.vmap(task.features)(states)
-        return Problem(dynamics, task, states, ct.gaussian_policy(jax.random.key(1), 1, examples, spread=0.5, depth=0))
+        policy = ct.gaussian_policy(jax.random.key(1), 1, examples, spread=0.5, depth=0)
+        return Problem(ct.Agent(dynamics, policy, AGENTS), task, states)
     angle = np.pi if place == "hanging" else 0.0
     task = ct.PendulumTask(jnp.asarray(angle), discount)
     states = jnp.asarray(np.array([angle, 0.0]) + random.uniform(-0.4, 0.4, (STARTS, 2)))
     examples, torques = jax.vmap(task.features)(states), jnp.linspace(-2.0, 2.0, 5)[:, None]
-    return Problem(ct.Pendulum(), task, states, ct.finite_policy(jax.random.key(1), torques, examples, width=32))
+    policy = ct.finite_policy(jax.random.key(1), torques, examples, width=32)
+    return Problem(ct.Agent(ct.Pendulum(), policy, AGENTS), task, states)
 
 
 def planned(problem: Problem, horizon: int, steps: int, *, moving: bool = True) -> tuple[ct.Policy, ct.Critic]:
     """Return a policy for the problem and a critic for the policy; unless `moving`, the policy stays as it is."""
     planner = replace(PLANNER, horizon=horizon, learning_rate=PLANNER.learning_rate if moving else UNMOVED)
     tasks, task = ct.batch_tasks([problem.task]), jnp.zeros(STARTS, jnp.int32)
-    result = ct.plan_policy(problem.dynamics, tasks, AGENTS, problem.policy, problem.states, task, planner, steps=steps)
+    result = ct.plan_policy(problem.agent, tasks, problem.states, task, planner, steps=steps)
     return result.policy, result.planner_state.critic
 
 
@@ -282,7 +278,7 @@ def noise(name: str, options: Options) -> Iterator[Record]:
     problem, longest = problem_of(name), max(options.horizons)
     note(f"{name}: computing a policy")
     policy, critic = planned(problem, longest, options.steps)
-    problem = eqx.tree_at(lambda whole: whole.policy, problem, policy)
+    problem = replace(problem, agent=replace(problem.agent, policy=policy))
     for horizon in options.horizons:
         note(f"{name}: horizon {horizon}")
         own = critic if horizon == longest else planned(problem, horizon, options.steps, moving=False)[1]
@@ -312,7 +308,7 @@ def measured(problem: Problem, critic: ct.Critic, horizon: int, options: Options
     gradients: dict[str, list[np.ndarray]] = {name: [] for name in ESTIMATORS}
     keys = jax.random.key(2)
     drawing = jax.random.split(jax.random.fold_in(keys, 0), PLACES)
-    choices = jax.vmap(problem.policy.sample)(drawing, jax.vmap(problem.task.features)(problem.states[:PLACES]))
+    choices = jax.vmap(problem.agent.policy.sample)(drawing, jax.vmap(problem.task.features)(problem.states[:PLACES]))
 
     def call(name: str) -> float:
         key = jax.random.fold_in(keys, 1 + len(gradients[name]))
@@ -340,7 +336,7 @@ def _estimates(
     tasks = ct.batch_tasks([problem.task])
 
     def one(state: Array, choice: Array, key: PRNGKeyArray) -> Array:
-        inputs = (problem.dynamics, problem.policy, tasks, AGENTS, key, state[None], choice[None, None], jnp.ones_like)
+        inputs = (problem.agent, ct.Starts(tasks, state[None], choice[None, None]), key, jnp.ones_like)
         return ravel_pytree(ct.value_gradient(*inputs, horizon=horizon, samples=1, critic=critic, estimator=by)[0])[0]
 
     keys = jax.random.split(key, (PLACES, samples))

@@ -8,11 +8,11 @@ import jax
 import numpy as np
 
 import sidestep as ss
-from sidestep.worlds.rooms import three_rooms
+from sidestep.worlds.rooms import rooms_in_a_row
 
 jax.config.update("jax_enable_x64", True)
 
-flat = three_rooms(5, 11, doors=(4, 0))
+flat = rooms_in_a_row(5, 11, doors=(4, 0))
 world, blank = ss.SlipperyGrid(flat, slip=float(np.log(0.2 / 0.8))), flat.forget()
 
 goals, free = [0, 24, 4, 28, 10, 52, 31], np.flatnonzero(flat.known.ravel() == ss.Cell.FREE)

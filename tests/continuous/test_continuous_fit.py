@@ -18,8 +18,8 @@ from sidestep.continuous.likelihood import FitProgress, Schedule
 from sidestep.continuous.obstacles import ObstacleMotion, Walls
 from sidestep.continuous.planner import Planner
 from sidestep.continuous.policies import FinitePolicy, ScaledNetwork, finite_policy, gaussian_policy
+from sidestep.continuous.simulation import gather_trajectories
 from sidestep.continuous.tasks import QuadraticTask, batch_tasks, reach_region
-from sidestep.continuous.trajectories import gather_trajectories
 from sidestep.errors import InputError, NotConverged
 from sidestep.inference.checkpoints import Saver
 from sidestep.inference.priors import Normal
@@ -354,18 +354,7 @@ FIRST_BACK = int(np.argmax(CHOICES == 0)) + 1
     ({"dynamics": Drift(vector(jnp.nan), vector(NOISE))}, "'parameters': expected finite numbers"),
     ({"dynamics": ObstacleMotion(Walls(low=jnp.ones((1, 1)), high=jnp.ones((1, 1))), vector(-9), vector(9), vector(1))},
      "'dynamics': expected parameters to learn, found none"),
-    ({"planner": Planner(horizon=0)}, "'horizon': expected at least 1, found 0"),
-    ({"planner": Planner(horizon=2, samples=1)}, "'samples': expected at least 2, found 1"),
-    ({"planner": Planner(horizon=2, batch_size=0)}, "'batch_size': expected at least 1, found 0"),
-    ({"planner": Planner(horizon=2, learning_rate=0.0)}, "'learning_rate': expected a finite number above 0, found 0"),
     ({"terms": ()}, r"'terms': expected one or both of .*, found \(\)"),
-    ({"schedule": Schedule(iterations=0)}, "'iterations': expected at least 2, found 0"),
-    ({"schedule": Schedule(batch_size=0)}, "'batch_size': expected at least 1, found 0"),
-    ({"schedule": Schedule(policy_steps=0)}, "'policy_steps': expected at least 1, found 0"),
-    ({"schedule": Schedule(policy_warmup=-1)}, "'policy_warmup': expected at least 0, found -1"),
-    ({"schedule": Schedule(learning_rate=0.0)}, "'learning_rate': expected a finite number above 0, found 0"),
-    ({"schedule": Schedule(learning_rate=jnp.inf)}, "'learning_rate': expected a finite number above 0, found inf"),
-    ({"schedule": Schedule(drift_tolerance=jnp.nan)}, "'drift_tolerance': expected a finite number above 0, found nan"),
     ({"demonstrations": changed(next_states=NAN)}, "'next_states': expected finite numbers"),
     ({"demonstrations": changed(tasks=batch_tasks([reach_region((0.0,), 9.0)]))}, "states, row 1: .*has not ended"),
     ({"dynamics": LinearGaussian(jnp.eye(2), jnp.ones((2, 1)), vector(1, 1))},
@@ -385,6 +374,20 @@ def test_fit_dynamics_bad_input_is_refused(change, match):
     }  # fmt: skip
     with pytest.raises(InputError, match=match):
         fit_dynamics(**{**settings, **change})
+
+
+@pytest.mark.parametrize(("setting", "expected"), [
+    ({"iterations": 1}, "at least 2, found 1"),
+    ({"policy_warmup": -1}, "at least 0, found -1"),
+    ({"batch_size": 0}, "at least 1, found 0"),
+    ({"policy_steps": 0}, "at least 1, found 0"),
+    ({"learning_rate": 0.0}, "a finite number above 0, found 0"),
+    ({"drift_tolerance": np.nan}, "a finite number above 0, found nan"),
+    ({"policy_gap_tolerance": np.inf}, "a finite number above 0, found inf"),
+])  # fmt: skip
+def test_schedule_refuses_settings_out_of_range(setting, expected):
+    with pytest.raises(InputError, match=f"'{next(iter(setting))}': expected {expected}"):
+        Schedule(**setting)
 
 
 def test_fit_dynamics_no_moves_are_refused():

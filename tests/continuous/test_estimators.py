@@ -1,6 +1,6 @@
 """Eq. 11 by roll-outs beside exact gradients: dynamic programming in a table, moments in a linear-Gaussian world."""
 
-from typing import NamedTuple
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -27,10 +27,9 @@ from helpers.small_worlds import (
     table,
     with_logits,
 )
-from sidestep.continuous.critic import Critic
 from sidestep.continuous.dynamics import LinearGaussian
 from sidestep.continuous.estimators import check_estimator, value_gradient, with_control_variates
-from sidestep.continuous.policies import FinitePolicy, ScaledNetwork
+from sidestep.continuous.policies import Agent, Critic, FinitePolicy, ScaledNetwork, Starts
 from sidestep.continuous.rollouts import q_estimates, sample_rollouts
 from sidestep.continuous.tasks import task_at
 from sidestep.errors import InputError
@@ -48,26 +47,17 @@ EACH = 10  # rollouts of a candidate for one estimate
 MANY = 600  # estimates; always the same number, because each one is compiled for
 
 
-class Starts(NamedTuple):
-    """Starts, the task of each, and its candidate actions."""
-
-    states: jax.Array
-    which: jax.Array
-    choices: jax.Array
-
-
-EVERYWHERE = Starts(PLACES, WHICH, jnp.broadcast_to(jnp.arange(ACTIONS), WEIGHTS.shape))
+EVERYWHERE = Starts(task_at(TABLE.tasks, WHICH), PLACES, jnp.broadcast_to(jnp.arange(ACTIONS), WEIGHTS.shape))
 
 
 @eqx.filter_jit
 def estimates(world, behavior, keys, starts, level, tilt, critic=None, estimator="score", horizon=HORIZON):
     """Independent estimates of Σ (level + tilt · Q) ∇Q, in rows; each has `EACH` rollouts of a candidate."""
-    tasks = task_at(world.tasks, starts.which)
+    agent = Agent(world.dynamics, world.policy, behavior)
     settings = {"horizon": horizon, "samples": EACH, "critic": critic, "estimator": estimator}
 
     def one(key):
-        args = world.dynamics, world.policy, tasks, behavior, key, starts.states, starts.choices
-        return ravel_pytree(value_gradient(*args, lambda q: level + tilt * q, **settings)[0])[0]
+        return ravel_pytree(value_gradient(agent, starts, key, lambda q: level + tilt * q, **settings)[0])[0]
 
     return jax.lax.map(one, keys, batch_size=50)
 
@@ -156,14 +146,12 @@ def test_value_gradient_exact_critic_halves_the_variance():
 def test_with_control_variates_exact_critic_removes_all_noise():
     pi = exact_policy(TABLE, SOFT)
     values, q = exact_values(TABLE, TABLE.dynamics.parameters, pi, 40, entropies(pi) / BETA)
-    policy, tasks = with_logits(jnp.log(pi)), task_at(TABLE.tasks, WHICH)
+    agent = Agent(TABLE.dynamics, with_logits(jnp.log(pi)), SOFT)
 
     @eqx.filter_jit
     def estimate(critic):
-        rolled = sample_rollouts(
-            TABLE.dynamics, policy, tasks, SOFT, jax.random.key(0), PLACES, 40, EVERYWHERE.choices, 20
-        )
-        known = with_control_variates(TABLE.dynamics, policy, rolled, critic)
+        rolled = sample_rollouts(agent, EVERYWHERE, jax.random.key(0), horizon=40, samples=20)
+        known = with_control_variates(agent, rolled, critic)
         return [q_estimates(each)[..., 0] for each in (rolled, known)]
 
     plain, known = estimate(critic_of(values))
@@ -178,12 +166,12 @@ def test_value_gradient_weights_are_independent_of_gradients():
 
 
 def test_value_gradient_score_error_falls_as_root_of_rollouts():
-    one = Starts(PLACES[:1], WHICH[:1], jnp.ones((1, 1), int))
+    one = Starts(task_at(TABLE.tasks, WHICH[:1]), PLACES[:1], jnp.ones((1, 1), int))
     _, exact = exact_table("log-sum-exp", TABLE, lambda q: q[0, 1])
     assert_falls_as_root(drawn(6, 4000, TABLE, SOFT, one, jnp.ones((1, 1))), exact)
 
 
-AROUND = Starts(jnp.asarray([[1.0, 0.5], [-0.5, -1.0]]), jnp.arange(2), jnp.asarray([[[0.5], [-1.0]], [[0.0], [1.5]]]))
+AROUND = Starts(LINEAR.tasks, jnp.asarray([[1.0, 0.5], [-0.5, -1.0]]), jnp.asarray([[[0.5], [-1.0]], [[0.0], [1.5]]]))
 WEIGHTS_AROUND = jnp.asarray([[1.0, -0.5], [0.3, 0.8]])
 
 
@@ -250,7 +238,7 @@ def test_value_gradient_score_in_linear_world_matches_closed_form_with_more_nois
 
 PUSHES = jnp.asarray([[-1.0], [0.2], [1.0]])
 MOVES = 3
-PUSHED = AROUND._replace(choices=jnp.broadcast_to(jnp.arange(len(PUSHES)), (2, len(PUSHES))))
+PUSHED = replace(AROUND, choices=jnp.broadcast_to(jnp.arange(len(PUSHES)), (2, len(PUSHES))))
 PARTS = jnp.asarray([[1.0, -0.5, 0.2], [0.3, 0.8, -1.0]])
 
 
@@ -296,9 +284,10 @@ def test_value_gradient_pathwise_and_score_agree_over_finite_actions():
 
 def short_gradient(**settings):
     """An estimate in the table, by default of two moves and rollouts."""
-    tasks, key = task_at(TABLE.tasks, WHICH), jax.random.key(0)
-    arguments = TABLE.dynamics, TABLE.policy, tasks, SOFT, key, PLACES, EVERYWHERE.choices, jnp.ones_like
-    return value_gradient(*arguments, **{"horizon": 2, "samples": 2, **settings})
+    agent = Agent(TABLE.dynamics, TABLE.policy, SOFT)
+    return value_gradient(
+        agent, EVERYWHERE, jax.random.key(0), jnp.ones_like, **{"horizon": 2, "samples": 2, **settings}
+    )
 
 
 def test_check_estimator_refuses_biased_ones():

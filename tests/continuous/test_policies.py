@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sidestep.continuous.critic import make_critic
-from sidestep.continuous.policies import FinitePolicy, finite_policy, gaussian_policy
+from sidestep.continuous.policies import FinitePolicy, finite_policy, gaussian_policy, make_critic
 from sidestep.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("unoptimised")

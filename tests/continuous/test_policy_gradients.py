@@ -25,17 +25,8 @@ from helpers.small_worlds import (
     table_policy,
     with_logits,
 )
-from sidestep.continuous.planner import (
-    Planner,
-    PlannerState,
-    PlanProblem,
-    PlanProgress,
-    PolicyPlan,
-    check_planner,
-    plan_policy,
-)
-from sidestep.continuous.policies import gaussian_policy
-from sidestep.continuous.policy_gradient import minibatches
+from sidestep.continuous.planner import Planner, PlannerState, PlanProgress, PolicyPlan, minibatches, plan_policy
+from sidestep.continuous.policies import Agent, gaussian_policy
 from sidestep.continuous.tasks import task_at
 from sidestep.errors import InputError, NotConverged
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax, LogSumExp, Mellowmax
@@ -55,7 +46,8 @@ UNIFORM = table_policy(ACTIONS, TASKS * STATES)
 
 
 def planned(behavior, policy=UNIFORM, planner=PLANNER, *, steps, **settings) -> PolicyPlan:
-    return plan_policy(WORLD.dynamics, WORLD.tasks, behavior, policy, PLACES, WHICH, planner, steps=steps, **settings)
+    agent = Agent(WORLD.dynamics, policy, behavior)
+    return plan_policy(agent, WORLD.tasks, PLACES, WHICH, planner, steps=steps, **settings)
 
 
 def divergence(pi, other):
@@ -66,8 +58,8 @@ def divergence(pi, other):
 @pytest.fixture(scope="module")
 def initial() -> PlannerState:
     """PlannerState at its start, from the uniform policy."""
-    agent = PlanProblem(WORLD.dynamics, task_at(WORLD.tasks, WHICH), SOFT, PLACES)
-    return PLANNER.initialize(jax.random.key(0), agent, UNIFORM)
+    agent = Agent(WORLD.dynamics, UNIFORM, SOFT)
+    return PLANNER.initialize(jax.random.key(0), agent, task_at(WORLD.tasks, WHICH), PLACES)
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +123,7 @@ def test_plan_policy_gaussian_policy_matches_maximum_entropy_control():
         horizon=12, batch_size=16, samples=2, candidates=16, critic_width=8, learning_rate=0.015, critic_rate=0.02
     )
     policy = gaussian_policy(jax.random.key(2), 1, starts, depth=0)
-    result = plan_policy(dynamics, tasks, SOFT, policy, starts, jnp.zeros(256, int), planner, steps=250)
+    result = plan_policy(Agent(dynamics, policy, SOFT), tasks, starts, jnp.zeros(256, int), planner, steps=250)
     gain, spread = optimal_control(task_at(tasks, 0), dynamics)
     mean, middle = result.policy.network, jnp.zeros(2)
     close = 0.05 * np.linalg.norm(gain)
@@ -236,26 +228,23 @@ def test_initialize_critic_begins_at_the_mean_return(initial):
         ("critic_steps", 0, 1),
     ],
 )
-def test_check_planner_refuses_counts_that_are_too_small(name, value, least, initial):
-    planner = Planner(**{"horizon": 2, name: value})
+def test_planner_refuses_counts_that_are_too_small(name, value, least):
     with pytest.raises(InputError, match=f"{name}.*at least {least}, found {value}"):
-        check_planner(planner)
-    with pytest.raises(InputError, match=name):
-        planned(SOFT, planner=planner, steps=1, warm_start=initial)
+        Planner(**{"horizon": 2, name: value})
 
 
 @pytest.mark.parametrize("name", ["learning_rate", "critic_rate"])
 @pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf")])
-def test_check_planner_refuses_rates_not_above_0(name, rate):
+def test_planner_refuses_rates_not_above_0(name, rate):
     with pytest.raises(InputError, match=f"{name}.*finite number above 0"):
-        check_planner(Planner(horizon=2, **{name: rate}))
+        Planner(horizon=2, **{name: rate})
 
 
 def test_plan_policy_refuses_bad_starts():
-    world, tasks = WORLD.dynamics, WORLD.tasks
+    agent, tasks = Agent(WORLD.dynamics, UNIFORM, SOFT), WORLD.tasks
 
     def planned_from(states, which, steps=1):
-        return plan_policy(world, tasks, SOFT, UNIFORM, states, which, PLANNER, steps=steps)
+        return plan_policy(agent, tasks, states, which, PLANNER, steps=steps)
 
     with pytest.raises(InputError, match=r"steps.*at least 1"):
         planned_from(PLACES, WHICH, steps=0)
@@ -267,9 +256,8 @@ def test_plan_policy_refuses_bad_starts():
         planned_from(PLACES[:2], jnp.asarray([0, 2]))
     with pytest.raises(InputError, match=r"states.*row 2.*has not ended"):
         planned_from(jnp.asarray([0, 4]), jnp.zeros(2, int))
-    agent = PlanProblem(world, task_at(tasks, jnp.zeros(2, int)), SOFT, jnp.asarray([4, 4]))
     with pytest.raises(InputError, match="has not ended"):
-        PLANNER.initialize(jax.random.key(0), agent, UNIFORM)
+        PLANNER.initialize(jax.random.key(0), agent, task_at(tasks, jnp.zeros(2, int)), jnp.asarray([4, 4]))
 
 
 def test_minibatches_hold_every_move_and_are_disjoint():
@@ -299,5 +287,6 @@ def test_plan_policy_figures_not_finite_raise(initial):
 
 def test_plan_policy_mellowmax_over_vectors_is_refused():
     dynamics, tasks, policy = linear()
+    agent = Agent(dynamics, policy, BEHAVIORS["mellowmax"])
     with pytest.raises(InputError, match="mellowmax"):
-        plan_policy(dynamics, tasks, BEHAVIORS["mellowmax"], policy, jnp.zeros((2, 2)), jnp.arange(2), PLANNER, steps=1)
+        plan_policy(agent, tasks, jnp.zeros((2, 2)), jnp.arange(2), PLANNER, steps=1)

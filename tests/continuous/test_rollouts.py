@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from helpers.small_worlds import ACTIONS, ENDS, PLACES, WHICH, entropies, exact_values, policy_table, table
+from sidestep.continuous.policies import Agent, Starts
 from sidestep.continuous.rollouts import (
     Rollout,
     discounted_returns,
@@ -23,7 +24,7 @@ from sidestep.tabular.backups import Behavior, LogSumExp
 pytestmark = pytest.mark.usefixtures("unoptimised")
 
 WORLD, HORIZON, BETA, SAMPLES = table(), 6, 2.0, 300
-BEHAVIOR = Behavior(LogSumExp(), BETA)
+AGENT = Agent(WORLD.dynamics, WORLD.policy, Behavior(LogSumExp(), BETA))
 PI = np.asarray(policy_table(WORLD.policy))
 BONUS = entropies(PI) / BETA
 ALL = jnp.append(PLACES, jnp.asarray([4, 0]))  # also where the first task has ended, and the first place once more
@@ -33,9 +34,8 @@ OPTIONS = jnp.asarray([0, 1, 2, 1])  # one of them twice
 
 @eqx.filter_jit
 def sample_all(key) -> Rollout:
-    choices = jnp.broadcast_to(OPTIONS, (len(ALL), len(OPTIONS)))
-    tasks = task_at(WORLD.tasks, OWN)
-    return sample_rollouts(WORLD.dynamics, WORLD.policy, tasks, BEHAVIOR, key, ALL, HORIZON, choices, SAMPLES)
+    starts = Starts(task_at(WORLD.tasks, OWN), ALL, jnp.broadcast_to(OPTIONS, (len(ALL), len(OPTIONS))))
+    return sample_rollouts(AGENT, starts, key, HORIZON, SAMPLES)
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,7 @@ def test_sample_rollout_without_choice_draws_it_from_the_policy():
     task, state = task_at(WORLD.tasks, 0), jnp.asarray(1)
 
     def total(key):
-        each = sample_rollout(WORLD.dynamics, WORLD.policy, task, BEHAVIOR, key, state, HORIZON)
+        each = sample_rollout(AGENT, task, key, state, HORIZON)
         return returns_to_go(each)[0], each.choices[0]
 
     drawn = jax.jit(jax.vmap(total))(jax.random.split(jax.random.key(1), 2000))

@@ -5,12 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.continuous.lattice import Lattice, action_values, tabular_model, tabular_task
+from sidestep.continuous.lattice import Lattice, LatticePlanner
 from sidestep.continuous.obstacles import ObstacleMotion, Walls
 from sidestep.continuous.physical import Pendulum
-from sidestep.continuous.simulation import simulate_trajectories
+from sidestep.continuous.simulation import gather_trajectories, simulate_trajectories
 from sidestep.continuous.tasks import PendulumTask, batch_tasks, reach_region
-from sidestep.continuous.trajectories import gather_trajectories
 from sidestep.errors import ImproperTask, InputError, NotConverged
 from sidestep.tabular.backups import Behavior, LogSumExp
 from sidestep.tabular.demonstrations import Trajectory
@@ -34,8 +33,8 @@ SHARP, SOFT = Behavior(LogSumExp(), 40.0), Behavior(LogSumExp(), 2.0)
 
 def simulate(believed, behavior, tasks=1, starts=STARTS, options=None):
     """Walks to the first goals; always the same number and length, so that this is compiled once."""
-    world = WAYS, behavior, SQUARES, 30, options
-    return simulate_trajectories(KEY, ROOM, believed, GOALS[:tasks], starts[:tasks], *world)
+    agent = LatticePlanner(believed, WAYS, behavior, SQUARES)
+    return simulate_trajectories(KEY, agent, ROOM, GOALS[:tasks], starts[:tasks], 30, options)
 
 
 def targets(walks):
@@ -103,8 +102,9 @@ def test_simulate_trajectories_start_at_goal_gives_none():
 def test_simulate_trajectories_soft_choices_match_action_values():
     place = np.array([4.2, 4.0])
     walking = simulate(ROOM, SOFT, starts=[np.tile(place, (COUNT, 1))])
-    values = solve(tabular_model(ROOM, SQUARES, WAYS), tabular_task(GOALS[0], SQUARES, WAYS), SOFT).values
-    q = np.asarray(action_values(ROOM, SQUARES, GOALS[0], values, jnp.asarray(place), WAYS))
+    agent = LatticePlanner(ROOM, WAYS, SOFT, SQUARES)
+    values = solve(agent.tabular_model(), agent.tabular_task(GOALS[0]), SOFT).values
+    q = np.asarray(agent.action_values(GOALS[0], values, jnp.asarray(place)))
     odds = np.exp(2 * (q - q.max()))
     frequencies = np.bincount([walk.actions[0] for walk in walking], minlength=4) / COUNT
     np.testing.assert_allclose(frequencies, odds / odds.sum(), atol=0.05)
@@ -117,7 +117,9 @@ def test_simulate_trajectories_wrong_gravity_changes_actions():
     goal, torques, real = np.pi - 0.4, jnp.linspace(-2, 2, 5)[:, None], Pendulum(10.0)
     task, starts = PendulumTask(jnp.asarray(goal), jnp.asarray(0.9)), RANDOM.normal([goal, 0], 0.1, (8, 2))
     right, light = (
-        simulate_trajectories(KEY, real, Pendulum(gravity), [task], [starts], torques, SHARP, lattice, 30)
+        simulate_trajectories(
+            KEY, LatticePlanner(Pendulum(gravity), torques, SHARP, lattice), real, [task], [starts], 30
+        )
         for gravity in (10.0, 2.0)
     )
     pushes = [np.mean([np.asarray(torques)[walk.actions].mean() for walk in walks]) for walks in (right, light)]

@@ -19,7 +19,7 @@ from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import true_model
 from sidestep.tabular.simulation import simulate
 from sidestep.tabular.tasks import reach
-from sidestep.worlds.rooms import two_rooms
+from sidestep.worlds.rooms import rooms_in_a_row
 
 NORMAL = ("--prior-mean", 0.5, "--prior-variance", 4, "--wall-prior", 0)
 """Cells are independent, so that the observation of one cell moves no other."""
@@ -127,7 +127,7 @@ def test_learn_with_a_sensor_map_of_other_geometry_names_file_and_field(office, 
         assert written(tmp_path / "out") == []
 
 
-FLAT = two_rooms(13, 9, door=12)
+FLAT = rooms_in_a_row(13, 9, doors=(12,))
 UPPER, LOWER = slice(0, 5), slice(7, 12)
 """The rows that sensors saw, and rows of the wall that agents walk around."""
 

@@ -20,7 +20,7 @@ from sidestep.tabular.solve import solve
 from sidestep.tabular.tasks import Task, reach
 from sidestep.worlds.farm import Farm
 from sidestep.worlds.gravity import DIRECTIONS, Gravity, most_probable_rule
-from sidestep.worlds.rooms import two_rooms
+from sidestep.worlds.rooms import rooms_in_a_row
 
 UP, DOWN, LEFT, RIGHT = range(4)
 
@@ -240,7 +240,7 @@ def test_slippery_grid_of_a_wrong_terrain_raises(terrain):
 @pytest.mark.slow
 def test_fit_of_a_slippery_grid_with_two_terrains_recovers_walls_and_slips():
     """Slips within four standard deviations of the fraction of moves that slip."""
-    rooms, slips = two_rooms(7, 9, door=6), np.array([0.1, 0.4])
+    rooms, slips = rooms_in_a_row(7, 9, doors=(6,)), np.array([0.1, 0.4])
     terrain = np.zeros((7, 9), int)
     terrain[:, 5:] = 1
     world, random = SlipperyGrid(rooms, slip=logit(slips), terrain=terrain), np.random.default_rng(0)

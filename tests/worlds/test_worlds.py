@@ -11,7 +11,7 @@ from sidestep.tabular.graph import walkable_graph
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.worlds.grids import WORLDS, block, wall
 from sidestep.worlds.offices import office, places
-from sidestep.worlds.rooms import three_rooms, two_rooms
+from sidestep.worlds.rooms import rooms_in_a_row
 
 
 def test_block_and_wall_have_the_obstacles_of_the_paper():
@@ -33,7 +33,6 @@ def test_block_has_the_starts_and_goals_of_the_paper():
 def test_worlds_connect_every_start_with_every_goal(name):
     world = WORLDS[name]()
     assert world.name == name
-    assert world.source
     assert not set(world.starts) & set(world.goals)
     distance = dijkstra(walkable_graph(world.truth), indices=world.starts)[:, list(world.goals)]
     assert np.isfinite(distance).all()
@@ -125,10 +124,10 @@ def test_places_lie_in_the_largest_connected_part():
 def test_rooms_are_connected_by_their_doors_only(connectivity):
     for rows, columns in ((1, 3), (4, 6), (7, 13)):
         for door in range(rows):
-            check_rooms(two_rooms(rows, columns, door, connectivity), {(columns + 1) // 2 - 1: door})
+            check_rooms(rooms_in_a_row(rows, columns, (door,), connectivity), {(columns + 1) // 2 - 1: door})
     for columns in range(5, 20):
         for doors in ((0, 0), (3, 1)):
-            grid = three_rooms(4, columns, doors, connectivity)
+            grid = rooms_in_a_row(4, columns, doors, connectivity)
             left, right = np.flatnonzero((grid.known == Cell.OCCUPIED).any(axis=0))
             check_rooms(grid, {left: doors[0], right: doors[1]})
             widths = [left, right - left - 1, columns - right - 1]
@@ -154,13 +153,13 @@ def rooms_of(grid):
     return len(np.unique(label[grid.known.reshape(-1) == Cell.FREE]))
 
 
-@pytest.mark.parametrize(("make", "arguments", "match"), [
-    (two_rooms, (3, 2, 0), "'columns': expected at least 3, found 2"),
-    (two_rooms, (0, 3, 0), "'rows': expected at least 1, found 0"),
-    (two_rooms, (3, 3, 3), "'door': expected a row in 0…2, found 3"),
-    (three_rooms, (3, 4, (0, 0)), "'columns': expected at least 5, found 4"),
-    (three_rooms, (3, 5, (0, -1)), "'door': expected a row in 0…2, found -1"),
+@pytest.mark.parametrize(("arguments", "match"), [
+    ((3, 2, (0,)), "'columns': expected at least 3, found 2"),
+    ((0, 3, (0,)), "'rows': expected at least 1, found 0"),
+    ((3, 3, (3,)), "'doors': expected a row in 0…2, found 3"),
+    ((3, 4, (0, 0)), "'columns': expected at least 5, found 4"),
+    ((3, 5, (0, -1)), "'doors': expected a row in 0…2, found -1"),
 ])  # fmt: skip
-def test_rooms_of_impossible_sizes_are_refused(make, arguments, match):
+def test_rooms_of_impossible_sizes_are_refused(arguments, match):
     with pytest.raises(InputError, match=match):
-        make(*arguments)
+        rooms_in_a_row(*arguments)

@@ -33,15 +33,18 @@ from .tasks import (
     task_features as task_features,
 )
 
-# policies and critics
+# agents, policies and critics
 from .policies import (
+    Agent as Agent,
+    Critic as Critic,
     FinitePolicy as FinitePolicy,
     GaussianPolicy as GaussianPolicy,
     Policy as Policy,
+    Starts as Starts,
     finite_policy as finite_policy,
     gaussian_policy as gaussian_policy,
+    make_critic as make_critic,
 )
-from .critic import Critic as Critic, make_critic as make_critic
 
 # rollouts and gradients
 from .rollouts import (
@@ -66,6 +69,5 @@ from .likelihood import FitProgress as FitProgress, Schedule as Schedule
 from .fit import ContinuousFit as ContinuousFit, fit_dynamics as fit_dynamics
 
 # lattices and demonstrations
-from .lattice import Lattice as Lattice
-from .simulation import simulate_trajectories as simulate_trajectories
-from .trajectories import gather_trajectories as gather_trajectories
+from .lattice import Lattice as Lattice, LatticePlanner as LatticePlanner
+from .simulation import gather_trajectories as gather_trajectories, simulate_trajectories as simulate_trajectories

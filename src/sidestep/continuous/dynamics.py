@@ -33,6 +33,8 @@ State = Shaped[Array, "*state"]
 Action = Shaped[Array, "*action"]
 Real = Float[Scalar, ""]
 Vector = Float[Array, " dimensions"]
+PerCandidate = Float[Array, "starts candidates"]
+PerSample = Float[Array, "starts candidates samples"]
 ValueFunction = Callable[[State], Real]
 
 _Family = TypeVar("_Family", bound="Dynamics")

@@ -21,21 +21,20 @@ Both are implemented as *surrogates*: numbers with the estimate as their derivat
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray, Shaped
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from sidestep._typing import FloatTree
-from sidestep.continuous.critic import Critic
-from sidestep.continuous.dynamics import Dynamics
-from sidestep.continuous.policies import PerCandidate, PerSample, Policy
-from sidestep.continuous.rollouts import Rollout, discount_powers, q_estimates, sample_rollouts
+from sidestep.continuous.dynamics import Dynamics, PerCandidate, PerSample
+from sidestep.continuous.policies import Agent, Critic, Starts
+from sidestep.continuous.rollouts import Rollout, q_estimates, sample_rollouts
 from sidestep.continuous.tasks import ContinuousTask
 from sidestep.errors import InputError, check
-from sidestep.tabular.backups import Behavior
 
 Estimator = Literal["score", "pathwise"]
 
@@ -43,50 +42,14 @@ WeightFunction = Callable[[PerCandidate], PerCandidate]
 """The weights of ∇Q of all candidates, as a function of the estimates of Q."""
 
 
-def at_every_move(function: Callable, rollouts: Rollout, *more: Array) -> Array:
-    """Return function(task, state, …) at every move; `more` has all axes of the moves."""
-    mapped = jax.vmap(function, (None, *(0,) * (1 + len(more))))
-    for _ in rollouts.acting.shape[:-1]:
-        mapped = jax.vmap(mapped)
-    return mapped(rollouts.task, rollouts.leaving, *more)
+def with_control_variates(agent: Agent, rollouts: Rollout, critic: Critic) -> Rollout:
+    """Return the rollouts with the z_i of a critic; no gradients pass through them.
 
-
-def features_at_moves(rollouts: Rollout) -> Float[Array, "*batch moves features"]:
-    """Return the features of every state that a move leaves."""
-    return at_every_move(lambda task, state: task.features(state), rollouts)
-
-
-def policy_log_probs(policy: Policy, rollouts: Rollout) -> Float[Array, "*batch moves"]:
-    """Return ln π_λ(a_i | s_i) of every move."""
-    moves = rollouts, rollouts.choices
-    return at_every_move(lambda task, state, choice: policy.log_prob(task.features(state), choice), *moves)
-
-
-def policy_advantages(policy: Policy, rollouts: Rollout) -> Float[Array, "*batch moves"]:
-    """Return q_λ(s_i, a_i) = ln π_λ(a_i | s_i) + H(π_λ(· | s_i)) of every move."""
-
-    def advantage(task: ContinuousTask, state: Array, choice: Array) -> Array:
-        features = task.features(state)
-        return policy.log_prob(features, choice) + policy.entropy(features)
-
-    return at_every_move(advantage, rollouts, rollouts.choices)
-
-
-def critic_values(critic: Critic, rollouts: Rollout) -> Float[Array, "*batch moves"]:
-    """Return V_w of every state that a move leaves."""
-    moves = rollouts, rollouts.fraction_left
-    return at_every_move(lambda task, state, left: critic(task.features(state), left), *moves)
-
-
-def action_baselines(critic: Critic | None, rollouts: Rollout) -> Float[Array, "*batch moves"]:
-    """Return E_i = V_w(s_i) − b_i of every move; V_w is 0 without a critic."""
-    if critic is None:
-        return -rollouts.bonuses
-    return critic_values(critic, rollouts) - rollouts.bonuses
-
-
-def with_control_variates(dynamics: Dynamics, policy: Policy, rollouts: Rollout, critic: Critic) -> Rollout:
-    """Return the rollouts with the z_i of a critic; no gradients pass through them."""
+    Args:
+        agent: The agent of the rollouts.
+        rollouts: One or, with leading axes, many.
+        critic: V_w.
+    """
     one_move = 1 / rollouts.acting.shape[-1]
 
     def variate(task: ContinuousTask, state: Array, choice: Array, following: Array, left: Array) -> Array:
@@ -94,58 +57,70 @@ def with_control_variates(dynamics: Dynamics, policy: Policy, rollouts: Rollout,
             going_on = jnp.where(left > 0.5 * one_move, critic(task.features(state), left), 0.0)
             return jnp.where(task.terminal(state), task.terminal_reward(state), going_on)
 
-        return task.discount * dynamics.transition_control_variate(value, state, policy.action(choice), following)
+        action = agent.policy.action(choice)
+        return task.discount * agent.dynamics.transition_control_variate(value, state, action, following)
 
     left_after = rollouts.fraction_left - one_move
-    variates = at_every_move(variate, rollouts, rollouts.choices, rollouts.following, left_after)
+    variates = rollouts.at_every_move(variate, rollouts.choices, rollouts.following, left_after)
     variates = jax.lax.stop_gradient(jnp.where(rollouts.acting, variates, 0.0)).astype(rollouts.rewards.dtype)
     return eqx.tree_at(lambda rollouts: rollouts.transition_control_variates, rollouts, variates)
 
 
-def score_surrogate(
-    dynamics: Dynamics, policy: Policy, rollouts: Rollout, critic: Critic | None = None
-) -> Float[Array, "*batch"]:
+def score_surrogate(agent: Agent, rollouts: Rollout, critic: Critic | None = None) -> Float[Array, "*batch"]:
     """Return numbers with the score estimate of eq. 11 as their derivative by θ, one a rollout.
 
     Args:
-        dynamics: T_θ, with gradients.
-        policy: π.
-        rollouts: one or, with leading axes, many.
+        agent: The agent of the rollouts; gradients pass through its dynamics T_θ.
+        rollouts: One or, with leading axes, many.
         critic: V_w of the baseline; 0 by default.
+
+    Returns:
+        A number for each rollout, in units of reward; only its derivative has a meaning.
+
+    Example:
+        >>> import sidestep as ss, sidestep.continuous as sc
+        >>> task = sc.QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.eye(1), jnp.asarray(0.9))
+        >>> dynamics = sc.LinearGaussian(jnp.eye(1), jnp.eye(1), jnp.full(1, 0.1))
+        >>> policy = sc.gaussian_policy(jax.random.key(0), 1, jnp.ones((1, 1)))
+        >>> agent = sc.Agent(dynamics, policy, ss.Behavior(ss.HardMax()))
+        >>> score_surrogate(agent, sc.sample_rollout(agent, task, jax.random.key(1), jnp.zeros(1), horizon=2)).shape
+        ()
 
     References:
         Eq. 11 of the paper, with the differences that the module's docstring lists.
     """
-    baselines = action_baselines(critic, rollouts)
+    baselines = rollouts.action_baselines(critic)
     beyond = q_estimates(rollouts) + rollouts.transition_control_variates - baselines
-    credit = discount_powers(rollouts, rollouts.acting.shape[-1]) * jnp.where(rollouts.acting, beyond, 0.0)
+    credit = rollouts.discount_powers(rollouts.acting.shape[-1]) * jnp.where(rollouts.acting, beyond, 0.0)
 
     def log_prob(_: ContinuousTask, state: Array, choice: Array, following: Array) -> Array:
-        return dynamics.log_prob(state, policy.action(choice), following)
+        return agent.dynamics.log_prob(state, agent.policy.action(choice), following)
 
-    log_probs = at_every_move(log_prob, rollouts, rollouts.choices, rollouts.following)
+    log_probs = rollouts.at_every_move(log_prob, rollouts.choices, rollouts.following)
     return jnp.sum(log_probs * jax.lax.stop_gradient(credit), axis=-1)
 
 
-def pathwise_surrogate(policy: Policy, rollouts: Rollout, critic: Critic | None = None) -> Float[Array, "*batch"]:
-    """Return numbers with the pathwise estimate as their derivative by θ, for rollouts that are functions of θ."""
+def pathwise_surrogate(agent: Agent, rollouts: Rollout, critic: Critic | None = None) -> Float[Array, "*batch"]:
+    """Return numbers with the pathwise estimate as their derivative by θ, for rollouts that are functions of θ.
+
+    Args:
+        agent: The agent of the rollouts.
+        rollouts: One or, with leading axes, many.
+        critic: V_w of the baseline; 0 by default.
+    """
     q = q_estimates(rollouts)
-    if policy.reparameterized:
+    if agent.policy.reparameterized:
         return q[..., 0]
-    baselines = action_baselines(critic, rollouts)
-    credit = jax.lax.stop_gradient(discount_powers(rollouts, rollouts.acting.shape[-1]) * (q - baselines))
-    scores = jnp.where(rollouts.acting, policy_log_probs(policy, rollouts) * credit, 0.0)
+    baselines = rollouts.action_baselines(critic)
+    credit = jax.lax.stop_gradient(rollouts.discount_powers(rollouts.acting.shape[-1]) * (q - baselines))
+    scores = jnp.where(rollouts.acting, rollouts.policy_log_probs(agent.policy) * credit, 0.0)
     return q[..., 0] + scores[..., 1:].sum(axis=-1)
 
 
 def value_gradient(
-    dynamics: Dynamics,
-    policy: Policy,
-    tasks: ContinuousTask,
-    behavior: Behavior,
+    agent: Agent,
+    starts: Starts,
     key: PRNGKeyArray,
-    states: Shaped[Array, "starts *state"],
-    choices: Shaped[Array, "starts candidates *choice"],
     weight_function: WeightFunction,
     *,
     horizon: int,
@@ -159,16 +134,12 @@ def value_gradient(
     and gradients is then independent.
 
     Args:
-        dynamics: T_θ.
-        policy: π.
-        tasks: the task of each start.
-        behavior: the agent's backup and β.
-        key: draws everything random.
-        states: the starts.
-        choices: the candidates of each start.
-        weight_function: the weights, as a function of the means of Q̂_0 over samples.
+        agent: T_θ, π and the backup.
+        starts: The tasks, the states, and the candidates of each.
+        key: Draws everything random.
+        weight_function: The weights, as a function of the means of Q̂_0 over samples.
         horizon: τ, the number of moves, 1 or more.
-        samples: rollouts of each candidate, 1 or more.
+        samples: Rollouts of each candidate, 1 or more.
         critic: V_w of baseline and control variates; none by default.
         estimator: "score" or "pathwise"; both are unbiased where they apply.
 
@@ -176,28 +147,36 @@ def value_gradient(
         The gradient, shaped as the parameters, and the rollouts, with axes (starts, candidates, samples).
 
     Raises:
-        InputError: a horizon or samples below 1, or an estimator that does not apply (`check_estimator`).
+        InputError: For a horizon or samples below 1, or an estimator that does not apply (`check_estimator`).
+
+    Example:
+        >>> import sidestep as ss, sidestep.continuous as sc
+        >>> task = sc.QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.eye(1), jnp.asarray(0.9))
+        >>> dynamics = sc.LinearGaussian(jnp.eye(1), jnp.eye(1), jnp.full(1, 0.1))
+        >>> policy = sc.gaussian_policy(jax.random.key(0), 1, jnp.ones((1, 1)))
+        >>> starts = sc.Starts(sc.batch_tasks([task]), jnp.zeros((1, 1)), jnp.ones((1, 2, 1)))
+        >>> agent, key = sc.Agent(dynamics, policy, ss.Behavior(ss.HardMax())), jax.random.key(1)
+        >>> gradient, _ = value_gradient(agent, starts, key, jnp.ones_like, horizon=2, samples=2)
+        >>> {name: part.shape for name, part in gradient.items()}
+        {'action': (1, 1), 'state': (1, 1)}
 
     References:
         Eq. 11 of the paper.
     """
-    check_estimator(estimator, dynamics, tasks)
+    check_estimator(estimator, agent.dynamics, starts.tasks)
+    pathwise = estimator == "pathwise"
 
     def total(parameters: FloatTree) -> tuple[Array, Rollout]:
-        moved = dynamics.with_parameters(parameters)
-        sampled = moved if estimator == "pathwise" else dynamics
-        rollouts = sample_rollouts(sampled, policy, tasks, behavior, key, states, horizon, choices, samples)
+        moved = replace(agent, dynamics=agent.dynamics.with_parameters(parameters))
+        rollouts = sample_rollouts(moved if pathwise else agent, starts, key, horizon, samples)
         if critic is not None:
-            rollouts = with_control_variates(dynamics, policy, rollouts, critic)
-        if estimator == "pathwise":
-            surrogates = pathwise_surrogate(policy, rollouts, critic)
-        else:
-            surrogates = score_surrogate(moved, policy, rollouts, critic)
+            rollouts = with_control_variates(agent, rollouts, critic)
+        surrogates = (pathwise_surrogate if pathwise else score_surrogate)(moved, rollouts, critic)
         rollouts = jax.lax.stop_gradient(rollouts)
         weights = jax.lax.stop_gradient(_cross_weights(q_estimates(rollouts)[..., 0], weight_function))
         return jnp.sum(weights * surrogates) / samples, rollouts
 
-    return jax.grad(total, has_aux=True)(dynamics.parameters)
+    return jax.grad(total, has_aux=True)(agent.dynamics.parameters)
 
 
 def check_estimator(estimator: Estimator, dynamics: Dynamics, tasks: ContinuousTask) -> None:

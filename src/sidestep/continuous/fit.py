@@ -8,6 +8,7 @@ little behind the model; `policy_gap` measures by how much.
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -22,18 +23,10 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from sidestep._typing import FloatTree, Tree
 from sidestep.continuous.dynamics import Dynamics
 from sidestep.continuous.estimators import Estimator
-from sidestep.continuous.likelihood import (
-    FitProblem,
-    FitProgress,
-    Schedule,
-    check_problem,
-    improve_policy,
-    objective_gradient,
-)
-from sidestep.continuous.planner import Planner, PlannerState, PlanProblem, SomePolicy, plan_policy
-from sidestep.continuous.policies import Policy
+from sidestep.continuous.likelihood import FitProblem, FitProgress, Schedule
+from sidestep.continuous.planner import Planner, PlannerState, plan_policy
+from sidestep.continuous.policies import Agent, SomePolicy
 from sidestep.continuous.tasks import task_at
-from sidestep.continuous.trajectories import check_choices
 from sidestep.errors import NotConverged
 from sidestep.inference.checkpoints import Saver, fingerprint
 from sidestep.inference.priors import Normal, Prior
@@ -119,34 +112,28 @@ def fit_dynamics(
     References:
         Eqs. 6, 11 and 12 of the paper.
     """
-    prior, schedule = prior or Normal(), schedule or Schedule()
-    check_choices(demonstrations, policy)
-    actions = jax.vmap(policy.action)(demonstrations.actions)
-    problem = FitProblem(dynamics, demonstrations, behavior, prior, planner, actions, schedule, terms, estimator)
-    check_problem(problem, policy)
-    key = problem_fingerprint((problem, policy, seed)) if checkpoint is not None else ""
-    saver = Saver(checkpoint, key)
+    agent, schedule = Agent(dynamics, policy, behavior), schedule or Schedule()
+    problem = FitProblem(agent, demonstrations, prior or Normal(), planner, schedule, terms, estimator)
+    saver = Saver(checkpoint, problem_fingerprint((problem, seed)) if checkpoint is not None else "")
     warmup_key, key = jax.random.split(jax.random.key(seed))
     initial_key, warmup_key = jax.random.split(warmup_key)
-    carried, fixed = eqx.partition(_initialize(problem, policy, initial_key), eqx.is_array)
-    history: list[FitProgress] = []
+    state, history = _initialize(problem, initial_key), []
     if resume:
-        carried, records, _ = saver.load(carried)
+        arrays, records, _ = saver.load(eqx.filter(state, eqx.is_array))
+        state = eqx.combine(arrays, state)
         history = [FitProgress(int(record[0]), *record[1:]) for record in records]
     if not history:
-        carried = eqx.filter(_warm_up(problem, eqx.combine(carried, fixed), warmup_key), eqx.is_array)
+        state = _warm_up(problem, state, warmup_key)
     for iteration in range(len(history), schedule.iterations):
-        step_key = jax.random.fold_in(key, iteration)
-        carried, numbers = _step(problem, carried, fixed, step_key, jnp.asarray(iteration))
-        progress = FitProgress(iteration, *(float(number) for number in numbers[1:]))
-        history.append(progress)
-        if not np.isfinite(progress).all():
+        state, numbers = _step(problem, state, jax.random.fold_in(key, iteration), jnp.asarray(iteration))
+        history.append(FitProgress(iteration, *(float(number) for number in numbers[1:])))
+        if not np.isfinite(history[-1]).all():
             reason = "dynamics or rewards that return NaN, or too high a learning rate"
             raise NotConverged(f"the figures ceased to be finite at iteration {iteration}: {reason}")
-        saver.save(carried, history)
+        saver.save(eqx.filter(state, eqx.is_array), history)
         if report:
-            report(progress, dynamics.with_parameters(eqx.combine(carried, fixed).parameters))
-    return _result(problem, eqx.combine(carried, fixed), history)
+            report(history[-1], dynamics.with_parameters(state.parameters))
+    return _result(problem, state, history)
 
 
 def problem_fingerprint(problem: Tree) -> str:
@@ -156,10 +143,9 @@ def problem_fingerprint(problem: Tree) -> str:
     return fingerprint((jax.tree.leaves(numbers), re.sub(r" at 0x[0-9a-f]+", "", text)))
 
 
-def _initialize(problem: FitProblem, policy: Policy, key: PRNGKeyArray) -> _State:
-    demos, parameters = problem.demonstrations, problem.dynamics.parameters
-    agent = PlanProblem(problem.dynamics, task_at(demos.tasks, demos.task), problem.behavior, demos.states)
-    planner_state = problem.planner.initialize(key, agent, policy)
+def _initialize(problem: FitProblem, key: PRNGKeyArray) -> _State:
+    demos, parameters = problem.demonstrations, problem.agent.dynamics.parameters
+    planner_state = problem.planner.initialize(key, problem.agent, task_at(demos.tasks, demos.task), demos.states)
     flat = ravel_pytree(parameters)[0]
     sums = jnp.zeros((2, len(flat)), flat.dtype)
     return _State(parameters, problem.schedule.adam().init(parameters), planner_state, sums)
@@ -167,36 +153,32 @@ def _initialize(problem: FitProblem, policy: Policy, key: PRNGKeyArray) -> _Stat
 
 def _warm_up(problem: FitProblem, state: _State, key: PRNGKeyArray) -> _State:
     """Plan for the first model, if the objective needs a policy."""
-    if not problem.schedule.policy_warmup or "actions" not in problem.terms:
+    steps, demos = problem.schedule.policy_warmup, problem.demonstrations
+    if not steps or "actions" not in problem.terms:
         return state
-    demos = problem.demonstrations
-    start, steps = state.planner_state, problem.schedule.policy_warmup
-    agent = problem.dynamics, demos.tasks, problem.behavior, start.policy
-    seed = int(jax.random.randint(key, (), 0, 2**31 - 1))
-    plan = plan_policy(*agent, demos.states, demos.task, problem.planner, steps=steps, seed=seed, warm_start=start)
-    return eqx.tree_at(lambda state: state.planner_state, state, plan.planner_state)
+    starts, seed = (demos.tasks, demos.states, demos.task), int(jax.random.randint(key, (), 0, 2**31 - 1))
+    plan = plan_policy(problem.agent, *starts, problem.planner, steps=steps, seed=seed, warm_start=state.planner_state)
+    return replace(state, planner_state=plan.planner_state)
 
 
 @eqx.filter_jit
 def _step(
-    problem: FitProblem, carried: Tree, fixed: Tree, key: PRNGKeyArray, iteration: Int[Array, ""]
-) -> tuple[Tree, FitProgress]:
+    problem: FitProblem, state: _State, key: PRNGKeyArray, iteration: Int[Array, ""]
+) -> tuple[_State, FitProgress]:
     """Make one step of the policy, its critic and the model."""
-    state: _State = eqx.combine(carried, fixed)
-    schedule = problem.schedule
+    schedule, planner_state = problem.schedule, state.planner_state
     model_key, *policy_keys = jax.random.split(key, schedule.policy_steps)
-    planner_state = state.planner_state
     if "actions" in problem.terms:
         for policy_key in policy_keys:
-            planner_state = improve_policy(problem, state.parameters, planner_state, policy_key)
-    planner_state, slope, numbers = objective_gradient(problem, state.parameters, planner_state, model_key)
+            planner_state = problem.improve_policy(state.parameters, planner_state, policy_key)
+    planner_state, slope, numbers = problem.objective_gradient(state.parameters, planner_state, model_key)
     step, moments = schedule.adam().update(slope, state.moments)
     parameters = optax.apply_updates(state.parameters, step)
     begin, middle, end = _last_quarter(schedule)
     after = jnp.stack([iteration >= begin, iteration >= middle])
     within = after & jnp.stack([iteration < middle, iteration < end])
     sums = state.sums + within[:, None] * ravel_pytree(parameters)[0]
-    return eqx.filter(_State(parameters, moments, planner_state, sums), eqx.is_array), numbers
+    return _State(parameters, moments, planner_state, sums), numbers
 
 
 def _last_quarter(schedule: Schedule) -> tuple[int, int, int]:
@@ -208,14 +190,14 @@ def _last_quarter(schedule: Schedule) -> tuple[int, int, int]:
 def _result(problem: FitProblem, state: _State, history: list[FitProgress]) -> ContinuousFit:
     schedule = problem.schedule
     begin, middle, end = _last_quarter(schedule)
-    flat, to_parameters = ravel_pytree(problem.dynamics.parameters)
+    flat, to_parameters = ravel_pytree(problem.agent.dynamics.parameters)
     former, latter = state.sums / jnp.asarray([[middle - begin], [end - middle]], flat.dtype)
     distance = jnp.cumsum(schedule.rate()(jnp.arange(end)))
     possible = distance[middle:end].mean() - distance[begin:middle].mean()
     drift = float(jnp.abs(latter - former).max() / possible)
     gap = float(np.mean([progress.policy_gap for progress in history[begin:]]))
     return ContinuousFit(
-        dynamics=problem.dynamics.with_parameters(to_parameters((former + latter) / 2)),
+        dynamics=problem.agent.dynamics.with_parameters(to_parameters((former + latter) / 2)),
         planner_state=state.planner_state,
         history=tuple(history),
         drift=drift,

@@ -18,11 +18,10 @@ from jaxtyping import Array, Float, Int
 from sidestep.continuous.dynamics import GaussianDynamics, Vector, check_corners
 from sidestep.continuous.tasks import ContinuousTask
 from sidestep.errors import InputError
+from sidestep.tabular.backups import Behavior
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.models import TabularModel
 from sidestep.tabular.tasks import Task
-
-Actions = Float[Array, "actions inputs"]
 
 
 class Lattice(eqx.Module):
@@ -90,44 +89,58 @@ class Lattice(eqx.Module):
         return values[points] @ weights
 
 
-def tabular_model(dynamics: GaussianDynamics, lattice: Lattice, actions: Actions) -> TabularModel:
-    """Return the transition model of a lattice over a continuous world.
+class LatticePlanner(eqx.Module):
+    """An agent that plans exactly, but for a lattice.
+
+    Attributes:
+        dynamics: The dynamics that it believes in.
+        actions: The actions that it chooses from.
+        behavior: Its backup and β.
+        lattice: The points of its values.
 
     References:
         Munos and Moore (2002), "Variable Resolution Discretization in Optimal Control".
     """
 
-    def outcomes(state: Vector, action: Array) -> tuple[Array, Array]:
-        log_probabilities, means = dynamics.outcomes(state, action)
-        points, weights = jax.vmap(lattice.interpolation_weights)(means)
-        return points.ravel(), (jnp.exp(log_probabilities)[:, None] * weights).ravel()
+    dynamics: GaussianDynamics
+    actions: Float[Array, "actions inputs"]
+    behavior: Behavior
+    lattice: Lattice
 
-    successors, probabilities = jax.vmap(jax.vmap(outcomes, (None, 0)), (0, None))(lattice.points(), actions)
-    possible = probabilities > 0
-    logits = jnp.log(jnp.where(possible, probabilities, 1.0))
-    return TabularModel(Graph(successors, jnp.ones((1, 1))), logits, possible)
+    def tabular_model(self) -> TabularModel:
+        """Return the transition model of the lattice over the world."""
 
+        def outcomes(state: Vector, action: Array) -> tuple[Array, Array]:
+            log_probabilities, means = self.dynamics.outcomes(state, action)
+            points, weights = jax.vmap(self.lattice.interpolation_weights)(means)
+            return points.ravel(), (jnp.exp(log_probabilities)[:, None] * weights).ravel()
 
-def tabular_task(task: ContinuousTask, lattice: Lattice, actions: Actions) -> Task:
-    """Return a continuous task on the points of a lattice."""
-    points = lattice.points()
-    reward = jax.vmap(jax.vmap(task.reward, (None, 0)), (0, None))(points, actions)
-    return Task(reward, jax.vmap(task.terminal_reward)(points), jax.vmap(task.terminal)(points), task.discount)
+        at_points = jax.vmap(jax.vmap(outcomes, (None, 0)), (0, None))
+        successors, probabilities = at_points(self.lattice.points(), self.actions)
+        possible = probabilities > 0
+        logits = jnp.log(jnp.where(possible, probabilities, 1.0))
+        return TabularModel(Graph(successors, jnp.ones((1, 1))), logits, possible)
 
+    def tabular_task(self, task: ContinuousTask) -> Task:
+        """Return a continuous task on the points of the lattice."""
+        points = self.lattice.points()
+        reward = jax.vmap(jax.vmap(task.reward, (None, 0)), (0, None))(points, self.actions)
+        return Task(reward, jax.vmap(task.terminal_reward)(points), jax.vmap(task.terminal)(points), task.discount)
 
-def action_values(
-    dynamics: GaussianDynamics,
-    lattice: Lattice,
-    task: ContinuousTask,
-    values: Float[Array, " points"],
-    state: Vector,
-    actions: Actions,
-) -> Float[Array, " actions"]:
-    """Return Q(s, a) at any place by one move of look-ahead, from the values of a lattice's points."""
+    def action_values(
+        self, task: ContinuousTask, values: Float[Array, " points"], state: Vector
+    ) -> Float[Array, " actions"]:
+        """Return Q(s, a) at any place by one move of look-ahead, from the values of the lattice's points.
 
-    def value(action: Array) -> Array:
-        log_probabilities, means = dynamics.outcomes(state, action)
-        after = jax.vmap(lambda place: lattice.interpolate(values, place))(means)
-        return task.reward(state, action) + task.discount * jnp.exp(log_probabilities) @ after
+        Args:
+            task: The task of the values.
+            values: V of every point, in units of reward.
+            state: s, the place.
+        """
 
-    return jax.vmap(value)(actions)
+        def value(action: Array) -> Array:
+            log_probabilities, means = self.dynamics.outcomes(state, action)
+            after = jax.vmap(lambda place: self.lattice.interpolate(values, place))(means)
+            return task.reward(state, action) + task.discount * jnp.exp(log_probabilities) @ after
+
+        return jax.vmap(value)(self.actions)

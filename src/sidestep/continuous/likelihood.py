@@ -9,6 +9,7 @@ and of its critic (eq. 12). Over vectors of actions the sum over a′ is a mean 
 importance weights exp(βQ)/π_λ: it is then that of the agent under the current model, even if the policy lags behind.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -16,18 +17,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sidestep._typing import Tree
-from sidestep.continuous.dynamics import Dynamics, check_finite
+from sidestep.continuous.dynamics import Dynamics, PerCandidate, check_finite
 from sidestep.continuous.estimators import Estimator, check_estimator, value_gradient
-from sidestep.continuous.planner import Planner, PlannerState, PlanProgress, check_planner, check_starts
-from sidestep.continuous.policies import FinitePolicy, PerCandidate, Policy
+from sidestep.continuous.planner import Planner, PlannerState, PlanProgress, check_starts
+from sidestep.continuous.policies import Agent, FinitePolicy, GaussianPolicy, Policy, Starts
 from sidestep.continuous.rollouts import q_estimates
-from sidestep.continuous.tasks import ContinuousTask, check_tasks, task_at, task_features
+from sidestep.continuous.tasks import check_tasks, task_at, task_features
 from sidestep.errors import InputError, check, check_count, check_positive
 from sidestep.inference.priors import Prior
-from sidestep.tabular.backups import Behavior, LogSumExp
+from sidestep.tabular.backups import LogSumExp
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import ALL_TERMS, Term
 
@@ -72,6 +73,9 @@ class Schedule(eqx.Module):
         drift_tolerance: the largest drift of a converged fit.
         policy_gap_tolerance: the largest policy gap of a converged fit, on either side of 0.
 
+    Raises:
+        InputError: For counts that are too small, and rates or tolerances not above 0.
+
     Example:
         >>> Schedule(iterations=100).learning_rate
         0.05
@@ -85,6 +89,13 @@ class Schedule(eqx.Module):
     drift_tolerance: float = eqx.field(default=0.5, static=True)
     policy_gap_tolerance: float = eqx.field(default=0.1, static=True)
 
+    def __check_init__(self):
+        # the drift is a difference between two iterations or more
+        for name, least in {"iterations": 2, "policy_warmup": 0, "batch_size": 1, "policy_steps": 1}.items():
+            check_count(getattr(self, name), least, name)
+        for name in ("learning_rate", "drift_tolerance", "policy_gap_tolerance"):
+            check_positive(getattr(self, name), name)
+
     def rate(self) -> optax.Schedule:
         """Return the learning rate as a function of the iteration."""
         return optax.cosine_decay_schedule(self.learning_rate, self.iterations, alpha=0.05)
@@ -95,185 +106,186 @@ class Schedule(eqx.Module):
 
 
 class FitProblem(eqx.Module):
-    """Data and settings of a fit.
+    """Data and settings of a fit; the agent has the initial dynamics and policy."""
 
-    Attributes:
-        actions: the action of every move, where `demonstrations.actions` holds choices.
-    """
-
-    dynamics: Dynamics
+    agent: Agent
     demonstrations: Demonstrations
-    behavior: Behavior
     prior: Prior
     planner: Planner
-    actions: Shaped[Array, "moves *action"]
     schedule: Schedule
     terms: tuple[Term, ...] = eqx.field(static=True)
     estimator: Estimator = eqx.field(static=True)
 
+    def __check_init__(self):
+        agent, demos = self.agent, self.demonstrations
+        _check_choices(demos, agent.policy)
+        message = f"expected one or both of {ALL_TERMS}, found {self.terms}"
+        check(self.terms and set(self.terms) <= set(ALL_TERMS), message, field="terms")
+        check(jax.tree.leaves(agent.dynamics.parameters), "expected parameters to learn, found none", field="dynamics")
+        check_finite(agent.dynamics.parameters)
+        check_tasks(demos.tasks)
+        check_starts(demos.states, demos.task, demos.tasks)
+        check_estimator(self.estimator, agent.dynamics, demos.tasks)
+        message = "over vectors of actions the policy is known for the log-sum-exp only: expected that, or a finite set"
+        known = isinstance(agent.policy, FinitePolicy) or isinstance(agent.behavior.backup, LogSumExp)
+        check(known, message, field="behavior")
+        check_finite(demos.next_states, field="next_states")
+        moves = demos.states, jax.vmap(agent.policy.action)(demos.actions), demos.next_states
+        _check_shapes(agent.dynamics, *(part[0] for part in moves[:2]))
+        densities = np.asarray(jax.vmap(agent.dynamics.log_prob)(*moves))
+        wrong = np.isnan(densities) | ((densities == -np.inf) & ("transitions" in self.terms))
+        move = int(wrong.argmax())
+        message = f"expected a density above 0 for every transition, found the logarithm {densities[move]}"
+        check(not wrong.any(), message, source=f"trajectory {int(demos.trajectory[move]) + 1}", field="log_prob")
 
-def improve_policy(
-    problem: FitProblem, parameters: Tree, planner_state: PlannerState, key: PRNGKeyArray
-) -> PlannerState:
-    """Make a step of the policy and its critic by rollouts from a batch of moves; the model stays the same."""
-    batch_key, rollout_key = jax.random.split(key)
-    return _action_terms(problem, parameters, planner_state, _draw_moves(problem, batch_key), rollout_key)[0]
+    def improve_policy(self, parameters: Tree, state: PlannerState, key: PRNGKeyArray) -> PlannerState:
+        """Make a step of the policy and its critic by rollouts from a batch of moves; the model stays the same.
 
+        Args:
+            parameters: θ.
+            state: The policy, its critic and their optimizers.
+            key: Draws everything random.
+        """
+        batch_key, rollout_key = jax.random.split(key)
+        return self._action_terms(parameters, state, self._draw_moves(batch_key), rollout_key)[0]
 
-def objective_gradient(
-    problem: FitProblem, parameters: Tree, planner_state: PlannerState, key: PRNGKeyArray
-) -> tuple[PlannerState, Tree, FitProgress]:
-    """Estimate the gradient of minus the objective from one batch of moves.
+    def objective_gradient(
+        self, parameters: Tree, state: PlannerState, key: PRNGKeyArray
+    ) -> tuple[PlannerState, Tree, FitProgress]:
+        """Estimate the gradient of minus the objective from one batch of moves.
 
-    Returns:
-        The next state of the planner, the gradient, and the figures of the fit.
+        Args:
+            parameters: θ.
+            state: The policy, its critic and their optimizers.
+            key: Draws everything random.
 
-    References:
-        Eq. 6 of the paper, with ∇Q by eq. 11.
-    """
-    batch_key, rollout_key = jax.random.split(key)
-    moves = _draw_moves(problem, batch_key)
-    slope, transitions, prior = _rollout_free_terms(problem, parameters, moves)
-    actions = zero = jnp.zeros_like(prior)
-    figures = zero, zero, zero
-    if "actions" in problem.terms:
-        terms = _action_terms(problem, parameters, planner_state, moves, rollout_key)
-        planner_state, action_slope, actions, plan = terms
-        slope = jax.tree.map(jnp.add, slope, action_slope)
-        figures = plan.expected_return, plan.entropy, plan.policy_gap
-    values = transitions + prior + actions, actions, transitions, prior
-    return planner_state, slope, FitProgress(0, *values, optax.tree.norm(slope), *figures)  # pyright: ignore[reportArgumentType]
+        Returns:
+            The next state of the planner, the gradient, and the figures of the fit.
 
+        References:
+            Eq. 6 of the paper, with ∇Q by eq. 11.
+        """
+        batch_key, rollout_key = jax.random.split(key)
+        moves = self._draw_moves(batch_key)
+        slope, transitions, prior = self._rollout_free_terms(parameters, moves)
+        actions = zero = jnp.zeros_like(prior)
+        figures = zero, zero, zero
+        if "actions" in self.terms:
+            state, action_slope, actions, plan = self._action_terms(parameters, state, moves, rollout_key)
+            slope = jax.tree.map(jnp.add, slope, action_slope)
+            figures = plan.expected_return, plan.entropy, plan.policy_gap
+        values = transitions + prior + actions, actions, transitions, prior
+        return state, slope, FitProgress(0, *values, optax.tree.norm(slope), *figures)  # pyright: ignore[reportArgumentType]
 
-def _draw_moves(problem: FitProblem, key: PRNGKeyArray) -> _Moves:
-    count = len(problem.demonstrations)
-    return jax.random.choice(key, count, (min(problem.schedule.batch_size, count),), replace=False)
+    def _draw_moves(self, key: PRNGKeyArray) -> _Moves:
+        count = len(self.demonstrations)
+        return jax.random.choice(key, count, (min(self.schedule.batch_size, count),), replace=False)
 
+    def _rollout_free_terms(self, parameters: Tree, moves: _Moves) -> tuple[Tree, Array, Array]:
+        """Return the gradient of minus the transitions' term (if it counts) and the prior, and the two values."""
+        demos, agent = self.demonstrations, self.agent
 
-def _rollout_free_terms(problem: FitProblem, parameters: Tree, moves: _Moves) -> tuple[Tree, Array, Array]:
-    """Return the gradient of minus the transitions' term (if it counts) and the prior, and the two values."""
-    demos = problem.demonstrations
+        def loss(parameters: Tree) -> tuple[Array, tuple[Array, Array]]:
+            dynamics, prior = agent.dynamics.with_parameters(parameters), self.prior.log_density(parameters)
+            transitions = jnp.zeros_like(prior)
+            if "transitions" in self.terms:
+                actions = jax.vmap(agent.policy.action)(demos.actions[moves])
+                log_probs = jax.vmap(dynamics.log_prob)(demos.states[moves], actions, demos.next_states[moves])
+                transitions = len(demos) / len(moves) * log_probs.sum()
+            return -(transitions + prior), (transitions, prior)
 
-    def loss(parameters: Tree) -> tuple[Array, tuple[Array, Array]]:
-        dynamics, prior = problem.dynamics.with_parameters(parameters), problem.prior.log_density(parameters)
-        transitions = jnp.zeros_like(prior)
-        if "transitions" in problem.terms:
-            arguments = demos.states[moves], problem.actions[moves], demos.next_states[moves]
-            transitions = len(demos) / len(moves) * jax.vmap(dynamics.log_prob)(*arguments).sum()
-        return -(transitions + prior), (transitions, prior)
+        slope, (transitions, prior) = jax.grad(loss, has_aux=True)(parameters)
+        return slope, transitions, prior
 
-    slope, (transitions, prior) = jax.grad(loss, has_aux=True)(parameters)
-    return slope, transitions, prior
+    def _action_terms(
+        self, parameters: Tree, state: PlannerState, moves: _Moves, key: PRNGKeyArray
+    ) -> tuple[PlannerState, Tree, Array, PlanProgress]:
+        """Estimate the actions' term by rollouts from the states of a batch of moves.
 
-
-def _action_terms(
-    problem: FitProblem, parameters: Tree, planner_state: PlannerState, moves: _Moves, key: PRNGKeyArray
-) -> tuple[PlannerState, Tree, Array, PlanProgress]:
-    """Estimate the actions' term by rollouts from the states of a batch of moves.
-
-    Returns:
-        The next state of the planner, the gradient of minus the actions' log-likelihood, this log-likelihood, and the
-        figures of the policy.
-    """
-    demos, planner, behavior, policy = problem.demonstrations, problem.planner, problem.behavior, planner_state.policy
-    choice_key, rollout_key = jax.random.split(key)
-    scale = len(demos) / len(moves)
-    tasks, states, observed = task_at(demos.tasks, demos.task[moves]), demos.states[moves], demos.actions[moves]
-    drawn, probabilities = planner.candidate_actions(choice_key, policy, tasks, states)
-    likelihood = _ActionLikelihood(behavior, policy, tasks, states, observed, drawn)
-    candidates, probabilities = likelihood.candidates(probabilities)
-    agent = problem.dynamics.with_parameters(parameters), policy, tasks, behavior
-    size = {"horizon": planner.horizon, "samples": planner.samples}
-    method = {"critic": planner_state.critic, "estimator": problem.estimator}
-    gradient, rollouts = value_gradient(*agent, rollout_key, states, candidates, likelihood.weights, **size, **method)
-    improved, progress = planner.update(planner_state, behavior, rollouts, probabilities)
-    q = q_estimates(rollouts)[..., 0].mean(axis=-1)
-    slope = jax.tree.map(lambda leaf: -scale * leaf, gradient)
-    return improved, slope, scale * likelihood.log_probs(q).sum(), progress
+        Returns:
+            The next state of the planner, the gradient of minus the actions' log-likelihood, this log-likelihood, and
+            the figures of the policy.
+        """
+        demos, planner = self.demonstrations, self.planner
+        agent = replace(self.agent, dynamics=self.agent.dynamics.with_parameters(parameters), policy=state.policy)
+        choice_key, rollout_key = jax.random.split(key)
+        tasks, states, observed = task_at(demos.tasks, demos.task[moves]), demos.states[moves], demos.actions[moves]
+        drawn, probabilities = planner.candidate_actions(choice_key, agent.policy, tasks, states)
+        likelihood = _ActionLikelihood(agent, Starts(tasks, states, drawn), observed)
+        starts, probabilities = likelihood.candidates(probabilities)
+        size = {"horizon": planner.horizon, "samples": planner.samples}
+        method = {"critic": state.critic, "estimator": self.estimator}
+        gradient, rollouts = value_gradient(agent, starts, rollout_key, likelihood.weights, **size, **method)
+        improved, progress = planner.update(state, agent.behavior, rollouts, probabilities)
+        q, scale = q_estimates(rollouts)[..., 0].mean(axis=-1), len(demos) / len(moves)
+        slope = jax.tree.map(lambda leaf: -scale * leaf, gradient)
+        return improved, slope, scale * likelihood.log_probs(q).sum(), progress
 
 
 class _ActionLikelihood(NamedTuple):
     """The likelihood of the choices of some demonstrated moves, by Q estimates.
 
-    `observed` are the choices of the demonstrations, `drawn` those of the policy (over a finite set, all actions).
+    `drawn` has the choices of the policy (over a finite set, all actions), `observed` those of the demonstrations.
     """
 
-    behavior: Behavior
-    policy: Policy
-    tasks: ContinuousTask
-    states: Array
+    agent: Agent
+    drawn: Starts
     observed: Array
-    drawn: Array
 
-    def candidates(self, probabilities: Array) -> tuple[Array, Array]:
+    def candidates(self, probabilities: Array) -> tuple[Starts, Array]:
         """Return all actions of a finite set, or the observed choices followed by those that the policy draws."""
-        if isinstance(self.policy, FinitePolicy):
+        if isinstance(self.agent.policy, FinitePolicy):
             return self.drawn, probabilities
-        candidates = jnp.concatenate([self.observed[:, None], self.drawn], axis=1)
-        return candidates, jnp.concatenate([jnp.zeros_like(probabilities[:, :1]), probabilities], axis=1)
+        choices = jnp.concatenate([self.observed[:, None], self.drawn.choices], axis=1)
+        none = jnp.zeros_like(probabilities[:, :1])
+        return replace(self.drawn, choices=choices), jnp.concatenate([none, probabilities], axis=1)
 
     def weights(self, q: PerCandidate) -> PerCandidate:
         """Return β (1 for the observed choice − π), the weights of ∇Q in ∇ log π of the observed choices."""
-        beta = self.behavior.beta
-        if isinstance(self.policy, FinitePolicy):
+        behavior = self.agent.behavior
+        if isinstance(self.agent.policy, FinitePolicy):
             observed = jax.nn.one_hot(self.observed, q.shape[1], dtype=q.dtype)
-            return beta * (observed - jnp.exp(self.behavior.log_policy(q)))
+            return behavior.beta * (observed - jnp.exp(behavior.log_policy(q)))
         probabilities = jax.nn.softmax(self._log_importance(q), axis=1)
-        return beta * jnp.concatenate([jnp.ones_like(probabilities[:, :1]), -probabilities], axis=1)
+        return behavior.beta * jnp.concatenate([jnp.ones_like(probabilities[:, :1]), -probabilities], axis=1)
 
     def log_probs(self, q: PerCandidate) -> Float[Array, " starts"]:
         """Return ln π of the observed choices."""
-        if isinstance(self.policy, FinitePolicy):
-            return jnp.take_along_axis(self.behavior.log_policy(q), self.observed[:, None], axis=1)[:, 0]
+        behavior = self.agent.behavior
+        if isinstance(self.agent.policy, FinitePolicy):
+            return jnp.take_along_axis(behavior.log_policy(q), self.observed[:, None], axis=1)[:, 0]
         weights = self._log_importance(q)
-        return self.behavior.beta * q[:, 0] - jax.nn.logsumexp(weights, axis=1) + jnp.log(weights.shape[1])
+        return behavior.beta * q[:, 0] - jax.nn.logsumexp(weights, axis=1) + jnp.log(weights.shape[1])
 
     def _log_importance(self, q: PerCandidate) -> Float[Array, "starts drawn"]:
         """Return the logarithms βQ − ln π_λ of the importance weights of the drawn choices."""
-        features = task_features(self.tasks, self.states)
-        log_probs = jax.vmap(jax.vmap(self.policy.log_prob, (None, 0)))(features, self.drawn)
-        return self.behavior.beta * q[:, 1:] - log_probs
+        features = task_features(self.drawn.tasks, self.drawn.states)
+        log_probs = jax.vmap(jax.vmap(self.agent.policy.log_prob, (None, 0)))(features, self.drawn.choices)
+        return self.agent.behavior.beta * q[:, 1:] - log_probs
 
 
-def check_problem(problem: FitProblem, policy: Policy) -> None:
-    """Refuse data or settings that do not go together."""
-    demos = problem.demonstrations
-    message = f"expected one or both of {ALL_TERMS}, found {problem.terms}"
-    check(problem.terms and set(problem.terms) <= set(ALL_TERMS), message, field="terms")
-    check_schedule(problem.schedule)
-    check_planner(problem.planner)
-    check(jax.tree.leaves(problem.dynamics.parameters), "expected parameters to learn, found none", field="dynamics")
-    check_finite(problem.dynamics.parameters)
-    check_tasks(demos.tasks)
-    check_starts(demos.states, demos.task, demos.tasks)
-    check_estimator(problem.estimator, problem.dynamics, demos.tasks)
-    message = "over vectors of actions the policy is known for the log-sum-exp only: expected that, or a finite set"
-    known = isinstance(policy, FinitePolicy) or isinstance(problem.behavior.backup, LogSumExp)
-    check(known, message, field="behavior")
-    check_finite(demos.next_states, field="next_states")
-    _check_shapes(problem)
-    densities = np.asarray(jax.vmap(problem.dynamics.log_prob)(demos.states, problem.actions, demos.next_states))
-    wrong = np.isnan(densities) | ((densities == -np.inf) & ("transitions" in problem.terms))
-    move = int(wrong.argmax())
-    message = f"expected a density above 0 for every transition, found the logarithm {densities[move]}"
-    check(not wrong.any(), message, source=f"trajectory {int(demos.trajectory[move]) + 1}", field="log_prob")
+def _check_choices(demos: Demonstrations, policy: Policy) -> None:
+    """Refuse actions that do not belong to the policy's."""
+    choices = np.asarray(demos.actions)
+    if isinstance(policy, FinitePolicy):
+        last = len(policy.actions) - 1
+        is_index = choices.ndim == 1 and np.issubdtype(choices.dtype, np.integer)
+        wrong = (choices < 0) | (choices > last) if is_index else np.ones(len(choices), bool)
+        for move in np.flatnonzero(wrong)[:1]:
+            message = f"expected the index of an action, 0…{last}, found {choices[move]}"
+            raise InputError(message, source=f"trajectory {int(demos.trajectory[move]) + 1}", field="actions")
+        return
+    check(np.issubdtype(choices.dtype, np.floating), "expected vectors, as the policy's actions are", field="actions")
+    if isinstance(policy, GaussianPolicy):
+        message = f"expected vectors of {len(policy.log_spread)}, found shape {choices.shape[1:]}"
+        check(choices.shape[1:] == policy.log_spread.shape, message, field="actions")
 
 
-def _check_shapes(problem: FitProblem) -> None:
+def _check_shapes(dynamics: Dynamics, state: Array, action: Array) -> None:
     """Refuse states or actions of shapes that the dynamics cannot take."""
-    state, action = problem.demonstrations.states[0], problem.actions[0]
     expected = f"expected states and actions that the dynamics can take, found shapes {state.shape} and {action.shape}"
     try:
-        following = jax.eval_shape(problem.dynamics.sample, jax.random.key(0), state, action).shape
+        following = jax.eval_shape(dynamics.sample, jax.random.key(0), state, action).shape
     except (TypeError, ValueError, IndexError) as error:
         raise InputError(expected, field="demonstrations") from error
     check(following == state.shape, f"{expected}, which lead to {following}", field="demonstrations")
-
-
-def check_schedule(schedule: Schedule) -> None:
-    """Refuse settings that are too small, and rates or tolerances not above 0."""
-    # the drift is a difference between two iterations or more
-    for name, least in {"iterations": 2, "policy_warmup": 0, "batch_size": 1, "policy_steps": 1}.items():
-        check_count(getattr(schedule, name), least, name)
-    for name in ("learning_rate", "drift_tolerance", "policy_gap_tolerance"):
-        check_positive(getattr(schedule, name), name)

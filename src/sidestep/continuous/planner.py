@@ -1,31 +1,48 @@
-"""Planning by policy gradients: the policy of an optimal (Q*) or soft (Q≈, eq. 12) agent that knows the dynamics.
+"""Planning by policy gradients: the policy of an optimal (Q*) or soft (Q≈) agent that knows the dynamics.
 
-`policy_gradient` has the mathematics. Each step samples rollouts from a batch of starts, and makes one step of Adam
-with the policy (eq. 12) and several with its critic.
+Each step samples rollouts from a batch of starts, and makes one step of Adam with the policy (eq. 12 of the paper) and
+several with its critic.
+
+A soft agent has π ∝ exp βQ^π. With the policy's advantages q_λ and the Q estimate Q̂_i of a rollout, the divergence
+between the agent's choices and those of π_λ falls along
+
+    −∇_λ = E [ Σ_i ∇_λ ln π_λ(a_i | s_i) γ^i ( Q̂_i − E_i − q_λ(s_i, a_i)/β ) ].
+
+This is a variational policy gradient with a baseline (Williams 1992). It differs from eq. 12 as printed in four points.
+
+1. It is divided by −β, and discounted.
+2. The baseline E_i, any function of s_i, is subtracted. The whole of what is subtracted is V_w(s_i) − b_i, a critic's
+   value, because the bonuses b_i of rollouts hold q_λ/β.
+3. Q̂_i may hold bonuses of later moves (`Backup.bonus`). As printed, eq. 12 counts rewards only, and leads to the
+   **Boltzmann average** (eqs. 3–5). The divergence to Ziebart's trajectory distribution also counts the entropies of
+   later moves, E[−Σ_{j>i} ln π_λ(a_j | s_j)]; with these the same equation leads to the **log-sum-exp**. For the
+   **hard maximum** 1/β is 0, and the ordinary policy gradient is left.
+4. At the first state of a rollout all actions are tried (or several draws of the policy), and the sum over them is
+   taken exactly, with their probabilities.
+
+The gradient is 0 where q_λ/β are the advantages of Q^π.
 """
 
 from collections.abc import Callable
-from typing import Generic, NamedTuple, TypeVar
+from dataclasses import replace
+from typing import Generic, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Int, PRNGKeyArray, Shaped
+from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
 
 from sidestep._typing import Tree
-from sidestep.continuous.critic import Critic, make_critic
-from sidestep.continuous.dynamics import Dynamics, check_finite
-from sidestep.continuous.estimators import features_at_moves, policy_advantages, with_control_variates
-from sidestep.continuous.policies import FinitePolicy, PerCandidate, Policy
-from sidestep.continuous.policy_gradient import fit_critic, policy_gap, policy_gradient
+from sidestep.continuous.dynamics import PerCandidate, PerSample, check_finite
+from sidestep.continuous.estimators import with_control_variates
+from sidestep.continuous.policies import Agent, Critic, FinitePolicy, Policy, SomePolicy, Starts, make_critic
 from sidestep.continuous.rollouts import Rollout, discounted_returns, q_estimates, returns_to_go, sample_rollouts
-from sidestep.continuous.tasks import ContinuousTask, check_tasks, has_ended, task_at, task_features
+from sidestep.continuous.tasks import ContinuousTask, States, check_tasks, has_ended, task_at, task_features
 from sidestep.errors import NotConverged, check, check_count, check_positive
-from sidestep.tabular.backups import Behavior
+from sidestep.tabular.backups import Behavior, HardMax
 
-SomePolicy = TypeVar("SomePolicy", bound=Policy)
 _sample = eqx.filter_jit(sample_rollouts)
 
 
@@ -37,7 +54,7 @@ class PlanProgress(NamedTuple):
         expected_return: the mean of Σ γ^i R_i over the starts.
         gradient: the norm of the policy's gradient, in units of reward.
         entropy: the mean over the starts, in nats.
-        policy_gap: the gap between the policy and its own Q estimates (`policy_gradient.policy_gap`). It is near 0 for
+        policy_gap: the gap between the policy and its own Q estimates (`policy_gap`). It is near 0 for
             a converged policy; noise is subtracted, so it can be below 0.
     """
 
@@ -64,22 +81,6 @@ class PlannerState(eqx.Module, Generic[SomePolicy]):
     critic_moments: Tree
 
 
-class PlanProblem(eqx.Module):
-    """An agent to plan for.
-
-    Attributes:
-        dynamics: T_θ.
-        tasks: the task of each start.
-        behavior: the agent's backup and β.
-        states: the starts.
-    """
-
-    dynamics: Dynamics
-    tasks: ContinuousTask
-    behavior: Behavior
-    states: Shaped[Array, "starts *state"]
-
-
 class Planner(eqx.Module):
     """Settings of rollouts and of the optimizers.
 
@@ -92,6 +93,9 @@ class Planner(eqx.Module):
         critic_rate: of Adam, for the critic.
         critic_width: units in each hidden layer of the critic.
         critic_steps: minibatches of a batch, each for one step of the critic.
+
+    Raises:
+        InputError: For counts below 1, fewer than 2 samples, and rates not above 0.
 
     Example:
         >>> Planner(horizon=10).samples
@@ -107,39 +111,55 @@ class Planner(eqx.Module):
     critic_width: int = eqx.field(default=64, static=True)
     critic_steps: int = eqx.field(default=8, static=True)
 
-    def initialize(self, key: PRNGKeyArray, problem: PlanProblem, policy: SomePolicy) -> PlannerState[SomePolicy]:
+    def __check_init__(self):
+        for name in ("horizon", "batch_size", "samples", "candidates", "critic_width", "critic_steps"):
+            check_count(getattr(self, name), 2 if name == "samples" else 1, name)
+        for name in ("learning_rate", "critic_rate"):
+            check_positive(getattr(self, name), name)
+
+    def initialize(
+        self, key: PRNGKeyArray, agent: Agent[SomePolicy], tasks: ContinuousTask, states: States
+    ) -> PlannerState[SomePolicy]:
         """Return the initial state, with a critic fitted to the mean return of the first policy.
 
         Args:
-            key: draws everything random.
-            problem: the agent to plan for.
-            policy: the initial policy.
+            key: Draws everything random.
+            agent: The agent to plan for, with its first policy.
+            tasks: The task of each start.
+            states: The starts.
+
+        Returns:
+            The agent's policy, a critic, and fresh optimizers for both.
 
         Raises:
-            InputError: settings that `check_planner` refuses, or no start where a task goes on.
+            InputError: For no start where a task goes on.
         """
-        check_planner(self)
         start_key, rollout_key, choice_key, critic_key = jax.random.split(key, 4)
-        count = len(problem.states)
+        count, policy = len(states), agent.policy
         batch = jax.random.choice(start_key, count, (min(count, 8 * self.batch_size),), replace=False)
-        tasks, states = task_at(problem.tasks, batch), problem.states[batch]
+        tasks, states = task_at(tasks, batch), states[batch]
         choices, _ = self.candidate_actions(choice_key, policy, tasks, states)
-        agent = problem.dynamics, policy, tasks, problem.behavior
-        rollouts = _sample(*agent, rollout_key, states, self.horizon, choices, self.samples)
+        rollouts = _sample(agent, Starts(tasks, states, choices), rollout_key, self.horizon, self.samples)
         acting = np.asarray(rollouts.acting)
         check(acting.any(), "expected starts where a task has not ended", field="states")
-        examples = features_at_moves(rollouts), rollouts.fraction_left, returns_to_go(rollouts)[..., :-1]
+        examples = rollouts.features(), rollouts.fraction_left, returns_to_go(rollouts)[..., :-1]
         critic = make_critic(critic_key, *(leaf[acting] for leaf in examples), width=self.critic_width)
         optimizers = (policy, optax.adam(self.learning_rate)), (critic, optax.adam(self.critic_rate))
         moments = (adam.init(eqx.filter(module, eqx.is_inexact_array)) for module, adam in optimizers)
         return PlannerState(policy, critic, *moments)
 
     def candidate_actions(
-        self, key: PRNGKeyArray, policy: Policy, tasks: ContinuousTask, states: Shaped[Array, "starts *state"]
+        self, key: PRNGKeyArray, policy: Policy, tasks: ContinuousTask, states: States
     ) -> tuple[Shaped[Array, "starts candidates *choice"], PerCandidate]:
         """Return the first choices to try from every start, and their probabilities.
 
         A sum over the candidates with these probabilities is a mean under the policy.
+
+        Args:
+            key: Draws the candidates where actions are vectors.
+            policy: π_λ.
+            tasks: The task of each start.
+            states: The starts.
         """
         features = task_features(tasks, states)
         if isinstance(policy, FinitePolicy):
@@ -174,7 +194,7 @@ class Planner(eqx.Module):
         expected_return = jnp.sum(probabilities * mean_returns, axis=1).mean()
         tasks = jax.tree.map(lambda leaf: leaf[:, 0, 0], rollouts.task)
         entropy = jax.vmap(policy.entropy)(task_features(tasks, rollouts.states[:, 0, 0, 0])).mean()
-        advantages = policy_advantages(policy, rollouts)[..., 0, 0]
+        advantages = rollouts.policy_advantages(policy)[..., 0, 0]
         gap = policy_gap(behavior, advantages, q_estimates(rollouts)[..., 0], probabilities)
         figures = expected_return, optax.tree.norm(gradient), entropy, gap
         return after, PlanProgress(0, *figures)  # pyright: ignore[reportArgumentType]
@@ -203,11 +223,9 @@ class PolicyPlan(eqx.Module, Generic[SomePolicy]):
 
 
 def plan_policy(
-    dynamics: Dynamics,
+    agent: Agent[SomePolicy],
     tasks: ContinuousTask,
-    behavior: Behavior,
-    policy: SomePolicy,
-    states: Shaped[Array, "starts *state"],
+    states: States,
     task: Int[Array, " starts"],
     planner: Planner,
     *,
@@ -216,53 +234,50 @@ def plan_policy(
     warm_start: PlannerState[SomePolicy] | None = None,
     report: Callable[[PlanProgress], None] | None = None,
 ) -> PolicyPlan[SomePolicy]:
-    """Find the policy of an agent that knows `dynamics`, by policy gradients.
+    """Find the policy of an agent that knows its dynamics, by policy gradients.
 
     Args:
-        dynamics: T_θ.
-        tasks: all tasks, as a batch.
-        behavior: the agent's backup and β.
-        policy: the initial policy.
-        states: the starts.
-        task: the index of each start's task.
-        planner: settings of rollouts and optimizers.
-        steps: the number of steps, 1 or more.
-        seed: draws everything random.
-        warm_start: the state of an earlier plan, instead of `policy`.
-        report: called with the figures after every step.
+        agent: T_θ, the backup and β, and the initial policy.
+        tasks: All tasks, as a batch.
+        states: The starts.
+        task: The index of each start's task.
+        planner: Settings of rollouts and optimizers.
+        steps: The number of steps, 1 or more.
+        seed: Draws everything random.
+        warm_start: The state of an earlier plan, instead of the agent's policy.
+        report: Called with the figures after every step.
+
+    Returns:
+        The policy, its critic and their optimizers, and the figures of every step.
 
     Raises:
-        InputError: starts that are not finite or where a task has ended, tasks that do not exist, parameters that are
-            not finite, settings out of range, or a mellowmax agent with vectors of actions.
-        NotConverged: figures that cease to be finite.
+        InputError: For starts that are not finite or where a task has ended, tasks that do not exist, parameters that
+            are not finite, a number of steps below 1, or a mellowmax agent with vectors of actions.
+        NotConverged: For figures that cease to be finite.
 
     Example:
-        >>> import sidestep as ss
-        >>> import sidestep.continuous as sc
+        >>> import sidestep as ss, sidestep.continuous as sc
         >>> task = sc.QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.eye(1), jnp.asarray(0.9))
         >>> dynamics = sc.LinearGaussian(jnp.eye(1), jnp.eye(1), jnp.full(1, 0.1))
-        >>> starts, behavior = jnp.linspace(-1, 1, 9)[:, None], Behavior(ss.LogSumExp(), 2.0)
-        >>> policy, planner = sc.gaussian_policy(jax.random.key(0), 1, starts), Planner(horizon=3, critic_width=4)
-        >>> len(plan_policy(
-        ...     dynamics, sc.batch_tasks([task]), behavior, policy, starts, jnp.zeros(9, int), planner, steps=2
-        ... ).history)
+        >>> starts, planner = jnp.linspace(-1, 1, 9)[:, None], Planner(horizon=3, critic_width=4)
+        >>> policy = sc.gaussian_policy(jax.random.key(0), 1, starts)
+        >>> agent = sc.Agent(dynamics, policy, ss.Behavior(ss.LogSumExp(), 2.0))
+        >>> plan = plan_policy(agent, sc.batch_tasks([task]), starts, jnp.zeros(9, int), planner, steps=2)
+        >>> len(plan.history)
         2
 
     References:
-        Eq. 12 of the paper; see `policy_gradient`.
+        Eq. 12 of the paper; see the module's docstring.
     """
-    check_planner(planner)
     check_tasks(tasks)
     check_starts(states, task, tasks)
-    check_finite(dynamics.parameters)
+    check_finite(agent.dynamics.parameters)
     check_count(steps, 1, "steps")
     initial_key, key = jax.random.split(jax.random.key(seed))
-    problem = PlanProblem(dynamics, task_at(tasks, task), behavior, states)
-    state = warm_start or planner.initialize(initial_key, problem, policy)
-    history = []
+    each_task, history = task_at(tasks, task), []
+    state = warm_start or planner.initialize(initial_key, agent, each_task, states)
     for iteration in range(steps):
-        step_key = jax.random.fold_in(key, iteration)
-        state, progress = _plan_step(planner, problem, state, step_key)
+        state, progress = _plan_step(planner, agent, each_task, states, state, jax.random.fold_in(key, iteration))
         history.append(PlanProgress(iteration, *(float(number) for number in progress[1:])))
         if not np.isfinite(history[-1]).all():
             reason = "dynamics or rewards that return NaN, or too high a rate"
@@ -274,28 +289,114 @@ def plan_policy(
 
 @eqx.filter_jit
 def _plan_step(
-    planner: Planner, problem: PlanProblem, state: PlannerState[SomePolicy], key: PRNGKeyArray
-) -> tuple[PlannerState[SomePolicy], PlanProgress]:
+    planner: Planner, agent: Agent, tasks: ContinuousTask, states: States, state: PlannerState, key: PRNGKeyArray
+) -> tuple[PlannerState, PlanProgress]:
     start_key, choice_key, rollout_key = jax.random.split(key, 3)
-    count, policy = len(problem.states), state.policy
+    count, agent = len(states), replace(agent, policy=state.policy)
     batch = jax.random.choice(start_key, count, (planner.batch_size,), replace=count < planner.batch_size)
-    tasks, states = task_at(problem.tasks, batch), problem.states[batch]
-    choices, probabilities = planner.candidate_actions(choice_key, policy, tasks, states)
-    agent = problem.dynamics, policy, tasks, problem.behavior
-    rollouts = sample_rollouts(*agent, rollout_key, states, planner.horizon, choices, planner.samples)
-    rollouts = with_control_variates(problem.dynamics, policy, rollouts, state.critic)
-    return planner.update(state, problem.behavior, rollouts, probabilities)
+    tasks, states = task_at(tasks, batch), states[batch]
+    choices, probabilities = planner.candidate_actions(choice_key, agent.policy, tasks, states)
+    starts = Starts(tasks, states, choices)
+    rollouts = sample_rollouts(agent, starts, rollout_key, planner.horizon, planner.samples)
+    rollouts = with_control_variates(agent, rollouts, state.critic)
+    return planner.update(state, agent.behavior, rollouts, probabilities)
 
 
-def check_planner(planner: Planner) -> None:
-    """Refuse settings below 1, fewer than 2 samples (halves are compared), and rates not above 0."""
-    for name in ("horizon", "batch_size", "samples", "candidates", "critic_width", "critic_steps"):
-        check_count(getattr(planner, name), 2 if name == "samples" else 1, name)
-    for name in ("learning_rate", "critic_rate"):
-        check_positive(getattr(planner, name), name)
+def policy_gradient(policy: Policy, critic: Critic, rollouts: Rollout, probabilities: PerCandidate) -> Tree:
+    """Return the mean of eq. 12 over −β, with the sign of a loss: the policy improves against it.
+
+    Args:
+        policy: π_λ.
+        critic: V_w.
+        rollouts: with axes (starts, candidates, samples).
+        probabilities: of the candidates; a sum with them is a mean over the policy's first choices.
+
+    References:
+        Eq. 12 of the paper, with the differences that the module's docstring lists.
+    """
+    beyond = q_estimates(rollouts) - rollouts.action_baselines(critic)
+    # all candidates of the first move were tried, whatever their probability
+    first = (probabilities * probabilities.shape[1])[..., None, None]
+    first = jnp.broadcast_to(first, (*rollouts.acting.shape[:-1], 1))
+    counts = jnp.concatenate([first, jnp.ones_like(beyond[..., 1:])], axis=-1)
+    powers = rollouts.discount_powers(beyond.shape[-1])
+    credit = jax.lax.stop_gradient(jnp.where(rollouts.acting, counts * powers * beyond, 0.0))
+
+    def loss(policy: Policy) -> Array:
+        return -jnp.sum(credit * rollouts.policy_log_probs(policy)) / credit[..., 0].size
+
+    return eqx.filter_grad(loss)(policy)
 
 
-def check_starts(states: Shaped[Array, "starts *state"], task: Int[Array, " starts"], tasks: ContinuousTask) -> None:
+def fit_critic(
+    critic: Critic, optimizer: optax.GradientTransformation, moments: Tree, rollouts: Rollout, steps: int
+) -> tuple[Critic, Tree]:
+    """Regress a critic on returns-to-go, one step of the optimizer for each of `steps` minibatches.
+
+    First moves are left out, because their choices were not drawn from the policy. With a horizon of 1 no moves are
+    left, and the critic stays the same.
+    """
+    if rollouts.acting.shape[-1] == 1:
+        return critic, moments
+    returns = returns_to_go(rollouts)[..., :-1]
+    moves = rollouts.features(), rollouts.fraction_left, returns, rollouts.acting
+    batches = jax.tree.map(lambda leaf: minibatches(leaf[:, :, :, 1:], steps), moves)
+    learned, fixed = eqx.partition(critic, eqx.is_inexact_array)
+
+    def loss(learned: Tree, features: Array, left: Array, returns: Array, acting: Array) -> Array:
+        """Return the mean squared error, in units of the critic's spread."""
+        critic = eqx.combine(learned, fixed)
+        squares = jnp.where(acting, (jax.vmap(critic)(features, left) - returns) ** 2, 0.0) / critic.spread**2
+        return squares.sum() / jnp.maximum(acting.sum(), 1)
+
+    def step(carry: tuple[Tree, Tree], batch: tuple[Array, Array, Array, Array]) -> tuple[tuple, None]:
+        learned, moments = carry
+        slope = jax.grad(loss)(learned, *batch)
+        change, moments = optimizer.update(slope, moments)
+        return (optax.apply_updates(learned, change), moments), None
+
+    (learned, moments), _ = jax.lax.scan(step, (learned, moments), batches)
+    return eqx.combine(learned, fixed), moments
+
+
+def minibatches(
+    leaf: Shaped[Array, "starts candidates samples moves *rest"], count: int
+) -> Shaped[Array, "batches size *rest"]:
+    """Deal all moves out to minibatches, so that each holds all move numbers and different starts.
+
+    There are at most as many minibatches as entries; a remainder is left out.
+    """
+    flat = jnp.moveaxis(leaf, (3, 0), (0, 3)).reshape(-1, *leaf.shape[4:])
+    count = min(count, len(flat))
+    size = len(flat) // count
+    return jnp.swapaxes(flat[: size * count].reshape(size, count, *leaf.shape[4:]), 0, 1)
+
+
+def policy_gap(
+    behavior: Behavior, advantages: PerCandidate, q: PerSample, probabilities: PerCandidate
+) -> Float[Array, ""]:
+    """Return the mean gap between a policy and its own Q estimates.
+
+    For soft agents it is the divergence of π_λ from exp βQ̂ in nats, for optimal ones the gain of the best action in
+    units of reward. Two independent halves of the samples give the noise of Q̂, which is subtracted.
+    """
+    half = q.shape[-1] // 2
+    halves = q[..., :half].mean(axis=-1), q[..., -half:].mean(axis=-1)
+    if isinstance(behavior.backup, HardMax):
+        best = jnp.take_along_axis(halves[1], halves[0].argmax(axis=1)[:, None], axis=1)[:, 0]
+        return (best - jnp.sum(probabilities * halves[1], axis=1)).mean()
+
+    # with d = q_λ − βQ̂ the divergence is E d + ln E exp(−d)
+    difference = advantages - behavior.beta * (halves[0] + halves[1]) / 2
+    divergence = jnp.sum(probabilities * difference, axis=1)
+    divergence = divergence + jax.nn.logsumexp(-difference, axis=1, b=probabilities)
+    # noise in Q̂ adds half its variance under π
+    noise = behavior.beta * (halves[0] - halves[1]) / 2
+    noise = noise - jnp.sum(probabilities * noise, axis=1, keepdims=True)
+    return (divergence - 0.5 * jnp.sum(probabilities * noise**2, axis=1)).mean()
+
+
+def check_starts(states: States, task: Int[Array, " starts"], tasks: ContinuousTask) -> None:
     """Refuse no starts, starts that are not finite, and tasks that do not exist or have ended there."""
     count = len(tasks.discount)
     message = f"expected starts and a task for each, found {len(states)} and {len(task)}"

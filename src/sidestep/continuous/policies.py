@@ -10,7 +10,7 @@ as eq. 12 of the paper requires, for every family.
 
 import abc
 import math
-from typing import ClassVar
+from typing import ClassVar, Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -19,14 +19,15 @@ import numpy as np
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float, PRNGKeyArray, Shaped
 
-from sidestep.continuous.dynamics import Action, Real
+from sidestep.continuous.dynamics import Action, Dynamics, Real
+from sidestep.continuous.tasks import ContinuousTask, States
 from sidestep.errors import check, check_positive
+from sidestep.tabular.backups import Behavior, HardMax
 
 Features = Float[Array, " features"]
 Choice = Shaped[Array, "*choice"]
 Examples = Float[Array, "examples features"]
-PerCandidate = Float[Array, "starts candidates"]
-PerSample = Float[Array, "starts candidates samples"]
+PerExample = Float[Array, " examples"]
 
 
 class ScaledNetwork(eqx.Module):
@@ -75,6 +76,61 @@ class Policy(eqx.Module):
     @abc.abstractmethod
     def action(self, choice: Choice) -> Action:
         """Return the action that a choice stands for."""
+
+
+SomePolicy = TypeVar("SomePolicy", bound=Policy)
+
+
+class Critic(eqx.Module):
+    """A value estimate V_w(x, l) = center + spread · network(x, l), fitted to returns-to-go W_i of earlier rollouts.
+
+    l = 1 − i/τ is the fraction of the horizon that is left, because little can follow when little is left. A critic
+    only serves as a baseline or control variate (Greensmith, Bartlett and Baxter 2004): every term made from it has
+    mean 0.
+    """
+
+    network: ScaledNetwork
+    center: Float[Array, ""]
+    spread: Float[Array, ""]
+
+    def __call__(self, x: Features, left: Real) -> Real:
+        """Return the estimate."""
+        center, spread = jax.lax.stop_gradient((self.center, self.spread))
+        return center + spread * self.network(jnp.append(x, left))[0]
+
+
+class Agent(eqx.Module, Generic[SomePolicy]):
+    """An agent in a world.
+
+    Attributes:
+        dynamics: T_θ, by which it moves.
+        policy: π_λ, by which it chooses.
+        behavior: Its backup and β, which set the bonuses.
+    """
+
+    dynamics: Dynamics
+    policy: SomePolicy
+    behavior: Behavior
+
+    @property
+    def temperature(self) -> Float[Array, ""]:
+        """1/β, or 0 for an optimal agent (`HardMax`)."""
+        beta = self.behavior.beta
+        return jnp.zeros_like(beta) if isinstance(self.behavior.backup, HardMax) else 1 / beta
+
+
+class Starts(eqx.Module):
+    """The beginnings of rollouts.
+
+    Attributes:
+        tasks: The task of each start (a leading axis of starts).
+        states: s_0 of each start.
+        choices: The first choices to try from each start.
+    """
+
+    tasks: ContinuousTask
+    states: States
+    choices: Shaped[Array, "starts candidates *choice"]
 
 
 class FinitePolicy(Policy):
@@ -191,6 +247,28 @@ def gaussian_policy(
     _check_examples(examples)
     network = scaled_network(key, examples, inputs, width, depth)
     return GaussianPolicy(network, jnp.full(inputs, math.log(spread), examples.dtype))
+
+
+def make_critic(
+    key: PRNGKeyArray, examples: Examples, left: PerExample, returns: PerExample, *, width: int = 64, depth: int = 2
+) -> Critic:
+    """Return a critic that begins at the mean of observed returns-to-go.
+
+    Args:
+        key: draws the initial weights.
+        examples: the features of states.
+        left: the fraction of the horizon that was left there, in [0, 1].
+        returns: the returns-to-go from there, in units of reward.
+        width: units in each hidden layer.
+        depth: hidden layers.
+
+    Example:
+        >>> critic = make_critic(jax.random.key(0), jnp.eye(2), jnp.ones(2), jnp.array([1.0, 3.0]))
+        >>> float(critic.center), float(critic.spread)
+        (2.0, 1.0)
+    """
+    network, spread = scaled_network(key, jnp.column_stack([examples, left]), 1, width, depth), returns.std()
+    return Critic(network, returns.mean(), jnp.where(spread > 0, spread, 1.0))
 
 
 def _check_examples(examples: Examples) -> None:

@@ -20,16 +20,17 @@ The *Q estimate* of Q^π(s_i, a_i), for an agent that looks τ moves ahead, is t
     Q̂_i = R_i − z_i + γ W_{i+1},        and E[W_0] = V^π(s_0).
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, Shaped
 
-from sidestep.continuous.dynamics import Dynamics, State
-from sidestep.continuous.policies import Choice, FinitePolicy, Policy
+from sidestep.continuous.dynamics import State
+from sidestep.continuous.policies import Agent, Choice, Critic, FinitePolicy, Policy, Starts
 from sidestep.continuous.tasks import ContinuousTask
 from sidestep.errors import check_count
-from sidestep.tabular.backups import Behavior, HardMax
 
 
 class Rollout(eqx.Module):
@@ -69,49 +70,75 @@ class Rollout(eqx.Module):
         moves = self.acting.shape[-1]
         return jnp.broadcast_to(1 - jnp.arange(moves) / moves, self.acting.shape).astype(self.rewards.dtype)
 
+    def at_every_move(self, function: Callable, *more: Array) -> Array:
+        """Return function(task, state, …) at every move.
 
-def temperature(behavior: Behavior) -> Float[Array, ""]:
-    """Return 1/β, or 0 for an optimal agent (`HardMax`)."""
-    return jnp.zeros_like(behavior.beta) if isinstance(behavior.backup, HardMax) else 1 / behavior.beta
+        Args:
+            function: Of the task, of the state that the move leaves, and of an entry of each of `more`.
+            more: Arrays with all axes of the moves.
+        """
+        mapped = jax.vmap(function, (None, *(0,) * (1 + len(more))))
+        for _ in self.acting.shape[:-1]:
+            mapped = jax.vmap(mapped)
+        return mapped(self.task, self.leaving, *more)
+
+    def features(self) -> Float[Array, "*batch moves features"]:
+        """Return the features of every state that a move leaves."""
+        return self.at_every_move(lambda task, state: task.features(state))
+
+    def policy_log_probs(self, policy: Policy) -> Float[Array, "*batch moves"]:
+        """Return ln π_λ(a_i | s_i) of every move."""
+        return self.at_every_move(lambda task, s, choice: policy.log_prob(task.features(s), choice), self.choices)
+
+    def policy_advantages(self, policy: Policy) -> Float[Array, "*batch moves"]:
+        """Return q_λ(s_i, a_i) = ln π_λ(a_i | s_i) + H(π_λ(· | s_i)) of every move."""
+        entropies = self.at_every_move(lambda task, state: policy.entropy(task.features(state)))
+        return self.policy_log_probs(policy) + entropies
+
+    def action_baselines(self, critic: Critic | None) -> Float[Array, "*batch moves"]:
+        """Return E_i = V_w(s_i) − b_i of every move; V_w is 0 without a critic."""
+        if critic is None:
+            return -self.bonuses
+        values = self.at_every_move(lambda task, s, left: critic(task.features(s), left), self.fraction_left)
+        return values - self.bonuses
+
+    def discount_powers(self, count: int) -> Float[Array, "*batch count"]:
+        """Return γ^0…γ^{count−1} of every rollout."""
+        return self.task.discount[..., None] ** jnp.arange(count)
 
 
 def sample_rollout(
-    dynamics: Dynamics,
-    policy: Policy,
-    task: ContinuousTask,
-    behavior: Behavior,
-    key: PRNGKeyArray,
-    state: State,
-    horizon: int,
-    choice: Choice | None = None,
+    agent: Agent, task: ContinuousTask, key: PRNGKeyArray, state: State, horizon: int, choice: Choice | None = None
 ) -> Rollout:
     """Sample one rollout from a state.
 
     It is differentiable along the path by θ, by λ, or both, where dynamics and policy are reparameterized.
 
     Args:
-        dynamics: T_θ.
-        policy: π_λ.
-        task: rewards and ends.
-        behavior: the agent's backup and β, which set the bonuses.
-        key: draws everything random.
+        agent: T_θ, π_λ and the backup.
+        task: Rewards and ends.
+        key: Draws everything random.
         state: s_0.
         horizon: τ, the number of moves, 1 or more.
-        choice: the first choice; drawn from the policy by default.
+        choice: The first choice; drawn from the policy by default.
+
+    Returns:
+        The rollout, with `horizon` moves.
 
     Raises:
-        InputError: a horizon below 1.
+        InputError: For a horizon below 1.
 
     Example:
-        >>> import sidestep.continuous as sc
+        >>> import sidestep as ss, sidestep.continuous as sc
         >>> task = sc.QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.eye(1), jnp.asarray(0.9))
         >>> dynamics = sc.LinearGaussian(jnp.eye(1), jnp.eye(1), jnp.full(1, 0.1))
         >>> policy = sc.gaussian_policy(jax.random.key(0), 1, jnp.ones((1, 1)))
-        >>> behavior = Behavior(HardMax())
-        >>> sample_rollout(dynamics, policy, task, behavior, jax.random.key(1), jnp.zeros(1), horizon=5).states.shape
+        >>> agent = sc.Agent(dynamics, policy, ss.Behavior(ss.HardMax()))
+        >>> sample_rollout(agent, task, jax.random.key(1), jnp.zeros(1), horizon=5).states.shape
         (6, 1)
     """
     check_count(horizon, 1, "horizon")
+    policy, behavior = agent.policy, agent.behavior
     actions = len(policy.actions) if isinstance(policy, FinitePolicy) else None
 
     def move(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, tuple]:
@@ -123,65 +150,60 @@ def sample_rollout(
         reward = jnp.where(acting, task.reward(state, action), jnp.where(over, 0.0, task.terminal_reward(state)))
         features = task.features(state)
         entropy = policy.entropy(features)
-        expected = temperature(behavior) * (policy.log_prob(features, choice) + entropy)
+        expected = agent.temperature * (policy.log_prob(features, choice) + entropy)
         bonus = jnp.where(acting, behavior.backup.bonus(entropy, actions, behavior.beta) - expected, 0.0)
-        following = dynamics.sample(transition_key, state, action)
+        following = agent.dynamics.sample(transition_key, state, action)
         next_choice = policy.sample(choice_key, task.features(following))
         return (following, next_choice, over | terminal), (state, choice, reward, bonus, acting)
 
     first_key, key = jax.random.split(key)
     choice = policy.sample(first_key, task.features(state)) if choice is None else choice
-    last, moves = jax.lax.scan(move, (state, choice, jnp.zeros((), bool)), jax.random.split(key, horizon))
+    (end, _, over), moves = jax.lax.scan(move, (state, choice, jnp.zeros((), bool)), jax.random.split(key, horizon))
     states, choices, rewards, bonuses, acting = moves
-    end, _, over = last
     final = jnp.where(task.terminal(end) & ~over, task.terminal_reward(end), 0.0).astype(rewards.dtype)
     states, rewards = jnp.concatenate([states, end[None]]), jnp.append(rewards, final)
     bonuses = bonuses.astype(rewards.dtype)
     return Rollout(task, states, choices, rewards, bonuses, jnp.zeros_like(bonuses), acting)
 
 
-def sample_rollouts(
-    dynamics: Dynamics,
-    policy: Policy,
-    tasks: ContinuousTask,
-    behavior: Behavior,
-    key: PRNGKeyArray,
-    states: Shaped[Array, "starts *state"],
-    horizon: int,
-    choices: Shaped[Array, "starts candidates *choice"],
-    samples: int,
-) -> Rollout:
+def sample_rollouts(agent: Agent, starts: Starts, key: PRNGKeyArray, horizon: int, samples: int) -> Rollout:
     """Sample several rollouts from every start with each of its first choices.
 
     The candidates of one start share their random numbers (common random numbers), which reduces the variance of
     differences between them.
 
     Args:
-        dynamics: T_θ.
-        policy: π_λ.
-        tasks: the task of each start (a leading axis of starts).
-        behavior: the agent's backup and β.
-        key: draws everything random.
-        states: s_0 of each start.
+        agent: T_θ, π_λ and the backup.
+        starts: The tasks, states and first choices.
+        key: Draws everything random.
         horizon: τ, the number of moves, 1 or more.
-        choices: the first choices to try from each start.
-        samples: rollouts of each first choice, 1 or more.
+        samples: Rollouts of each first choice, 1 or more.
 
     Returns:
         Rollouts with leading axes (starts, candidates, samples).
 
     Raises:
-        InputError: a horizon or samples below 1.
+        InputError: For a horizon or samples below 1.
+
+    Example:
+        >>> import sidestep as ss, sidestep.continuous as sc
+        >>> task = sc.QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.eye(1), jnp.asarray(0.9))
+        >>> dynamics = sc.LinearGaussian(jnp.eye(1), jnp.eye(1), jnp.full(1, 0.1))
+        >>> policy = sc.gaussian_policy(jax.random.key(0), 1, jnp.ones((1, 1)))
+        >>> starts = sc.Starts(sc.batch_tasks([task, task]), jnp.zeros((2, 1)), jnp.ones((2, 3, 1)))
+        >>> agent = sc.Agent(dynamics, policy, ss.Behavior(ss.HardMax()))
+        >>> sample_rollouts(agent, starts, jax.random.key(1), horizon=5, samples=4).states.shape
+        (2, 3, 4, 6, 1)
     """
     check_count(samples, 1, "samples")
-    keys = jax.random.split(key, (len(states), samples))
+    keys = jax.random.split(key, (len(starts.states), samples))
 
     def sample(task: ContinuousTask, state: State, choice: Choice, key: PRNGKeyArray) -> Rollout:
-        return sample_rollout(dynamics, policy, task, behavior, key, state, horizon, choice)
+        return sample_rollout(agent, task, key, state, horizon, choice)
 
     over_samples = jax.vmap(sample, (None, None, None, 0))
     over_candidates = jax.vmap(over_samples, (None, None, 0, None))
-    return jax.vmap(over_candidates)(tasks, states, choices, keys)
+    return jax.vmap(over_candidates)(starts.tasks, starts.states, starts.choices, keys)
 
 
 def returns_to_go(rollouts: Rollout) -> Float[Array, "*batch payments"]:
@@ -205,9 +227,4 @@ def q_estimates(rollouts: Rollout) -> Float[Array, "*batch moves"]:
 
 def discounted_returns(rollouts: Rollout) -> Float[Array, "*batch"]:
     """Return Σ γ^i R_i, without bonuses."""
-    return jnp.sum(discount_powers(rollouts, rollouts.rewards.shape[-1]) * rollouts.rewards, axis=-1)
-
-
-def discount_powers(rollouts: Rollout, count: int) -> Float[Array, "*batch count"]:
-    """Return γ^0…γ^{count−1} of every rollout."""
-    return rollouts.task.discount[..., None] ** jnp.arange(count)
+    return jnp.sum(rollouts.discount_powers(rollouts.rewards.shape[-1]) * rollouts.rewards, axis=-1)

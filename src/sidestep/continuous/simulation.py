@@ -1,4 +1,4 @@
-"""Simulated agents in a continuous world, with values from a lattice: demonstrations to learn from.
+"""Demonstrations in continuous worlds: of simulated agents with values from a lattice, or from trajectories at hand.
 
 An agent plans with the dynamics that it believes in, exactly but for the lattice, and moves in the real ones. This
 module imports neither rollouts nor policies, so that the data do not depend on the methods that learn from them.
@@ -13,105 +13,148 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from sidestep.continuous.dynamics import GaussianDynamics
-from sidestep.continuous.lattice import Lattice, action_values, tabular_model, tabular_task
-from sidestep.continuous.tasks import ContinuousTask
+from sidestep.continuous.lattice import LatticePlanner
+from sidestep.continuous.tasks import ContinuousTask, batch_tasks, check_tasks, has_ended
 from sidestep.errors import NotConverged, check, check_count
-from sidestep.tabular.backups import Behavior
-from sidestep.tabular.demonstrations import Trajectory
+from sidestep.tabular.demonstrations import Demonstrations, Trajectory
 from sidestep.tabular.solve import SolveOptions, check_proper, solve
 
 
 def simulate_trajectories(
     key: PRNGKeyArray,
+    agent: LatticePlanner,
     real: GaussianDynamics,
-    believed: GaussianDynamics,
     tasks: Sequence[ContinuousTask],
     starts: Sequence[Float[np.ndarray, "agents dimensions"]],
-    actions: Float[Array, "actions inputs"],
-    behavior: Behavior,
-    lattice: Lattice,
     moves: int,
     options: SolveOptions | None = None,
 ) -> list[Trajectory]:
-    """Simulate agents that plan with the `believed` dynamics and move in the `real` ones.
+    """Simulate agents that plan with the dynamics that they believe in, and move in the `real` ones.
 
     Args:
-        key: draws everything random.
-        real: the dynamics of the world.
-        believed: the dynamics that agents plan with.
-        tasks: the tasks to pursue.
-        starts: for each task, the first states of its agents. Those where the task has ended give no trajectory.
-        actions: the actions to choose from.
-        behavior: the agents' backup and β.
-        lattice: the points of the values.
-        moves: the greatest length of a trajectory, 1 or more.
-        options: of the solve for the values.
+        key: Draws everything random.
+        agent: How each of the agents plans.
+        real: The dynamics of the world.
+        tasks: The tasks to pursue.
+        starts: For each task, the first states of its agents. Those where the task has ended give no trajectory.
+        moves: The greatest length of a trajectory, 1 or more.
+        options: The options of the solve for the values.
+
+    Returns:
+        The trajectories in the order of tasks and starts.
 
     Raises:
-        InputError: starts or actions that are not finite or do not have the dynamics' width, different numbers of
+        InputError: For starts or actions that are not finite or do not have the dynamics' width, different numbers of
             tasks and starts, or `moves` below 1.
-        ImproperTask: a task with infinite values.
-        NotConverged: values that did not converge.
+        ImproperTask: For a task with infinite values.
+        NotConverged: For values that did not converge.
 
     Example:
-        >>> import sidestep as ss
-        >>> import sidestep.continuous as sc
+        >>> import sidestep as ss, sidestep.continuous as sc
         >>> world = sc.LinearGaussian(jnp.eye(1), jnp.eye(1), jnp.full(1, 0.01))
         >>> task, steps = sc.reach_region((1.0,), 0.1, discount=0.9), jnp.array([[-0.5], [0.5]])
-        >>> lattice, behavior = Lattice(jnp.full(1, -1.0), jnp.ones(1), (5,)), Behavior(ss.LogSumExp(), 50.0)
-        >>> walks = simulate_trajectories(
-        ...     jax.random.key(0), world, world, [task], [np.zeros((1, 1))], steps, behavior, lattice, moves=9
-        ... )
+        >>> lattice = sc.Lattice(jnp.full(1, -1.0), jnp.ones(1), (5,))
+        >>> agent = sc.LatticePlanner(world, steps, ss.Behavior(ss.LogSumExp(), 50.0), lattice)
+        >>> walks = simulate_trajectories(jax.random.key(0), agent, world, [task], [np.zeros((1, 1))], moves=9)
         >>> walks[0].actions.tolist()
         [1, 1]
     """
     check_count(moves, 1, "moves")
     message = f"expected as many as tasks, found {len(starts)} for {len(tasks)}"
     check(0 < len(tasks) == len(starts), message, field="starts")
-    width = real.example_action().shape
+    actions, width = agent.actions, real.example_action().shape
     message = f"expected rows of finite numbers of shape {width}, found {actions.shape}"
     check(np.isfinite(actions).all() and actions.shape[1:] == width, message, field="actions")
-    model = tabular_model(believed, lattice, actions)
-    trajectories = []
+    model, trajectories = agent.tabular_model(), []
     for index, (task, own) in enumerate(zip(tasks, starts, strict=True)):
         fits = np.isfinite(own).all() and np.shape(own)[1:] == real.noise.shape
         check(fits, f"expected rows of {len(real.noise)} finite numbers", source=f"starts of task {index}")
-        table = tabular_task(task, lattice, actions)
-        check_proper(table, behavior, len(actions))
-        solution = solve(model, table, behavior, options=options)
+        table = agent.tabular_task(task)
+        check_proper(table, agent.behavior, len(actions))
+        solution = solve(model, table, agent.behavior, options=options)
         if not solution.converged:
             raise NotConverged(f"values did not converge for task {index}: a finer lattice or a smaller β may help")
         keys = jax.random.split(jax.random.fold_in(key, index), len(own))
-        world = _World(real, believed, task, behavior, lattice, solution.values, actions)
-        parts = (np.asarray(part) for part in _simulate(world, jnp.asarray(own), keys, moves))
-        for states, choices, acting in zip(*parts, strict=True):
+        parts = _simulate(agent, real, task, solution.values, jnp.asarray(own), keys, moves)
+        for states, choices, acting in zip(*map(np.asarray, parts), strict=True):
             length = int(acting.sum())
             if length:
                 trajectories.append(Trajectory(states[: length + 1], choices[:length], index))
     return trajectories
 
 
-class _World(eqx.Module):
-    real: GaussianDynamics
-    believed: GaussianDynamics
-    task: ContinuousTask
-    behavior: Behavior
-    lattice: Lattice
-    values: Float[Array, " points"]
-    actions: Float[Array, "actions inputs"]
+def gather_trajectories(trajectories: Sequence[Trajectory], tasks: Sequence[ContinuousTask]) -> Demonstrations:
+    """Return the demonstrations of trajectories in a continuous world.
+
+    Args:
+        trajectories: states of shape (moves + 1, …), actions of shape (moves, …), and the index of a task.
+        tasks: all of one kind.
+
+    Raises:
+        InputError: no or an empty trajectory, lengths or shapes that do not fit, numbers that are not finite, a task
+            that does not exist, or a trajectory that goes on after its task has ended.
+
+    Example:
+        >>> import sidestep.continuous as sc
+        >>> walk = Trajectory(np.array([[0.0], [0.5], [1.0]]), np.array([1, 1]), task=0)
+        >>> len(gather_trajectories([walk], [sc.reach_region((1.0,), 0.1)]))
+        2
+    """
+    batched = batch_tasks(tasks)
+    check_tasks(batched)
+    check(trajectories, "expected at least one trajectory", field="trajectories")
+    for row, trajectory in enumerate(trajectories, start=1):
+        _check_trajectory(trajectory, trajectories[0], len(tasks), row)
+    states, actions, task = zip(*trajectories, strict=True)
+    lengths = [len(each) for each in actions]
+    demonstrations = Demonstrations(
+        states=jnp.asarray(np.concatenate([each[:-1] for each in states])),
+        actions=jnp.asarray(np.concatenate(actions)),
+        next_states=jnp.asarray(np.concatenate([each[1:] for each in states])),
+        task=jnp.asarray(np.repeat(task, lengths), dtype=jnp.int32),
+        trajectory=jnp.asarray(np.repeat(np.arange(len(lengths)), lengths), dtype=jnp.int32),
+        tasks=batched,
+    )
+    ended = has_ended(batched, demonstrations.task, demonstrations.states)
+    row = int(demonstrations.trajectory[int(ended.argmax())]) + 1
+    check(not ended.any(), "goes on after a terminal state of its task", source="trajectory", row=row)
+    return demonstrations
+
+
+def _check_trajectory(trajectory: Trajectory, first: Trajectory, tasks: int, row: int) -> None:
+    """Refuse a trajectory that is inconsistent, or has other shapes than the first."""
+    states, actions, task = trajectory
+    shape, action = np.shape(first.states)[1:], np.shape(first.actions)[1:]
+    message, field = "", None
+    if len(actions) == 0 or len(states) != len(actions) + 1 or np.shape(states)[1:] != shape:
+        message = f"expected moves and one state of shape {shape} more, found {len(actions)} and {np.shape(states)}"
+    elif np.shape(actions)[1:] != action:
+        message, field = f"expected actions of shape {action}, found {np.shape(actions)[1:]}", "actions"
+    elif not (np.isfinite(states).all() and np.isfinite(actions).all()):
+        message, field = "expected finite numbers", "actions" if np.isfinite(states).all() else "states"
+    elif not 0 <= task < tasks:
+        message = f"expected a task in 0…{tasks - 1}, found {task}"
+    check(not message, message, source="trajectory", row=row, field=field)
 
 
 @eqx.filter_jit
-def _simulate(world: _World, starts: Array, keys: Key[Array, " agents"], moves: int) -> tuple[Array, Array, Array]:
+def _simulate(
+    agent: LatticePlanner,
+    real: GaussianDynamics,
+    task: ContinuousTask,
+    values: Array,
+    starts: Array,
+    keys: Key[Array, " agents"],
+    moves: int,
+) -> tuple[Array, Array, Array]:
     """Return states, choices, and whether the task had not ended, of every agent at every move."""
 
     def move(carry: tuple[Array, Array], key: PRNGKeyArray) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:
         state, over = carry
         choice_key, transition_key = jax.random.split(key)
-        over = over | world.task.terminal(state)
-        q = action_values(world.believed, world.lattice, world.task, world.values, state, world.actions)
-        choice = jax.random.categorical(choice_key, world.behavior.log_policy(q))
-        after = jnp.where(over, state, world.real.sample(transition_key, state, world.actions[choice]))
+        over = over | task.terminal(state)
+        choice = jax.random.categorical(choice_key, agent.behavior.log_policy(agent.action_values(task, values, state)))
+        after = jnp.where(over, state, real.sample(transition_key, state, agent.actions[choice]))
         return (after, over), (state, choice, ~over)
 
     def simulate(start: Array, key: PRNGKeyArray) -> tuple[Array, Array, Array]:

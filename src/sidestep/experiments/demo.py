@@ -4,22 +4,18 @@ Agents cross the office between a few places. The map is learned from their walk
 no walk had.
 """
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import sidestep as ss
 from sidestep._files import write_json
-from sidestep.evaluation.evaluate import plan_paths
-from sidestep.io.maps import write_map
+from sidestep.experiments.output import Notify
 from sidestep.io.trajectories import walks_from_trajectories
-from sidestep.io.walks import write_walks
-from sidestep.maps.config import BehaviorConfig, MapConfig, SimulationConfig
-from sidestep.maps.learn import learn_map
+from sidestep.maps.config import SimulationConfig
 from sidestep.plotting.maps import Panel, figure_learned, save
-from sidestep.tabular.reward import Reward
 from sidestep.worlds.offices import office, places
 from sidestep.worlds.walks import simulate_walks
 
@@ -31,12 +27,14 @@ class DemoConfig:
     rows: int = 14
     columns: int = 24
     agents: SimulationConfig = field(default_factory=lambda: SimulationConfig(walks=400, goals=12))
-    learning: MapConfig = field(default_factory=lambda: MapConfig(Reward(discount=0.97), BehaviorConfig(beta=20.0)))
+    learning: ss.MapConfig = field(
+        default_factory=lambda: ss.MapConfig(ss.Reward(discount=0.97), ss.BehaviorConfig(beta=20.0))
+    )
     new_places: int = 4
 
 
 def demo(
-    folder: Path, seed: int = 0, notify: Callable[[str], None] = lambda _: None, config: DemoConfig | None = None
+    folder: Path, seed: int = 0, notify: Notify = lambda _: None, config: DemoConfig | None = None
 ) -> dict[str, Any]:
     """Run the demonstration; write `demo.png`, the true map, the walks and the learned map.
 
@@ -55,11 +53,11 @@ def demo(
     notify("agents cross the office")
     trajectories, goals = simulate_walks(truth, agents)
     walks = walks_from_trajectories(trajectories, goals, truth)
-    write_map(folder / "truth.yaml", truth.known.astype(np.float64), truth)
-    write_walks(folder / "walks.csv", walks)
+    ss.write_map(folder / "truth.yaml", truth.known.astype(np.float64), truth)
+    ss.write_walks(folder / "walks.csv", walks)
 
     notify("learning the map from their walks")
-    learned = learn_map(truth.forget(), walks, config.learning)
+    learned = ss.learn_map(truth.forget(), walks, config.learning)
     learning = learned.learning
     assert learning is not None
 
@@ -67,7 +65,7 @@ def demo(
     scores = learned.evaluate(truth)
     elsewhere = places(truth, config.new_places + len(goals), seed + 1)
     new = elsewhere[~np.isin(elsewhere, goals)][: config.new_places]
-    paths, _ = plan_paths(learned.robot(), new[:1], new[1:])
+    paths, _ = ss.plan_paths(learned.robot(), new[:1], new[1:])
     title = "what they say of its walls, and new plans"
     starts, ends = new[:1].tolist(), new[1:].tolist()
     panels = [

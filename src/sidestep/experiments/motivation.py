@@ -13,7 +13,6 @@ changes no plan, and in both forms every state has a plan of positive value.
 """
 
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -24,25 +23,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-from sidestep._files import write_json
+import sidestep as ss
 from sidestep.baselines.behavior_aware import behavior_aware
 from sidestep.baselines.interface import ModelResult
 from sidestep.baselines.maxent_irl import maxent_irl
-from sidestep.maps.config import BehaviorConfig, MapConfig
+from sidestep.experiments.output import Notify, write_results
 from sidestep.maps.fit import behavior_of
-from sidestep.plotting.maps import save
 from sidestep.plotting.policies import Curves, PolicyPanel, figure_policies
-from sidestep.robots.robot import risk_averse_robot
-from sidestep.tabular.demonstrations import Demonstrations, gather
-from sidestep.tabular.grid import Cell, Grid
-from sidestep.tabular.models import ObstacleGrid
-from sidestep.tabular.planning import plan
-from sidestep.tabular.reward import Reward
-from sidestep.tabular.simulation import simulate
-from sidestep.tabular.tasks import Task
-from sidestep.worlds.rooms import two_rooms
+from sidestep.worlds.rooms import rooms_in_a_row
 
 ROWS, COLUMNS, DOOR = 9, 13, 8
+BLANK = ss.Grid.unknown(ROWS, COLUMNS)
 MUD, MUD_FAILS = (slice(2, 5), slice(8, 11)), 0.8
 GOALS = ((0, 0), (7, 1), (3, 5), (0, 7), (0, 12), (3, 12), (6, 7), (8, 12), (4, 3))
 """The goals of the agents: cells (row, column)."""
@@ -79,12 +70,12 @@ class Form(NamedTuple):
     """
 
     worth: float
-    config: MapConfig
+    config: ss.MapConfig
 
 
 FORMS = {
-    "goal": Form(1.0, MapConfig(Reward(0.95), BehaviorConfig(beta=200.0))),
-    "steps": Form(40.0, MapConfig(Reward(1.0, 1.0), BehaviorConfig(beta=10.0))),
+    "goal": Form(1.0, ss.MapConfig(ss.Reward(0.95), ss.BehaviorConfig(beta=200.0))),
+    "steps": Form(40.0, ss.MapConfig(ss.Reward(1.0, 1.0), ss.BehaviorConfig(beta=10.0))),
 }
 
 
@@ -106,15 +97,15 @@ class Trial(NamedTuple):
     fewest: Float[np.ndarray, " starts"]
 
 
-def true_world() -> ObstacleGrid:
+def true_world() -> ss.ObstacleGrid:
     """Return the model of the two rooms with known walls and mud."""
-    known = two_rooms(ROWS, COLUMNS, DOOR).known.copy()
-    known[MUD] = Cell.UNKNOWN
-    return ObstacleGrid(Grid(known), np.log(MUD_FAILS / (1 - MUD_FAILS)))
+    known = rooms_in_a_row(ROWS, COLUMNS, (DOOR,)).known.copy()
+    known[MUD] = ss.Cell.UNKNOWN
+    return ss.ObstacleGrid(ss.Grid(known), np.log(MUD_FAILS / (1 - MUD_FAILS)))
 
 
 def run(
-    folder: Path, seed: int = 0, notify: Callable[[str], None] = lambda _: None, config: MotivationConfig | None = None
+    folder: Path, seed: int = 0, notify: Notify = lambda _: None, config: MotivationConfig | None = None
 ) -> dict[str, Any]:
     """Run the experiment; write `motivation.png` and `summary.json`.
 
@@ -128,20 +119,26 @@ def run(
         The content of `summary.json`.
     """
     config, started = config or MotivationConfig(), time.monotonic()
-    forms, panels = {}, []
+    forms, panels, curves = {}, [], []
     for name, form in FORMS.items():
-        draws = []
+        trials: dict[str, list[list[Trial]]] = {method: [] for method in ("truth", *METHODS)}
         for draw in range(config.draws):
             notify(f"reward of the form {name}: draw {draw + 1} of {config.draws}")
-            demonstrations = simulate_walks(form, config, seed + draw)
-            results = learn_models(form, demonstrations)
-            draws.append({method: _run_trials(result, form, config) for method, result in results.items()})
-            panels = panels or _panels(results, draws[0], demonstrations, config)
-        forms[name] = {method: _outcome_fractions([draw[method] for draw in draws]) for method in draws[0]}
+            walks = simulate_walks(form, config, seed + draw)
+            results = {method: learn(BLANK, walks, form.config) for method, learn in METHODS.items()}
+            results["truth"] = true_result(form)
+            for method, own in trials.items():
+                for goal in map(_state, config.new_goals):
+                    own.append([run_trial(results[method], form, goal, stakes) for stakes in config.stakes])
+            panels = panels or _panels(results, trials, walks, config)
+        forms[name] = {
+            method: _over_stakes(own) | {"goal_in_mud": _over_stakes(own[:: len(config.new_goals)])}
+            for method, own in trials.items()
+        }
+        fractions = {method: {key: forms[name][method][key] for key in OUTCOMES} for method in METHODS}
+        curves.append(Curves(TITLES[name], config.stakes, fractions))
     costs, behavior = forms["goal"]["costs"], forms["goal"]["behavior"]
     summary = {
-        "command": "experiment motivation",
-        "seed": seed,
         "draws": config.draws,
         "stays_put_by_costs_at_the_smallest_stakes": costs["stays_put"][0],
         "bumps_by_costs_at_the_largest_stakes": costs["bumps"][-1],
@@ -149,52 +146,39 @@ def run(
         "stakes": list(config.stakes),
         "forms": forms,
         "settings": {name: asdict(form.config) | {"worth": form.worth} for name, form in FORMS.items()},
-        "seconds": round(time.monotonic() - started, 1),
     }
-    curves = [
-        Curves(TITLES[name], config.stakes, {method: {key: own[method][key] for key in OUTCOMES} for method in METHODS})
-        for name, own in forms.items()
-    ]
-    save(figure_policies(panels, curves), folder / "motivation.png")
-    write_json(folder / "summary.json", summary)
-    return summary
+    return write_results(folder, "motivation", seed, started, figure_policies(panels, curves), summary)
 
 
-def simulate_walks(form: Form, config: MotivationConfig, seed: int) -> Demonstrations:
+def simulate_walks(form: Form, config: MotivationConfig, seed: int) -> ss.Demonstrations:
     """Return walks of optimal agents that know the world, from states outside the mud."""
     world, random = true_world(), np.random.default_rng(seed)
-    goals, dry = [_state(goal) for goal in GOALS], np.flatnonzero(np.asarray(world.known) == Cell.FREE)
-    tasks = [form.config.reward.reach(_blank(), goal) for goal in goals]
+    goals, dry = [_state(goal) for goal in GOALS], np.flatnonzero(np.asarray(world.known) == ss.Cell.FREE)
+    tasks = [form.config.reward.reach(BLANK, goal) for goal in goals]
     starts = [random.choice(np.setdiff1d(dry, [goal]), config.walks_per_goal) for goal in goals]
-    return gather(simulate(jax.random.key(seed), world, tasks, starts), tasks)
-
-
-def learn_models(form: Form, demonstrations: Demonstrations) -> dict[str, ModelResult]:
-    """Return the true model, and what each method learns from the walks on an unknown map."""
-    results = {name: learn(_blank(), demonstrations, form.config) for name, learn in METHODS.items()}
-    return {"truth": true_result(form), **results}
+    return ss.gather(ss.simulate(jax.random.key(seed), world, tasks, starts), tasks)
 
 
 def true_result(form: Form) -> ModelResult:
     """Return the true model as a result."""
     world, behavior = true_world(), behavior_of(form.config.behavior)
-    ranking, robot = np.asarray(world.blocked), risk_averse_robot(world, [])
+    ranking, robot = np.asarray(world.blocked), ss.risk_averse_robot(world, [])
     return ModelResult(world, form.config.reward, behavior, ranking, robot, converged=True)
 
 
-def task_at_stakes(result: ModelResult, form: Form, goal: int, stakes: float) -> Task:
+def task_at_stakes(result: ModelResult, form: Form, goal: int, stakes: float) -> ss.Task:
     """Return the task of reaching a state with the goal's pay and the step costs multiplied by the stakes.
 
     The costs of cells stay as they were learned: a global cost function does not depend on the task.
     """
-    learned, base = (reward.reach(_blank(), goal) for reward in (result.reward, form.config.reward))
+    learned, base = (reward.reach(BLANK, goal) for reward in (result.reward, form.config.reward))
     pay = jnp.full((1,), stakes * form.worth)
-    return Task(learned.reward + (stakes - 1) * base.reward, pay, learned.terminal, learned.discount)
+    return ss.Task(learned.reward + (stakes - 1) * base.reward, pay, learned.terminal, learned.discount)
 
 
 def run_trial(result: ModelResult, form: Form, goal: int, stakes: float) -> Trial:
     """Return what a robot does that plans optimally with a method's result."""
-    robot = plan(result.model, task_at_stakes(result, form, goal, stakes))
+    robot = ss.plan(result.model, task_at_stakes(result, form, goal, stakes))
     fails = np.asarray(true_world().blocked).ravel()
     starts = np.setdiff1d(np.flatnonzero(fails < 1), [goal])
     paths = robot.follow(starts)
@@ -210,50 +194,34 @@ def run_trial(result: ModelResult, form: Form, goal: int, stakes: float) -> Tria
 @cache
 def _fewest_moves(goal: int) -> Float[np.ndarray, " states"]:
     """Return the smallest expected number of moves from each state in the true world."""
-    task = Reward(discount=1.0, step_cost=1.0).reach(_blank(), goal)
-    return -np.asarray(plan(true_world(), task).solution.values)
+    task = ss.Reward(discount=1.0, step_cost=1.0).reach(BLANK, goal)
+    return -np.asarray(ss.plan(true_world(), task).solution.values)
 
 
-def _run_trials(result: ModelResult, form: Form, config: MotivationConfig) -> list[list[Trial]]:
-    """Return the trials by goal and stakes."""
-    return [[run_trial(result, form, _state(goal), stakes) for stakes in config.stakes] for goal in config.new_goals]
-
-
-def _outcome_fractions(draws: list[list[list[Trial]]]) -> dict[str, Any]:
-    """Return the fraction of each outcome and the relative length of paths, from trials by draw, goal and stakes."""
-
-    def summarize(trials: list[Trial]) -> dict[str, float | None]:
+def _over_stakes(by_goal: list[list[Trial]]) -> dict[str, Any]:
+    """Return the fraction of each outcome and the relative length of paths, for each of the stakes."""
+    summary: dict[str, Any] = {name: [] for name in (*OUTCOMES, "relative_length")}
+    for trials in zip(*by_goal, strict=True):
         outcomes = np.concatenate([trial.outcomes for trial in trials])
-        arrives = outcomes == "arrives"
-        ratio = np.concatenate([trial.expected / trial.fewest for trial in trials])[arrives]
-        fractions = {name: float(np.mean(outcomes == name)) for name in OUTCOMES}
-        return fractions | {"relative_length": float(ratio.mean()) if len(ratio) else None}
-
-    def over_stakes(goals: slice) -> dict[str, list[float | None]]:
-        by_stakes = [
-            summarize([own[index] for draw in draws for own in draw[goals]]) for index in range(len(draws[0][0]))
-        ]
-        return {name: [summary[name] for summary in by_stakes] for name in by_stakes[0]}
-
-    return over_stakes(slice(None)) | {"goal_in_mud": over_stakes(slice(0, 1))}
+        ratio = np.concatenate([trial.expected / trial.fewest for trial in trials])[outcomes == "arrives"]
+        for name in OUTCOMES:
+            summary[name].append(float(np.mean(outcomes == name)))
+        summary["relative_length"].append(float(ratio.mean()) if len(ratio) else None)
+    return summary
 
 
 def _state(cell: tuple[int, int]) -> int:
     return cell[0] * COLUMNS + cell[1]
 
 
-def _blank() -> Grid:
-    return Grid.unknown(ROWS, COLUMNS)
-
-
 def _panels(
     results: dict[str, ModelResult],
     trials: dict[str, list[list[Trial]]],
-    demonstrations: Demonstrations,
+    walks: ss.Demonstrations,
     config: MotivationConfig,
 ) -> list[PolicyPanel]:
     """Return panels of the walks, of what was learned, and of robots that plan with it to the first new goal."""
-    truth, goal, paths = two_rooms(ROWS, COLUMNS, DOOR), _state(config.new_goals[0]), demonstrations.paths()
+    truth, goal, paths = rooms_in_a_row(ROWS, COLUMNS, (DOOR,)), _state(config.new_goals[0]), walks.paths()
     panels = [PolicyPanel(f"{len(paths)} walks", results["truth"].ranking, "P(a move fails)", 1.0, truth, walks=paths)]
     middle, last = len(config.stakes) // 2, len(config.stakes) - 1
     for method, index in (("costs", 0), ("costs", middle), ("costs", last), ("behavior", middle)):
@@ -261,5 +229,5 @@ def _panels(
         label, most = ("cost, in units of the goal", ranking.max()) if method == "costs" else ("P(blocked)", 1)
         policy = trial.starts, trial.intended, trial.outcomes == "stays_put"
         title = f"{method}, stakes {config.stakes[index]:g}"
-        panels.append(PolicyPanel(title, ranking, label, float(most), truth, goal, *policy))
+        panels.append(PolicyPanel(title, ranking, label, float(most), truth, goal, policy))
     return panels

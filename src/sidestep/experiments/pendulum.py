@@ -6,7 +6,6 @@ real one, are not used.
 """
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,63 +15,45 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sidestep._files import write_json
-from sidestep.continuous.fit import fit_dynamics
-from sidestep.continuous.lattice import Lattice
-from sidestep.continuous.likelihood import FitProgress, Schedule
-from sidestep.continuous.physical import Pendulum
-from sidestep.continuous.planner import Planner
-from sidestep.continuous.policies import finite_policy
-from sidestep.continuous.simulation import simulate_trajectories
-from sidestep.continuous.tasks import PendulumTask, task_at, task_features
-from sidestep.continuous.trajectories import gather_trajectories
-from sidestep.inference.priors import Normal
-from sidestep.tabular.backups import Behavior, LogSumExp
-from sidestep.tabular.demonstrations import Trajectory
+import sidestep as ss
+import sidestep.continuous as sc
+from sidestep.experiments.continuous import ContinuousConfig
+from sidestep.experiments.output import Notify, write_results
+from sidestep.plotting.physics import figure_belief
 
 
 @dataclass(frozen=True)
-class PendulumConfig:
+class PendulumConfig(ContinuousConfig):
     """Settings of the experiment.
 
     Attributes:
-        real_gravity: in m/s².
-        believed_gravity: in m/s².
-        goals: the angles to hold the pendulum at, in radians from upright; it hangs at π.
-        torques: the actions.
-        noise: the standard deviations of angle and speed.
-        start_spread: starts are uniform within these distances of angle and speed from the goal.
-        agents_per_goal: agents with each of the goals.
-        moves: the length of a trajectory.
-        beta: the agents' inverse temperature β.
+        real_gravity: In m/s².
+        believed_gravity: In m/s².
+        goals: The angles to hold the pendulum at, in radians from upright; it hangs at π.
+        torques: The actions.
+        noise: The standard deviations of angle and speed.
+        start_spread: Starts are uniform within these distances of angle and speed from the goal.
+        moves: The length of a trajectory.
         discount: γ.
-        width: units in each hidden layer of the policy.
-        lattice_points: points along angle and speed of the lattice that agents plan on.
-        planner: rollouts and the policy's optimizers.
-        schedule: length and steps of the fit.
+        lattice_points: The numbers of points along angle and speed of the lattice that agents plan on.
     """
 
+    agents_per_goal: int = 5
+    beta: float = 10.0
+    width: int = 48
+    planner: sc.Planner = field(default_factory=lambda: sc.Planner(horizon=20, learning_rate=0.01))
+    schedule: sc.Schedule = field(
+        default_factory=lambda: sc.Schedule(300, policy_warmup=150, batch_size=100, learning_rate=0.03)
+    )
     real_gravity: float = 10.0
     believed_gravity: float = 14.0
     goals: tuple[float, ...] = (np.pi - 0.25, np.pi, np.pi + 0.25, np.pi)
     torques: tuple[float, ...] = (-2.0, -1.0, 0.0, 1.0, 2.0)
     noise: tuple[float, float] = (0.01, 0.1)
     start_spread: tuple[float, float] = (2.5, 3.0)
-    agents_per_goal: int = 5
     moves: int = 60
-    beta: float = 10.0
     discount: float = 0.9
-    width: int = 48
     lattice_points: tuple[int, int] = (96, 81)
-    planner: Planner = field(default_factory=lambda: Planner(horizon=20, learning_rate=0.01))
-    schedule: Schedule = field(
-        default_factory=lambda: Schedule(iterations=300, policy_warmup=150, batch_size=100, learning_rate=0.03)
-    )
-
-    @property
-    def behavior(self) -> Behavior:
-        """The agents' backup and β."""
-        return Behavior(LogSumExp(), self.beta)
 
     @property
     def actions(self) -> Float[Array, "torques 1"]:
@@ -80,83 +61,63 @@ class PendulumConfig:
         return jnp.asarray(self.torques)[:, None]
 
     @property
-    def tasks(self) -> list[PendulumTask]:
+    def tasks(self) -> list[sc.PendulumTask]:
         """The task of each goal."""
-        return [PendulumTask(goal=jnp.asarray(goal), discount=jnp.asarray(self.discount)) for goal in self.goals]
+        return [sc.PendulumTask(goal=jnp.asarray(goal), discount=jnp.asarray(self.discount)) for goal in self.goals]
 
-    def trajectories(self, seed: int) -> list[Trajectory]:
+    def trajectories(self, seed: int) -> list[ss.Trajectory]:
         """Simulate the agents."""
         random, spread = np.random.default_rng(seed), np.array(self.start_spread)
         shape = self.agents_per_goal, 2
         starts = [np.array([goal, 0.0]) + random.uniform(-spread, spread, shape) for goal in self.goals]
-        lattice = Lattice(jnp.array([-np.pi, -8.0]), jnp.array([np.pi, 8.0]), self.lattice_points, (True, False))
-        real, believed = (Pendulum(gravity, noise=self.noise) for gravity in (self.real_gravity, self.believed_gravity))
-        key, actions, behavior = jax.random.key(seed), self.actions, self.behavior
-        return simulate_trajectories(key, real, believed, self.tasks, starts, actions, behavior, lattice, self.moves)
+        lattice = sc.Lattice(jnp.array([-np.pi, -8.0]), jnp.array([np.pi, 8.0]), self.lattice_points, (True, False))
+        real, believed = (
+            sc.Pendulum(gravity, noise=self.noise) for gravity in (self.real_gravity, self.believed_gravity)
+        )
+        agent = sc.LatticePlanner(believed, self.actions, self.behavior, lattice)
+        return sc.simulate_trajectories(jax.random.key(seed), agent, real, self.tasks, starts, self.moves)
 
 
 def run(
-    folder: Path, seed: int = 0, report: Callable[[str], None] = lambda _: None, config: PendulumConfig | None = None
+    folder: Path, seed: int = 0, notify: Notify = lambda _: None, config: PendulumConfig | None = None
 ) -> dict[str, Any]:
-    """Run the experiment, and write `pendulum.png` and `summary.json` to a folder.
+    """Run the experiment; write `pendulum.png` and `summary.json`.
 
     Args:
-        folder: the folder to write to.
-        seed: draws everything random.
-        report: called with a line of progress.
-        config: the experiment's settings.
+        folder: The folder to write to.
+        seed: Draws everything random.
+        notify: Called with a line of progress.
+        config: The experiment's settings.
 
     Returns:
-        The summary.
+        The content of `summary.json`.
     """
-    from sidestep.plotting.maps import save
-    from sidestep.plotting.physics import figure_belief
-
     started, config = time.monotonic(), config or PendulumConfig()
     real, believed = config.real_gravity, config.believed_gravity
-    report("agents swing the pendulum to a stop")
+    notify("agents swing the pendulum to a stop")
     trajectories = config.trajectories(seed)
-    demonstrations = gather_trajectories(trajectories, config.tasks)
-
-    report("planning under the real gravity")
-    own = task_at(demonstrations.tasks, demonstrations.task)
-    features = task_features(own, demonstrations.states)
+    walks = sc.gather_trajectories(trajectories, config.tasks)
     estimates: list[float] = []
 
-    def progress(progress: FitProgress, dynamics: Pendulum) -> None:
+    def report(iteration: int, dynamics: sc.Pendulum) -> None:
         estimates.append(float(dynamics.constant("gravity")))
-        report(f"learning gravity, iteration {progress.iteration} of {config.schedule.iterations}")
+        notify(f"learning gravity, iteration {iteration} of {config.schedule.iterations}")
 
-    dynamics = Pendulum(real, noise=config.noise)
-    fit = fit_dynamics(
-        dynamics,
-        demonstrations,
-        config.behavior,
-        finite_policy(jax.random.key(seed), config.actions, features, width=config.width),
-        config.planner,
-        prior=Normal(np.log(real), 0.5),
-        terms=("actions",),
-        estimator="pathwise",
-        schedule=config.schedule,
-        seed=seed,
-        report=progress,
-    )
+    notify("planning under the real gravity")
+    dynamics, prior = sc.Pendulum(real, noise=config.noise), ss.Normal(np.log(real), 0.5)
+    settings = {"prior": prior, "terms": ("actions",), "estimator": "pathwise"}
+    fit = config.fit(dynamics, walks, config.actions, seed, report, **settings)
     estimate = float(fit.dynamics.constant("gravity"))
-    summary = {
-        "command": "experiment pendulum",
-        "seed": seed,
+    results = {
         "gravity_true": believed,
         "gravity_estimate": estimate,
         "gravity_real": real,
         "relative_error": abs(estimate - believed) / believed,
         "trajectories": len(trajectories),
-        "moves": len(demonstrations),
+        "moves": len(walks),
         "converged": fit.converged,
         "message": fit.message,
-        "seconds": round(time.monotonic() - started, 1),
     }
     angles = [trajectory.states[:, 0] for trajectory in trajectories]
     figure = figure_belief(angles, dynamics.time_step, np.asarray(estimates), believed, real)
-    save(figure, folder / "pendulum.png")
-    write_json(folder / "summary.json", summary)
-    return summary
+    return write_results(folder, "pendulum", seed, started, figure, results)

@@ -5,8 +5,8 @@ instead: the walks become moves between cells half a meter wide, in eight direct
 """
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +15,13 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from sidestep._files import write_json
+import sidestep as ss
+import sidestep.continuous as sc
 from sidestep._typing import FloatTree
-from sidestep.continuous.likelihood import FitProgress
-from sidestep.continuous.obstacles import Field, ObstacleMotion, network_field
-from sidestep.experiments.room import Report, RoomConfig, blocked_map, fit_field, score_map
-from sidestep.inference.fit import fit
-from sidestep.inference.optimizers import LBFGS, Optimizer
-from sidestep.inference.priors import Normal, Prior
-from sidestep.io.demonstrations import demonstrations_from_walks
-from sidestep.io.walks import Walks, walks_from_table
-from sidestep.tabular.backups import Behavior, BoltzmannAverage
-from sidestep.tabular.demonstrations import Demonstrations
-from sidestep.tabular.grid import Grid
-from sidestep.tabular.models import ObstacleGrid
+from sidestep.experiments.output import Notify, write_results
+from sidestep.experiments.room import RoomConfig, blocked_map, score_map
+from sidestep.io.walks import walks_from_table
+from sidestep.plotting.maps import Panel, figure_learned
 from sidestep.worlds.continuous_room import RESOLUTION, SIDE, Room, room
 
 CELL = 0.5
@@ -43,29 +36,29 @@ class RepresentationsConfig(RoomConfig):
     """Settings of the experiment.
 
     Attributes:
-        network_rate: the learning rate of a network's weights.
-        grid_optimizer: the optimizer of the grid's cells.
+        network_rate: The learning rate of a network's weights.
+        grid_optimizer: The optimizer of the grid's cells.
     """
 
     network_rate: float = 0.02
-    grid_optimizer: Optimizer = field(default_factory=LBFGS)
+    grid_optimizer: ss.Optimizer = field(default_factory=ss.LBFGS)
 
 
-class FunctionSpacePrior(Prior):
+class FunctionSpacePrior(ss.Prior):
     """A prior on the logits of a field at some places, whatever its parameters mean.
 
     A prior on a network's weights would leave its logits free. A network with all logits low would then hardly learn,
     because the gradient of each logit is proportional to P(blocked) (1 − P(blocked)).
 
     Attributes:
-        field: the field; only its structure counts.
-        places: where its logits have the prior.
-        each: the prior on every logit.
+        field: The field; only its structure counts.
+        places: The places where its logits have the prior.
+        each: The prior on every logit.
     """
 
-    field: Field
+    field: sc.Field
     places: Float[Array, "places dimensions"]
-    each: Normal
+    each: ss.Normal
 
     def log_density(self, parameters: FloatTree) -> Float[Array, ""]:
         """Return the log-density of the logits at the places."""
@@ -74,95 +67,80 @@ class FunctionSpacePrior(Prior):
 
 
 def run(
-    folder: Path, seed: int = 0, report: Report = lambda _: None, config: RepresentationsConfig | None = None
+    folder: Path, seed: int = 0, notify: Notify = lambda _: None, config: RepresentationsConfig | None = None
 ) -> dict[str, Any]:
-    """Run the experiment, and write `representations.png` and `summary.json` to a folder.
+    """Run the experiment; write `representations.png` and `summary.json`.
 
     Args:
-        folder: the folder to write to.
-        seed: draws everything random.
-        report: called with a line of progress.
-        config: the experiment's settings.
+        folder: The folder to write to.
+        seed: Draws everything random.
+        notify: Called with a line of progress.
+        config: The experiment's settings.
 
     Returns:
-        The summary. The scores of the best representation, by AUC, are also the summary's own.
+        The content of `summary.json`. The scores of the best representation, by AUC, are also the summary's own.
     """
-    from sidestep.plotting.maps import Panel, figure_learned, save
-
     started, config = time.monotonic(), config or RepresentationsConfig()
     world = room(config.lattice_points)
-    report("agents walk around the wall")
-    demonstrations, _ = config.demonstrations(world, seed)
-    methods = {"basis functions": _fit_basis_functions, "network": _fit_network, "fine grid": _fit_grid}
+    notify("agents walk around the wall")
+    walks, _ = config.demonstrations(world, seed)
+    radial, low, high = config.radial_field(world), world.dynamics.low, world.dynamics.high
+    network = sc.network_field(jax.random.key(seed), low, high, logit=config.prior_mean)
+    on_logits = FunctionSpacePrior(network, radial.centers, config.prior)
+    slower = replace(config, schedule=replace(config.schedule, learning_rate=config.network_rate))
+    methods = {
+        "basis functions": partial(_fit_field, config, world, walks, radial, config.prior, seed),
+        "network": partial(_fit_field, slower, world, walks, network, on_logits, seed),
+        "fine grid": partial(_fit_grid, config, walks),
+    }
     results, panels = {}, []
     for name, method in methods.items():
-        report(f"learning with {name}")
+        notify(f"learning with {name}")
         began = time.monotonic()
-        blocked, parameters, converged, message = method(world, demonstrations, config, seed, report)
-        results[name] = {
-            **score_map(blocked, world)._asdict(),
-            "parameters": parameters,
-            "converged": converged,
-            "message": message,
-            "seconds": round(time.monotonic() - began, 1),
-        }
+        blocked, parameters, converged, message = method(notify, name)
+        fitted = {"parameters": parameters, "converged": converged, "message": message}
+        results[name] = {**score_map(blocked, world), **fitted, "seconds": round(time.monotonic() - began, 1)}
         panels.append(Panel(f"{name} ({results[name]['seconds']:.0f} s)", world.cells, blocked, world.cells))
     best = max(results.values(), key=lambda result: result["auc"])
-    summary = {
-        "command": "experiment representations",
-        "seed": seed,
-        **{key: best[key] for key in ("auc", "mean_inside", "mean_outside")},
-        "representations": results,
-        "moves": len(demonstrations),
-        "seconds": round(time.monotonic() - started, 1),
-    }
-    save(figure_learned(panels), folder / "representations.png")
-    write_json(folder / "summary.json", summary)
-    return summary
+    scores = {key: best[key] for key in ("auc", "mean_inside", "mean_outside")}
+    entries = {**scores, "representations": results, "moves": len(walks)}
+    return write_results(folder, "representations", seed, started, figure_learned(panels), entries)
 
 
-def _fit_basis_functions(
-    world: Room, demonstrations: Demonstrations, config: RepresentationsConfig, seed: int, report: Report
+def _fit_field(
+    config: RoomConfig,
+    world: Room,
+    walks: ss.Demonstrations,
+    field: sc.Field,
+    prior: ss.Prior,
+    seed: int,
+    notify: Notify,
+    name: str,
 ) -> LearnedField:
-    progress = _reporting(report, "basis functions", config)
-    field = config.radial_field(world)
-    result = fit_field(world, field, config.prior, demonstrations, config, seed=seed, report=progress)
-    return blocked_map(result.dynamics, world), field.parameters.size, result.converged, result.message
+    def report(iteration: int, _: sc.Dynamics) -> None:
+        notify(f"learning with {name}, iteration {iteration} of {config.schedule.iterations}")
 
-
-def _fit_network(
-    world: Room, demonstrations: Demonstrations, config: RepresentationsConfig, seed: int, report: Report
-) -> LearnedField:
-    """Fit a network under the prior of the basis functions, on its logits at their centers."""
-    low, high = world.dynamics.low, world.dynamics.high
-    field = network_field(jax.random.key(seed), low, high, logit=config.prior_mean)
-    prior = FunctionSpacePrior(field, config.radial_field(world).centers, config.prior)
-    config = replace(config, schedule=replace(config.schedule, learning_rate=config.network_rate))
-    progress = _reporting(report, "network", config)
-    result = fit_field(world, field, prior, demonstrations, config, seed=seed, report=progress)
+    fit = config.fit(world.with_field(field), walks, world.actions, seed, report, prior=prior)
     count = sum(leaf.size for leaf in jax.tree.leaves(field.parameters))
-    return blocked_map(result.dynamics, world), count, result.converged, result.message
+    return blocked_map(fit.dynamics, world), count, fit.converged, fit.message
 
 
-def _fit_grid(
-    world: Room, demonstrations: Demonstrations, config: RepresentationsConfig, seed: int, report: Report
-) -> LearnedField:
+def _fit_grid(config: RepresentationsConfig, walks: ss.Demonstrations, *_: Any) -> LearnedField:
     """Fit cells with exact values: costs and β a meter are the same, under the Boltzmann average.
 
     The Boltzmann average has finite values however short a move is.
     """
-    del world, seed, report
     count = round(SIDE / CELL)
-    grid = Grid(np.full((count, count), -1), resolution=CELL, connectivity=8)
-    moves = demonstrations_from_walks(_walks(demonstrations), grid, discount=1.0, step_cost=CELL)
-    behavior = Behavior(BoltzmannAverage(), config.beta)
-    model = ObstacleGrid(grid, config.prior_mean)
-    result = fit(model, moves, behavior, prior=config.prior, optimizer=config.grid_optimizer)
+    grid = ss.Grid(np.full((count, count), -1), resolution=CELL, connectivity=8)
+    moves = ss.demonstrations_from_walks(_walks(walks), grid, discount=1.0, step_cost=CELL)
+    behavior = ss.Behavior(ss.BoltzmannAverage(), config.beta)
+    model = ss.ObstacleGrid(grid, config.prior_mean)
+    fit = ss.fit(model, moves, behavior, prior=config.prior, optimizer=config.grid_optimizer)
     finer = np.ones((round(CELL / RESOLUTION),) * 2)
-    return np.kron(np.asarray(result.model.blocked), finer), grid.size, result.converged, result.message
+    return np.kron(np.asarray(fit.model.blocked), finer), grid.size, fit.converged, fit.message
 
 
-def _walks(demonstrations: Demonstrations) -> Walks:
+def _walks(demonstrations: ss.Demonstrations) -> ss.Walks:
     """Return the walks as a table of positions, clipped to the room, which noise can leave by a little."""
     import pyarrow as pa
 
@@ -174,12 +152,3 @@ def _walks(demonstrations: Demonstrations) -> Walks:
         for step, (x, y) in enumerate(np.clip(places, edge, SIDE - edge))
     ]
     return walks_from_table(pa.Table.from_pylist(rows))
-
-
-def _reporting(
-    report: Report, name: str, config: RepresentationsConfig
-) -> Callable[[FitProgress, ObstacleMotion], None]:
-    def progress(progress: FitProgress, _: ObstacleMotion) -> None:
-        report(f"learning with {name}, iteration {progress.iteration} of {config.schedule.iterations}")
-
-    return progress

@@ -11,7 +11,7 @@ then learned from their walks alone by four variants:
 Two maps of the paper exist only as pictures that we do not have; `sidestep.worlds.grids` has the maps used here.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -20,20 +20,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+import sidestep as ss
 from sidestep._files import write_json
-from sidestep.evaluation.evaluate import evaluate, plan_paths
-from sidestep.inference.fit import Fit, fit
-from sidestep.inference.optimizers import LBFGS, Adam, Optimizer
-from sidestep.inference.priors import Normal
+from sidestep.experiments.output import Notify
 from sidestep.plotting.maps import Panel, figure_environments, figure_learned, save
 from sidestep.robots.planners import ModelPlanner
-from sidestep.tabular.backups import Behavior, BoltzmannAverage, Gradient
-from sidestep.tabular.demonstrations import Demonstrations, gather
+from sidestep.tabular.backups import Gradient
 from sidestep.tabular.likelihood import ALL_TERMS, Term
-from sidestep.tabular.models import ObstacleGrid, true_model
-from sidestep.tabular.reward import Reward
-from sidestep.tabular.simulation import simulate
-from sidestep.tabular.solve import SolveOptions
 from sidestep.worlds.grids import WORLDS, World
 
 
@@ -43,14 +36,14 @@ class Variant(NamedTuple):
     title: str
     terms: tuple[Term, ...]
     gradient: Gradient
-    optimizer: Optimizer
+    optimizer: ss.Optimizer
 
 
 VARIANTS: Mapping[str, Variant] = {
-    "bam": Variant("BAM", ALL_TERMS, "fixed_policy", Adam()),
-    "bam_exact": Variant("BAM, exact gradient", ALL_TERMS, "exact", LBFGS()),
-    "actions_only": Variant("actions only", ("actions",), "fixed_policy", Adam()),
-    "transitions_only": Variant("transitions only", ("transitions",), "exact", LBFGS()),
+    "bam": Variant("BAM", ALL_TERMS, "fixed_policy", ss.Adam()),
+    "bam_exact": Variant("BAM, exact gradient", ALL_TERMS, "exact", ss.LBFGS()),
+    "actions_only": Variant("actions only", ("actions",), "fixed_policy", ss.Adam()),
+    "transitions_only": Variant("transitions only", ("transitions",), "exact", ss.LBFGS()),
 }
 FIGURES = {"figure2.png": ("bam", "bam_exact"), "figure3.png": ("actions_only",), "figure4.png": ("transitions_only",)}
 
@@ -71,13 +64,13 @@ class ReproduceConfig:
     worlds: tuple[str, ...] = tuple(WORLDS)
     walks_per_pair: int = 10
     beta: float = 10.0
-    reward: Reward = field(default_factory=Reward)
+    reward: ss.Reward = field(default_factory=ss.Reward)
     prior_mean: float = -2.0
     prior_variance: float = 4.0 / 2
 
 
 def reproduce(
-    folder: Path, seed: int = 0, notify: Callable[[str], None] = lambda _: None, config: ReproduceConfig | None = None
+    folder: Path, seed: int = 0, notify: Notify = lambda _: None, config: ReproduceConfig | None = None
 ) -> dict[str, Any]:
     """Run the experiments; write `figure1.png` to `figure4.png` and `summary.json`.
 
@@ -93,17 +86,15 @@ def reproduce(
     config = config or ReproduceConfig()
     worlds = [WORLDS[name]() for name in config.worlds]
     save(figure_environments(worlds), folder / "figure1.png")
-    scores: dict[str, dict[str, Any]] = {}
+    scores: dict[str, dict[str, Any]] = {world.name: {} for world in worlds}
     panels: dict[str, list[Panel]] = {name: [] for name in VARIANTS}
     for world in worlds:
         demonstrations = simulate_walks(world, config, seed)
-        scores[world.name] = {}
         for name, variant in VARIANTS.items():
-            notify(f"{world.name}: {variant.title}")
-            result = _learn(world, demonstrations, variant, config)
-            planner = ModelPlanner(result.model, partial(config.reward.reach, result.model.blank))
-            scores[world.name][name] = _scores(world, demonstrations, result, planner)
-            panels[name].append(_panel(world, variant, result, planner))
+            title = f"{world.name}: {variant.title}"
+            notify(title)
+            scores[world.name][name], panel = _learn(world, demonstrations, variant, config, title)
+            panels[name].append(panel)
     for file, names in FIGURES.items():
         drawn = [panel for name in names for panel in panels[name]]
         save(figure_learned(drawn, columns=len(worlds)), folder / file)
@@ -112,39 +103,40 @@ def reproduce(
     return summary
 
 
-def simulate_walks(world: World, config: ReproduceConfig, seed: int) -> Demonstrations:
-    """Return walks of optimal agents that know the map; the tasks of the demonstrations do not contain it."""
+def simulate_walks(world: World, config: ReproduceConfig, seed: int) -> ss.Demonstrations:
+    """Return walks of optimal agents that know the map; the tasks of the demonstrations do not contain it.
+
+    Args:
+        world: The map, the starts and the goals.
+        config: The number of walks and the reward.
+        seed: Draws the agents' choices among optimal actions.
+    """
     tasks = [config.reward.reach(world.truth.forget(), goal) for goal in world.goals]
     starts = [
         np.repeat([start for start in world.starts if start != goal], config.walks_per_pair) for goal in world.goals
     ]
-    return gather(simulate(jax.random.key(seed), true_model(world.truth), tasks, starts), tasks)
+    return ss.gather(ss.simulate(jax.random.key(seed), ss.true_model(world.truth), tasks, starts), tasks)
 
 
 def _learn(
-    world: World, demonstrations: Demonstrations, variant: Variant, config: ReproduceConfig
-) -> Fit[ObstacleGrid]:
-    return fit(
-        ObstacleGrid(world.truth.forget(), config.prior_mean),
-        demonstrations,
-        Behavior(BoltzmannAverage(), config.beta),
-        prior=Normal(config.prior_mean, config.prior_variance),
+    world: World, walks: ss.Demonstrations, variant: Variant, config: ReproduceConfig, title: str
+) -> tuple[dict[str, Any], Panel]:
+    """Return the scores of what a variant learns, and its panel."""
+    fit = ss.fit(
+        ss.ObstacleGrid(world.truth.forget(), config.prior_mean),
+        walks,
+        ss.Behavior(ss.BoltzmannAverage(), config.beta),
+        prior=ss.Normal(config.prior_mean, config.prior_variance),
         terms=variant.terms,
-        options=SolveOptions(gradient=variant.gradient),
+        options=ss.SolveOptions(gradient=variant.gradient),
         optimizer=variant.optimizer,
     )
-
-
-def _scores(
-    world: World, demonstrations: Demonstrations, result: Fit[ObstacleGrid], planner: ModelPlanner
-) -> dict[str, Any]:
-    everywhere, visited = np.ones(world.truth.shape, dtype=bool), demonstrations.visited_state_goals()
-    evaluation = evaluate(planner, np.asarray(result.model.blocked), world.truth, everywhere, visited)
-    fitted = {"objective": result.final.objective, "converged": result.converged, "message": result.message}
-    return {**evaluation.to_dict(), **fitted}
-
-
-def _panel(world: World, variant: Variant, result: Fit[ObstacleGrid], planner: ModelPlanner) -> Panel:
-    paths, _ = plan_paths(planner, np.array(world.starts), np.array(world.goals))
-    title, blocked = f"{world.name}: {variant.title}", np.asarray(result.model.blocked)
-    return Panel(title, world.truth, blocked, world.truth, paths, world.starts, world.goals)
+    planner, blocked = (
+        ModelPlanner(fit.model, partial(config.reward.reach, fit.model.blank)),
+        np.asarray(fit.model.blocked),
+    )
+    everywhere, visited = np.ones(world.truth.shape, dtype=bool), walks.visited_state_goals()
+    scores = ss.evaluate(planner, blocked, world.truth, everywhere, visited).to_dict()
+    paths, _ = ss.plan_paths(planner, np.array(world.starts), np.array(world.goals))
+    fitted = {"objective": fit.final.objective, "converged": fit.converged, "message": fit.message}
+    return {**scores, **fitted}, Panel(title, world.truth, blocked, world.truth, paths, world.starts, world.goals)

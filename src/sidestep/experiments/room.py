@@ -6,212 +6,135 @@ walks in the learned room, and walk them in the real one.
 """
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from sidestep._files import write_json
-from sidestep.continuous.fit import ContinuousFit, fit_dynamics
-from sidestep.continuous.likelihood import FitProgress, Schedule
-from sidestep.continuous.obstacles import Field, ObstacleMotion, RadialField, radial_field
-from sidestep.continuous.planner import Planner
-from sidestep.continuous.policies import finite_policy
-from sidestep.continuous.simulation import simulate_trajectories
-from sidestep.continuous.tasks import task_at, task_features
+import sidestep as ss
+import sidestep.continuous as sc
 from sidestep.evaluation.metrics import ranking_scores
-from sidestep.inference.priors import Normal, Prior
-from sidestep.tabular.backups import Behavior, LogSumExp
-from sidestep.tabular.demonstrations import Demonstrations
-from sidestep.tabular.grid import Cell
-from sidestep.tabular.likelihood import ALL_TERMS, Term
+from sidestep.experiments.continuous import ContinuousConfig
+from sidestep.experiments.output import Notify, write_results
+from sidestep.plotting.maps import Panel, figure_learned
 from sidestep.worlds.continuous_room import Room, room, walks_without_collisions
 
 _NEW_WALKS = (((1.0, 2.0), 1), ((9.0, 3.0), 2), ((3.0, 4.0), 3), ((7.0, 1.0), 4))
 """The starts of planned walks, and the indices of their goals."""
 
-Report = Callable[[str], None]
-
 
 @dataclass(frozen=True)
-class RoomConfig:
-    """Settings of the experiments in the room.
+class RoomConfig(ContinuousConfig):
+    """Settings of the experiments in the room; rewards are in meters.
 
     Attributes:
-        agents_per_goal: agents that walk to each goal.
-        beta: their inverse temperature β, in units of one over meters.
-        prior_mean: of the logit of P(blocked).
-        prior_variance: of the logit of P(blocked).
-        centers: centers of basis functions along each side.
-        width: units in each hidden layer of the policy.
-        lattice_points: points along each side of the lattice that agents plan on.
-        planner: rollouts and the policy's optimizers.
-        schedule: length and steps of the fit.
+        prior_mean: The mean of the logit of P(blocked).
+        prior_variance: The variance of the logit of P(blocked).
+        centers: The number of centers of basis functions along each side.
+        lattice_points: The number of points along each side of the lattice that agents plan on.
     """
 
     agents_per_goal: int = 24
     beta: float = 4.0
+    width: int = 48
+    planner: sc.Planner = field(default_factory=lambda: sc.Planner(horizon=24, learning_rate=0.02))
+    schedule: sc.Schedule = field(
+        default_factory=lambda: sc.Schedule(300, policy_warmup=80, learning_rate=0.15, policy_gap_tolerance=0.2)
+    )
     prior_mean: float = -2.5
     prior_variance: float = 10.0
     centers: int = 16
-    width: int = 48
     lattice_points: int = 41
-    planner: Planner = field(default_factory=lambda: Planner(horizon=24, learning_rate=0.02))
-    schedule: Schedule = field(
-        default_factory=lambda: Schedule(300, policy_warmup=80, learning_rate=0.15, policy_gap_tolerance=0.2)
-    )
 
     @property
-    def behavior(self) -> Behavior:
-        """The agents' backup and β."""
-        return Behavior(LogSumExp(), self.beta)
-
-    @property
-    def prior(self) -> Normal:
+    def prior(self) -> ss.Normal:
         """The prior over logits."""
-        return Normal(self.prior_mean, self.prior_variance)
+        return ss.Normal(self.prior_mean, self.prior_variance)
 
-    def radial_field(self, world: Room) -> RadialField:
+    def radial_field(self, world: Room) -> sc.RadialField:
         """Return basis functions at the prior's mean."""
-        return radial_field(world.dynamics.low, world.dynamics.high, (self.centers, self.centers), self.prior_mean)
+        return sc.radial_field(world.dynamics.low, world.dynamics.high, (self.centers, self.centers), self.prior_mean)
 
-    def demonstrations(self, world: Room, seed: int) -> tuple[Demonstrations, int]:
+    def demonstrations(self, world: Room, seed: int) -> tuple[ss.Demonstrations, int]:
         """Return the moves to learn from, and the number of those that were removed."""
         return walks_without_collisions(jax.random.key(seed), world, self.behavior, self.agents_per_goal, seed)
 
 
-class Scores(NamedTuple):
-    """The separation of the wall from the rest of the room by P(blocked), over small cells."""
-
-    auc: float
-    mean_inside: float
-    mean_outside: float
-
-
-def fit_field(
-    world: Room,
-    field: Field,
-    prior: Prior,
-    demonstrations: Demonstrations,
-    config: RoomConfig,
-    *,
-    seed: int,
-    terms: tuple[Term, ...] = ALL_TERMS,
-    report: Callable[[FitProgress, ObstacleMotion], None] | None = None,
-) -> ContinuousFit:
-    """Fit a field to walks in the room; the arguments are those of `fit_dynamics`."""
-    real = world.dynamics
-    own = task_at(demonstrations.tasks, demonstrations.task)
-    features = task_features(own, demonstrations.states)
-    return fit_dynamics(
-        ObstacleMotion(field, real.low, real.high, real.noise),
-        demonstrations,
-        config.behavior,
-        finite_policy(jax.random.key(seed), world.actions, features, width=config.width),
-        config.planner,
-        prior=prior,
-        terms=terms,
-        schedule=config.schedule,
-        seed=seed,
-        report=report,
-    )
-
-
-def blocked_map(dynamics: ObstacleMotion, world: Room) -> Float[np.ndarray, "rows columns"]:
+def blocked_map(dynamics: sc.ObstacleMotion, world: Room) -> Float[np.ndarray, "rows columns"]:
     """Return P(blocked) at the center of every small cell."""
     cells = world.cells
     places = jnp.asarray(cells.centers(np.arange(cells.size)))
     return np.asarray(jax.vmap(dynamics.blocked)(places)).reshape(cells.shape)
 
 
-def score_map(blocked: Float[np.ndarray, "rows columns"], world: Room) -> Scores:
-    """Compare P(blocked) with the wall."""
-    wall = world.cells.known == Cell.OCCUPIED
+def score_map(blocked: Float[np.ndarray, "rows columns"], world: Room) -> dict[str, float]:
+    """Return how P(blocked) separates the wall from the rest of the room, over small cells."""
+    wall = world.cells.known == ss.Cell.OCCUPIED
     auc, _ = ranking_scores(blocked[wall], blocked[~wall])
-    return Scores(auc or 0.0, float(blocked[wall].mean()), float(blocked[~wall].mean()))
+    means = {"mean_inside": float(blocked[wall].mean()), "mean_outside": float(blocked[~wall].mean())}
+    return {"auc": auc or 0.0, **means}
 
 
 def run(
-    folder: Path, seed: int = 0, report: Report = lambda _: None, config: RoomConfig | None = None
+    folder: Path, seed: int = 0, notify: Notify = lambda _: None, config: RoomConfig | None = None
 ) -> dict[str, Any]:
-    """Run the experiment, and write `room.png` and `summary.json` to a folder.
+    """Run the experiment; write `room.png` and `summary.json`.
 
     Args:
-        folder: the folder to write to.
-        seed: draws everything random.
-        report: called with a line of progress.
-        config: the experiment's settings.
+        folder: The folder to write to.
+        seed: Draws everything random.
+        notify: Called with a line of progress.
+        config: The experiment's settings.
 
     Returns:
-        The summary.
+        The content of `summary.json`.
     """
     started, config = time.monotonic(), config or RoomConfig()
     world = room(config.lattice_points)
-    report("agents walk around the wall")
+    notify("agents walk around the wall")
     demonstrations, collisions = config.demonstrations(world, seed)
 
-    def progress(progress: FitProgress, _: ObstacleMotion) -> None:
-        report(f"learning the wall, iteration {progress.iteration} of {config.schedule.iterations}")
+    def report(iteration: int, _: sc.Dynamics) -> None:
+        notify(f"learning the wall, iteration {iteration} of {config.schedule.iterations}")
 
-    report("planning in an empty room")
-    data = world, config.radial_field(world), config.prior, demonstrations, config
-    fit = fit_field(*data, seed=seed, report=progress)
-    report("learning from transitions alone")
-    transitions_fit = fit_field(*data, seed=seed, terms=("transitions",))
+    notify("planning in an empty room")
+    data = world.with_field(config.radial_field(world)), demonstrations, world.actions, seed
+    fit = config.fit(*data, report, prior=config.prior)
+    notify("learning from transitions alone")
+    transitions_fit = config.fit(*data, prior=config.prior, terms=("transitions",))
     blocked, by_transitions = (blocked_map(each.dynamics, world) for each in (fit, transitions_fit))
-    report("planning in the learned room")
+    notify("planning in the learned room")
     planned, arrived = _new_walks(world, fit.dynamics, seed)
-    summary = {
-        "command": "experiment room",
-        "seed": seed,
-        **score_map(blocked, world)._asdict(),
-        "transitions_only": score_map(by_transitions, world)._asdict(),
-        "walks": config.agents_per_goal * len(world.tasks),
+    walks, cells = config.agents_per_goal * len(world.tasks), world.cells
+    starts, goals = np.asarray([walk[0] for walk in planned]), np.asarray([task.goal for task in world.tasks])
+    panels = [
+        Panel(f"{walks} walks", cells, paths=demonstrations.paths(), goals=goals),
+        Panel("The learned wall, and new plans", cells, blocked, cells, planned, starts, goals),
+        Panel("By transitions alone", cells, by_transitions, cells),
+    ]
+    results = {
+        **score_map(blocked, world),
+        "transitions_only": score_map(by_transitions, world),
+        "walks": walks,
         "moves": len(demonstrations),
         "collisions_removed": collisions,
         "planned_walks_arrived": arrived,
         "planned_walks": len(planned),
         "converged": fit.converged,
         "message": fit.message,
-        "seconds": round(time.monotonic() - started, 1),
     }
-    _draw(folder / "room.png", world, demonstrations, (blocked, by_transitions), planned, summary["walks"])
-    write_json(folder / "summary.json", summary)
-    return summary
+    return write_results(folder, "room", seed, started, figure_learned(panels), results)
 
 
-def _draw(
-    path: Path,
-    world: Room,
-    demonstrations: Demonstrations,
-    maps: tuple[np.ndarray, np.ndarray],
-    planned: list[np.ndarray],
-    walks: int,
-) -> None:
-    from sidestep.plotting.maps import Panel, figure_learned, save
-
-    cells, goals = world.cells, np.asarray([task.goal for task in world.tasks])
-    starts = np.asarray([walk[0] for walk in planned])
-    panels = [
-        Panel(f"{walks} walks", cells, paths=demonstrations.paths(), goals=goals),
-        Panel("The learned wall, and new plans", cells, maps[0], cells, planned, starts, goals),
-        Panel("By transitions alone", cells, maps[1], cells),
-    ]
-    save(figure_learned(panels), path)
-
-
-def _new_walks(world: Room, believed: ObstacleMotion, seed: int) -> tuple[list[Float[np.ndarray, "places 2"]], int]:
+def _new_walks(world: Room, believed: sc.ObstacleMotion, seed: int) -> tuple[list[Float[np.ndarray, "places 2"]], int]:
     """Return walks planned in the learned room and made in the real one, and the number that arrive."""
     tasks = [world.tasks[goal] for _, goal in _NEW_WALKS]
     starts = [np.asarray([start]) for start, _ in _NEW_WALKS]
-    behavior = Behavior(LogSumExp(), 30.0)
-    walks = simulate_trajectories(
-        jax.random.key(seed + 1), world.dynamics, believed, tasks, starts, world.actions, behavior, world.lattice, 30
-    )
+    agent = sc.LatticePlanner(believed, world.actions, ss.Behavior(ss.LogSumExp(), 30.0), world.lattice)
+    walks = sc.simulate_trajectories(jax.random.key(seed + 1), agent, world.dynamics, tasks, starts, 30)
     arrived = sum(bool(tasks[walk.task].terminal(jnp.asarray(walk.states[-1]))) for walk in walks)
     return [walk.states for walk in walks], arrived

@@ -243,14 +243,13 @@ def _cell_lines(grid: Grid) -> list[Float[np.ndarray, "2 2"]]:
 
 def _borders(inside: Bool[np.ndarray, "rows columns"], grid: Grid) -> list[Float[np.ndarray, "2 2"]]:
     """Return the cell sides that separate cells inside from cells outside or from the edge of the map, in metres."""
-    rows = inside.shape[0]
-    padded = np.pad(inside, 1)
+    rows, padded = inside.shape[0], np.pad(inside, 1)
     row, column = np.nonzero(padded[1:-1, 1:] != padded[1:-1, :-1])  # left side of (row, column)
-    upright = np.stack([np.stack([column, rows - row], -1), np.stack([column, rows - row - 1], -1)], axis=1)
+    upright = np.array([[column, rows - row], [column, rows - row - 1]])
     row, column = np.nonzero(padded[1:, 1:-1] != padded[:-1, 1:-1])  # upper side of (row, column)
-    level = np.stack([np.stack([column, rows - row], -1), np.stack([column + 1, rows - row], -1)], axis=1)
-    corners = np.concatenate([upright, level]).astype(np.float64)
-    return list(grid.to_metres(corners.reshape(-1, 2)).reshape(-1, 2, 2))
+    level = np.array([[column, rows - row], [column + 1, rows - row]])
+    sides = np.concatenate([upright, level], axis=-1).transpose(2, 0, 1)
+    return list(grid.to_metres(sides.reshape(-1, 2).astype(np.float64)).reshape(-1, 2, 2))
 
 
 def _shifts(count: int) -> Float[np.ndarray, "walks 2"]:

@@ -13,6 +13,7 @@ from sidestep.plotting import palette
 from sidestep.plotting.maps import Places, draw_cells, draw_outlines, draw_places, draw_walks
 from sidestep.tabular.grid import Cell, Grid
 
+States = Int[np.ndarray, " starts"]
 _HALO = (Stroke(linewidth=2.2, foreground="white"), Normal())
 
 
@@ -26,10 +27,9 @@ class PolicyPanel:
         label: the name of the values.
         most: the value of the last color; the first color is that of 0.
         truth: the true map; its obstacles are outlined.
-        goal: the state that the robot has to reach, if there is one.
-        starts: the states from which the policy is drawn.
-        intended: the state that the next move from each start should reach.
-        stays: whether the robot stays at each start instead.
+        goal: The state that the robot has to reach, if there is one.
+        policy: The states from which the policy is drawn, the state that the next move from each should reach, and
+            whether the robot stays at each instead.
         walks: the places along each demonstrated walk.
     """
 
@@ -39,9 +39,7 @@ class PolicyPanel:
     most: float
     truth: Grid
     goal: int | None = None
-    starts: Int[np.ndarray, " starts"] | None = None
-    intended: Int[np.ndarray, " starts"] | None = None
-    stays: Bool[np.ndarray, " starts"] | None = None
+    policy: tuple[States, States, Bool[np.ndarray, " starts"]] | None = None
     walks: Sequence[Places] = ()
 
 
@@ -72,31 +70,29 @@ def figure_policies(panels: Sequence[PolicyPanel], curves: Sequence[Curves]) -> 
     return figure
 
 
-def draw_policy(axes: Axes, panel: PolicyPanel) -> None:
-    """Draw an arrow where a robot moves, a ring where it stays, and a cross on every wall that it bumps into."""
-    if panel.starts is None or panel.intended is None or panel.stays is None:
-        return
-    here, there = panel.truth.centers(panel.starts), panel.truth.centers(panel.intended)
-    moves = ~panel.stays
-    shape = {"arrowstyle": "->", "linewidth": 0.9, "shrinkA": 0, "shrinkB": 0, "path_effects": _HALO}
-    for place, step in zip(here[moves], 0.4 * (there - here)[moves], strict=True):
-        axes.annotate("", tuple(place + step), tuple(place - step), arrowprops=shape)
-    axes.plot(*here[panel.stays].T, "o", markerfacecolor="white", markeredgecolor="black", markersize=3.5)
-    targets = np.unique(panel.intended[moves])
-    walls = targets[panel.truth.known.ravel()[targets] == Cell.OCCUPIED]
-    axes.plot(*panel.truth.centers(walls).T, "X", color="white", markeredgecolor="black", markersize=6.5, zorder=5)
-
-
 def _draw_panel(figure: SubFigure, axes: Axes, panel: PolicyPanel) -> None:
     image = draw_cells(axes, panel.values, panel.truth, palette.BLOCKED, (0.0, panel.most))
     figure.colorbar(image, ax=axes, label=panel.label, location="bottom", shrink=0.8, aspect=25)
     draw_outlines(axes, panel.truth)
     draw_walks(axes, panel.walks, panel.truth)
-    draw_policy(axes, panel)
+    if panel.policy is not None:
+        _draw_policy(axes, panel.truth, *panel.policy)
     if panel.goal is not None:
         draw_places(axes, [], [panel.goal], panel.truth)
     axes.set(xlabel="", ylabel="")
     axes.set_title(panel.title, fontsize=10)
+
+
+def _draw_policy(axes: Axes, truth: Grid, starts: States, intended: States, stays: Bool[np.ndarray, " starts"]) -> None:
+    """Draw an arrow where a robot moves, a ring where it stays, and a cross on every wall that it bumps into."""
+    here, there = truth.centers(starts), truth.centers(intended)
+    shape = {"arrowstyle": "->", "linewidth": 0.9, "shrinkA": 0, "shrinkB": 0, "path_effects": _HALO}
+    for place, step in zip(here[~stays], 0.4 * (there - here)[~stays], strict=True):
+        axes.annotate("", tuple(place + step), tuple(place - step), arrowprops=shape)
+    axes.plot(*here[stays].T, "o", markerfacecolor="white", markeredgecolor="black", markersize=3.5)
+    targets = np.unique(intended[~stays])
+    walls = targets[truth.known.ravel()[targets] == Cell.OCCUPIED]
+    axes.plot(*truth.centers(walls).T, "X", color="white", markeredgecolor="black", markersize=6.5, zorder=5)
 
 
 def _draw_curves(figure: SubFigure, curves: Curves) -> None:

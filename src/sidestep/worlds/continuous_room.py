@@ -10,14 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from sidestep.continuous.lattice import Lattice
-from sidestep.continuous.obstacles import ObstacleMotion, Walls
-from sidestep.continuous.simulation import simulate_trajectories
-from sidestep.continuous.tasks import ReachTask, reach_region
-from sidestep.continuous.trajectories import gather_trajectories
-from sidestep.tabular.backups import Behavior
-from sidestep.tabular.demonstrations import Demonstrations, Trajectory
-from sidestep.tabular.grid import Cell, Grid
+import sidestep as ss
+import sidestep.continuous as sc
 
 SIDE, NOISE, RADIUS = 10.0, 0.1, 0.8
 """The length of the room's sides, the standard deviation of moves, and the radius of goals; in meters."""
@@ -33,18 +27,22 @@ _MOVES = 40
 class Room(NamedTuple):
     """The real room, and the tasks and actions of agents in it."""
 
-    dynamics: ObstacleMotion
-    tasks: list[ReachTask]
+    dynamics: sc.ObstacleMotion
+    tasks: list[sc.ReachTask]
     actions: Float[Array, "actions 2"]
-    lattice: Lattice
+    lattice: sc.Lattice
 
     @property
-    def cells(self) -> Grid:
+    def cells(self) -> ss.Grid:
         """The room as a map of small cells."""
         count = round(SIDE / RESOLUTION)
-        blank = Grid(np.zeros((count, count), dtype=np.int64), resolution=RESOLUTION)
-        inside = self.inside(blank.centers(np.arange(blank.size)))
-        return Grid(np.where(inside, Cell.OCCUPIED, Cell.FREE).reshape(blank.shape).astype(np.int64), RESOLUTION)
+        blank = ss.Grid(np.zeros((count, count), dtype=np.int64), resolution=RESOLUTION)
+        inside = self.inside(blank.centers(np.arange(blank.size))).reshape(blank.shape)
+        return ss.Grid(np.where(inside, int(ss.Cell.OCCUPIED), int(ss.Cell.FREE)), RESOLUTION)
+
+    def with_field(self, field: sc.Field) -> sc.ObstacleMotion:
+        """Return the dynamics of the room with a field in place of its wall."""
+        return sc.ObstacleMotion(field, self.dynamics.low, self.dynamics.high, self.dynamics.noise)
 
     def inside(self, places: Float[np.ndarray, "places 2"]) -> Bool[np.ndarray, " places"]:
         """Return whether each place lies in the wall."""
@@ -53,13 +51,13 @@ class Room(NamedTuple):
 
 def room(lattice_points: int = 41) -> Room:
     """Return the room, and a lattice with `lattice_points` points along each side for the values of agents."""
-    walls = Walls(low=jnp.asarray([WALL_LOW]), high=jnp.asarray([WALL_HIGH]))
+    walls = sc.Walls(low=jnp.asarray([WALL_LOW]), high=jnp.asarray([WALL_HIGH]))
     low, high = jnp.zeros(2), jnp.full(2, SIDE)
     angles = np.arange(8) * np.pi / 4
     actions = jnp.asarray(np.stack([np.cos(angles), np.sin(angles)], axis=1))
-    tasks = [reach_region(goal, RADIUS, discount=1.0, step_cost=1.0) for goal in GOALS]
-    dynamics = ObstacleMotion(walls, low, high, jnp.full(2, NOISE))
-    return Room(dynamics, tasks, actions, Lattice(low, high, (lattice_points, lattice_points)))
+    tasks = [sc.reach_region(goal, RADIUS, discount=1.0, step_cost=1.0) for goal in GOALS]
+    dynamics = sc.ObstacleMotion(walls, low, high, jnp.full(2, NOISE))
+    return Room(dynamics, tasks, actions, sc.Lattice(low, high, (lattice_points, lattice_points)))
 
 
 def random_starts(world: Room, count: int, random: np.random.Generator) -> list[Float[np.ndarray, "count 2"]]:
@@ -73,8 +71,8 @@ def random_starts(world: Room, count: int, random: np.random.Generator) -> list[
 
 
 def walks_without_collisions(
-    key: PRNGKeyArray, world: Room, behavior: Behavior, agents_per_goal: int, seed: int
-) -> tuple[Demonstrations, int]:
+    key: PRNGKeyArray, world: Room, behavior: ss.Behavior, agents_per_goal: int, seed: int
+) -> tuple[ss.Demonstrations, int]:
     """Simulate agents that know the room, and remove every move that aimed at the wall.
 
     Args:
@@ -88,23 +86,23 @@ def walks_without_collisions(
         The moves that are left, and the number of those that were removed.
     """
     starts = random_starts(world, agents_per_goal, np.random.default_rng(seed))
-    real = world.dynamics
-    walks = simulate_trajectories(key, real, real, world.tasks, starts, world.actions, behavior, world.lattice, _MOVES)
+    agent = sc.LatticePlanner(world.dynamics, world.actions, behavior, world.lattice)
+    walks = sc.simulate_trajectories(key, agent, world.dynamics, world.tasks, starts, _MOVES)
     pieces, collisions = [], 0
     for walk in walks:
         targets = np.clip(walk.states[:-1] + np.asarray(world.actions)[walk.actions], 0, SIDE)
         hits = world.inside(targets)
         collisions += int(hits.sum())
         pieces += without_moves(walk, hits)
-    return gather_trajectories(pieces, world.tasks), collisions
+    return sc.gather_trajectories(pieces, world.tasks), collisions
 
 
-def without_moves(trajectory: Trajectory, removed: Bool[np.ndarray, " moves"]) -> list[Trajectory]:
+def without_moves(trajectory: ss.Trajectory, removed: Bool[np.ndarray, " moves"]) -> list[ss.Trajectory]:
     """Return the pieces of a trajectory before, between and after the moves that are removed."""
     pieces, begin = [], 0
     for end in (*np.flatnonzero(removed), len(removed)):
         if end > begin:
             states, actions = trajectory.states[begin : end + 1], trajectory.actions[begin:end]
-            pieces.append(Trajectory(states, actions, trajectory.task))
+            pieces.append(ss.Trajectory(states, actions, trajectory.task))
         begin = end + 1
     return pieces

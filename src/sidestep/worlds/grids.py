@@ -12,33 +12,28 @@ import numpy as np
 
 from sidestep.tabular.grid import Cell, Grid
 
-_LATER_WORK = "a map of the first author's later work; starts and goals are our own"
-
 
 @dataclass(frozen=True, eq=False)
 class World:
     """A map that agents know, and the places that they walk between.
 
     Attributes:
-        name: the key in `WORLDS`.
-        truth: the map, fully known.
-        starts: states; agents walk from every start to every goal.
-        goals: states.
-        source: the origin of the map.
+        name: The key in `WORLDS`.
+        truth: The map, fully known.
+        starts: States; agents walk from every start to every goal.
+        goals: States.
     """
 
     name: str
     truth: Grid
     starts: tuple[int, ...]
     goals: tuple[int, ...]
-    source: str
 
 
 def block() -> World:
     """Return a 9×9 room with a 3×3 block in the middle (rows and columns 3–5)."""
     return _world(
         "block",
-        _LATER_WORK,
         "S . . . G . . . G",
         ". . . . . . . . .",
         ". . . . . . . . .",
@@ -55,7 +50,6 @@ def wall() -> World:
     """Return a 9×9 room with a thick wall (columns 3–5 in rows 0–5) between its left and its right side."""
     return _world(
         "wall",
-        _LATER_WORK,
         "S . G # # # G . S",
         ". . . # # # . . .",
         ". . . # # # . . .",
@@ -72,7 +66,6 @@ def rooms() -> World:
     """Return a 9×9 flat of four rooms: walls one cell thick, and a door between each two neighbors."""
     return _world(
         "rooms",
-        "our own",
         "S . . G # S . . G",
         ". . . . # . . . .",
         ". . . . . . . . .",
@@ -89,9 +82,9 @@ WORLDS = MappingProxyType({"block": block, "wall": wall, "rooms": rooms})
 """The worlds by name; each is a function without arguments that returns a `World`."""
 
 
-def _world(name: str, source: str, *drawing: str) -> World:
+def _world(name: str, *drawing: str) -> World:
     """Return the world of a drawing, top row first: `#` occupied, `S` start, `G` goal, anything else free."""
     signs = np.array([row.split() for row in drawing])
     truth = Grid(np.where(signs == "#", int(Cell.OCCUPIED), int(Cell.FREE)))
     starts, goals = (tuple(np.flatnonzero(signs == sign).tolist()) for sign in "SG")
-    return World(name, truth, starts, goals, source)
+    return World(name, truth, starts, goals)

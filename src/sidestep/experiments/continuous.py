@@ -1,0 +1,62 @@
+"""What the experiments in continuous worlds share: the settings of agents and of fits to their walks."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+from jaxtyping import Array, Float
+
+import sidestep as ss
+import sidestep.continuous as sc
+
+
+@dataclass(frozen=True)
+class ContinuousConfig:
+    """Settings of agents in a continuous world, and of the fit to their walks.
+
+    Attributes:
+        agents_per_goal: The number of agents with each of the goals.
+        beta: Their inverse temperature β, in units of one over reward.
+        width: The units in each hidden layer of the policy.
+        planner: Rollouts and the policy's optimizers.
+        schedule: The length and the steps of the fit.
+    """
+
+    agents_per_goal: int
+    beta: float
+    width: int
+    planner: sc.Planner
+    schedule: sc.Schedule
+
+    @property
+    def behavior(self) -> ss.Behavior:
+        """The agents' backup and β."""
+        return ss.Behavior(ss.LogSumExp(), self.beta)
+
+    def fit(
+        self,
+        dynamics: sc.Dynamics,
+        walks: ss.Demonstrations,
+        actions: Float[Array, "actions inputs"],
+        seed: int,
+        report: Callable[[int, Any], None] = lambda *_: None,
+        **settings: Any,
+    ) -> sc.ContinuousFit:
+        """Fit dynamics to walks.
+
+        Args:
+            dynamics: The family at the initial parameters.
+            walks: The moves to learn from.
+            actions: The actions that the agents choose from.
+            seed: Draws everything random.
+            report: Called with the number of the iteration and the present dynamics after every iteration.
+            settings: Other settings of `fit_dynamics`.
+
+        Returns:
+            The fit.
+        """
+        features = sc.task_features(sc.task_at(walks.tasks, walks.task), walks.states)
+        policy = sc.finite_policy(jax.random.key(seed), actions, features, width=self.width)
+        settings |= {"schedule": self.schedule, "seed": seed, "report": lambda now, each: report(now.iteration, each)}
+        return sc.fit_dynamics(dynamics, walks, self.behavior, policy, self.planner, **settings)
