@@ -11,7 +11,7 @@ def rooms_in_a_row(rows: int, columns: int, doors: tuple[int, ...], connectivity
 
     Args:
         rows: The number of rows, 1 or more.
-        columns: The number of columns, so many that each room has one.
+        columns: The number of columns, enough for each room to have one.
         doors: The row of the free cell in each wall from left to right, 0 at the top; there is one room more.
         connectivity: The number of directions, 4 or 8.
 
