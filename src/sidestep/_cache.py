@@ -4,11 +4,15 @@ The environment variable `SIDESTEP_CACHE` names the folder; `off` keeps nothing.
 user's caches.
 """
 
+import hashlib
 import os
 import warnings
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+
+from sidestep._files import write_whole
+from sidestep.errors import InputError
 
 _OFF = "off"
 _UNREADABLE = "Error reading persistent compilation cache entry for '"
@@ -39,6 +43,22 @@ def cache_folder() -> Path | None:
 def kept_in() -> Path | None:
     """Return the folder in which this process keeps compiled code; None where it does not."""
     return _folder
+
+
+def keep_entry(path: Path, content: bytes) -> None:
+    """Write an entry with a checksum; a folder that cannot be written is no reason to stop."""
+    with suppress(InputError):
+        write_whole(path, lambda file: file.write(hashlib.sha256(content).digest() + content))
+
+
+def kept_entry(path: Path) -> bytes | None:
+    """Return the content of an entry; None if it is missing or damaged."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    digest = hashlib.sha256().digest_size
+    return content[digest:] if hashlib.sha256(content[digest:]).digest() == content[:digest] else None
 
 
 def keep_compiled_code() -> None:

@@ -14,21 +14,16 @@ import hashlib
 import os
 import pickle
 from collections.abc import Callable
-from contextlib import suppress
 from functools import cache, wraps
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from sidestep import _cache
-from sidestep._files import read_whole, write_whole
-from sidestep.errors import InputError
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _Program = tuple[Callable[..., Any], Any]
 """A function of arrays that returns a tuple of arrays, and the structure of the result."""
 _TRACED_LIBRARIES = ("jax", "jaxlib", "equinox", "optax", "numpy")
-_DIGEST = 32
-"""The bytes of a SHA-256 digest, which an entry begins with."""
 
 
 def keep_program(function: _Function) -> _Function:
@@ -72,19 +67,17 @@ def keep_program(function: _Function) -> _Function:
 
 def _load(path: Path) -> _Program | None:
     """Return the program of an entry; None if it is missing, damaged or made for another kind of processor."""
-    if not path.exists():
+    content = _cache.kept_entry(path)
+    if content is None:
         return None
     import jax
     from jax.errors import JaxRuntimeError
     from jax.experimental.serialize_executable import deserialize_and_load
 
     try:
-        content = read_whole(path)
-        if hashlib.sha256(content[_DIGEST:]).digest() != content[:_DIGEST]:
-            return None
-        program, skeleton = pickle.loads(content[_DIGEST:])
+        program, skeleton = pickle.loads(content)
         return deserialize_and_load(*program), jax.tree.structure(skeleton)
-    except (InputError, JaxRuntimeError, ValueError, AttributeError, ImportError, pickle.UnpicklingError):
+    except (JaxRuntimeError, ValueError, AttributeError, ImportError, pickle.UnpicklingError):
         return None
 
 
@@ -114,9 +107,7 @@ def _compile(path: Path, function: Callable[..., Any], leaves: list[Any], struct
         content = pickle.dumps((serialize(program), skeleton))
     except (AttributeError, NotImplementedError, TypeError, ValueError, pickle.PicklingError):
         return program, result
-    # a folder that cannot be written is no reason to stop
-    with suppress(InputError):
-        write_whole(path, lambda file: file.write(hashlib.sha256(content).digest() + content))
+    _cache.keep_entry(path, content)
     return program, result
 
 

@@ -18,7 +18,6 @@ from sidestep.tabular.solvers.adjoint_kernels import WeightScratch, differentiat
 from sidestep.tabular.solvers.base import neg_inf
 from sidestep.tabular.solvers.gauss_seidel import KERNELS, GaussSeidel
 from sidestep.tabular.solvers.native import NativeBackup, compiled
-from sidestep.tabular.solvers.ordering import stable_argsort
 from sidestep.tabular.solvers.sweep_loop import SweepLoop
 from sidestep.tabular.solvers.value_kernels import Scratch, backed_up
 from sidestep.tabular.tasks import reach
@@ -58,15 +57,6 @@ def test_order_by_distance_without_terminal_states_keeps_the_numbers():
     problem = random_problem()
     task = eqx.tree_at(lambda task: task.terminal, generic_task(problem, 0.9), jnp.zeros(7, dtype=bool))
     assert order_of(problem.model, task).tolist() == list(range(7))
-
-
-def test_stable_argsort_equals_numpy():
-    random = np.random.default_rng(0)
-    distances = np.exp(random.uniform(-700, 700, 5_000))
-    distances[::7], distances[5::17], distances[3::13] = 0, distances[4], np.inf
-    near = distances[11] * (1 + np.arange(200) * 2.0**-50)
-    distances[1::25] = random.permutation(near)
-    np.testing.assert_array_equal(stable_argsort(distances), np.argsort(distances, kind="stable"))
 
 
 def test_number_process_bandwidth_is_the_largest_difference_of_positions():

@@ -29,9 +29,7 @@ import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 from jaxtyping import Bool, Float, Int
 
-from sidestep._cache import cache_folder
-from sidestep._files import write_whole
-from sidestep.errors import InputError
+from sidestep._cache import cache_folder, keep_entry, kept_entry
 
 _Result = TypeVar("_Result")
 
@@ -320,21 +318,19 @@ class _CodeCache:
         """Return the machine code for a signature, None if it is not kept."""
         target.refresh()
         with suppress(OSError):
-            content = self._path(signature, target.codegen()).read_bytes()
-            if hashlib.sha256(content[32:]).digest() == content[:32]:
+            content = kept_entry(self._path(signature, target.codegen()))
+            if content is not None:
                 from numba.core.compiler import CompileResult
 
-                return CompileResult._rebuild(target, *pickle.loads(content[32:]))
+                return CompileResult._rebuild(target, *pickle.loads(content))
         return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
         """Keep the machine code for a signature, if the folder can be written."""
         from numba.core.serialize import dumps
 
-        with suppress(OSError, InputError):
-            content = dumps(result._reduce())
-            path = self._path(signature, result.codegen)
-            write_whole(path, lambda file: file.write(hashlib.sha256(content).digest() + content))
+        with suppress(OSError):
+            keep_entry(self._path(signature, result.codegen), dumps(result._reduce()))
 
     def _path(self, signature: Any, code_generator: Any) -> Path:
         import numba

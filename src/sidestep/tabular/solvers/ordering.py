@@ -14,7 +14,7 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from sidestep.tabular.solvers.native import HostProcess, NativeFunction, compiled, map_ranges
 
@@ -35,20 +35,7 @@ def order_by_distance(process: HostProcess) -> Int[np.ndarray, " states"]:
     edges = csr_array((costs, sources, row_starts), shape=(len(process.successors), len(process.successors)))
     ends = np.flatnonzero(process.terminal)
     distance = dijkstra(edges, indices=ends[0]) if len(ends) == 1 else dijkstra(edges, indices=ends, min_only=True)
-    return stable_argsort(distance)
-
-
-def stable_argsort(distances: Float[np.ndarray, " states"]) -> Int[np.ndarray, " states"]:
-    """Return the stable argsort of numbers that are not negative, by radix sort.
-
-    Their bits ascend with them, and NumPy sorts 16 bits many times as fast as 64.
-    """
-    bits = np.ascontiguousarray(distances, np.float64).view(np.uint64)
-    last_digits, *others = ((bits >> np.uint64(shift)).astype(np.uint16) for shift in range(0, 64, 16))
-    order = np.argsort(last_digits, kind="stable").astype(np.int32)
-    for digits in others:
-        order = order[np.argsort(digits[order], kind="stable")]
-    return order
+    return np.argsort(distance, kind="stable").astype(np.int32)
 
 
 @compiled()
