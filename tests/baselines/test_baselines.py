@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 from sidestep.baselines import BASELINES, METHODS
-from sidestep.baselines.behavior_aware import behavior_aware, transitions_only
+from sidestep.baselines.behavior_aware import behavior_aware, transitions_only, visit_counts
 from sidestep.baselines.behavior_cloning import behavior_cloning
 from sidestep.baselines.constraint_inference import constraint_inference
 from sidestep.baselines.interface import BaselineResult, model_result
-from sidestep.baselines.joint import joint_estimation
-from sidestep.baselines.maxent_irl import CostlyReward, maxent_irl
-from sidestep.baselines.visits import visit_counts
+from sidestep.baselines.maxent_irl import CostlyReward, joint_estimation, maxent_irl
 from sidestep.evaluation.study import mean_log_likelihood
 from sidestep.maps.config import BehaviorConfig, MapConfig, PriorConfig
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp

@@ -214,7 +214,7 @@ def test_read_map_of_an_image_of_fractions_raises(tmp_path):
 def test_read_map_of_a_huge_image_raises_before_decoding(tmp_path, size):
     path = make_map(tmp_path, grey(0))
     (tmp_path / "map.pgm").write_bytes(f"P5\n{size}\n255\n".encode())
-    with pytest.raises(InputError, match=r"map\.pgm: expected (from 1 to|at most) 100,000,000 pixels"):
+    with pytest.raises(InputError, match=r"map\.pgm: expected an image in PGM or PNG format: .*pixels"):
         read_map(path)
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.robots.replanning import grid_environment, policy_lengths, replanning_lengths
+from sidestep.robots.planners import grid_environment, policy_lengths, replanning_lengths
 from sidestep.tabular.graph import moves_into
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid

@@ -1,13 +1,23 @@
-"""Behavior-aware modeling with the interface of the baselines, and with the likelihood of transitions only."""
+"""Behavior-aware modeling with the interface of the baselines, and two baselines that ignore the goals of agents.
+
+The baselines learn from transitions only, and from the number of visits: the fewer, the more
+probable an obstacle.
+"""
 
 from dataclasses import replace
 
+import numpy as np
+
 from sidestep.baselines.interface import ModelResult, model_result
+from sidestep.evaluation.metrics import visit_ranking
 from sidestep.maps.config import MapConfig
 from sidestep.maps.fit import fit_map
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
+
+_UNVISITED = 0.98
+"""P(blocked) of a cell without visits."""
 
 
 def behavior_aware(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
@@ -20,3 +30,11 @@ def behavior_aware(grid: Grid, demonstrations: Demonstrations, config: MapConfig
 def transitions_only(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
     """Learn P(blocked) from transitions and first cells, whatever the goals of agents."""
     return behavior_aware(grid, demonstrations, replace(config, fit=replace(config.fit, terms="transitions")))
+
+
+def visit_counts(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
+    """Count visits: P(blocked) = 1/(n + 1) of a cell with n > 0 visits and .98 of one without."""
+    ranking = visit_ranking(np.concatenate(demonstrations.paths()), grid)
+    blocked = np.clip(1 / (1 - ranking), None, _UNVISITED).ravel()
+    model = ObstacleGrid(grid, np.log(blocked) - np.log1p(-blocked))
+    return model_result(model, demonstrations, config, ranking)

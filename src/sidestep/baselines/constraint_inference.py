@@ -14,7 +14,6 @@ References:
 """
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -33,30 +32,23 @@ _MAX_LOGIT = 6.0
 """The logit of the first forbidden cell."""
 
 
-class _Prediction(NamedTuple):
-    """The expected visits of each cell, and the log-likelihood of the observed actions."""
-
-    visits: Float[np.ndarray, " cells"]
-    log_likelihood: float
-
-
 def constraint_inference(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
     """Forbid cells one after another; P(blocked) is higher for cells that were forbidden earlier."""
     visited = np.zeros(grid.size, dtype=bool)
     visited[np.concatenate(demonstrations.paths())] = True
     candidates = ~visited & (grid.known.ravel() == Cell.UNKNOWN)
     behavior, forbidden = behavior_of(config.behavior), []
-    current = _predict(grid, forbidden, demonstrations, behavior)
+    visits, log_likelihood = _predict(grid, forbidden, demonstrations, behavior)
     while len(forbidden) < candidates.sum():
-        visits = np.where(candidates, current.visits, -np.inf)
-        visits[forbidden] = -np.inf
-        cell = int(visits.argmax())
-        new = _predict(grid, [*forbidden, cell], demonstrations, behavior)
-        if new.log_likelihood - current.log_likelihood < np.log(candidates.sum()):
+        ranking = np.where(candidates, visits, -np.inf)
+        ranking[forbidden] = -np.inf
+        cell = int(ranking.argmax())
+        new_visits, new_log_likelihood = _predict(grid, [*forbidden, cell], demonstrations, behavior)
+        if new_log_likelihood - log_likelihood < np.log(candidates.sum()):
             break
         forbidden.append(cell)
-        current = new
-    model = ObstacleGrid(grid, _logits(candidates, forbidden, current.visits))
+        visits, log_likelihood = new_visits, new_log_likelihood
+    model = ObstacleGrid(grid, _logits(candidates, forbidden, visits))
     return model_result(model, demonstrations, config)
 
 
@@ -71,7 +63,10 @@ def _logits(
     return logits
 
 
-def _predict(grid: Grid, forbidden: list[int], demonstrations: Demonstrations, behavior: Behavior) -> _Prediction:
+def _predict(
+    grid: Grid, forbidden: list[int], demonstrations: Demonstrations, behavior: Behavior
+) -> tuple[Float[np.ndarray, " cells"], float]:
+    """Return the expected visits of each cell, and the log-likelihood of the observed actions."""
     known = grid.passable().known
     known.flat[forbidden] = Cell.OCCUPIED
     model = true_model(replace(grid, known=known))
@@ -85,7 +80,7 @@ def _predict(grid: Grid, forbidden: list[int], demonstrations: Demonstrations, b
         total += float(np.log(np.asarray(agents.policy)[states[own], actions[own]]).sum())
         starts = np.bincount(states[first[task[first] == index]], minlength=grid.size).astype(np.float64)
         visits += _expected_visits(model, agents, starts)
-    return _Prediction(visits, total)
+    return visits, total
 
 
 def _expected_visits(

@@ -1,16 +1,30 @@
-"""Maximum causal entropy inverse reinforcement learning (Ziebart et al. 2010): a cost of each cell.
+"""A cost of each cell: maximum causal entropy inverse reinforcement learning, and costs together with obstacles.
 
-This is the method that the paper's section "Motivation" argues against: costs of cells explain detours, and no
-transition model does. Agents choose actions by maximum causal entropy, π(a | s) ∝ exp βQ(s, a) with the log-sum-exp
-backup, whatever the configuration says of backups. It differs from the published algorithm in four ways:
+`maxent_irl` (Ziebart et al. 2010) is the method that the paper's section "Motivation" argues against: costs of cells
+explain detours, and no transition model does. Agents choose actions by maximum causal entropy, π(a | s) ∝ exp βQ(s, a)
+with the log-sum-exp backup, whatever the configuration says of backups. It differs from the published algorithm in
+four ways:
 1. the reward that agents pursue anyway is known, and the costs add to it;
 2. there is one cost for each cell, ln(1 + exp k) ≥ 0, paid by moves that aim at the cell, instead of linear features;
 3. the costs are the same for all goals and have a prior (`sidestep.tabular.behavior_model`);
 4. the likelihood of actions is maximized by L-BFGS with the exact gradient.
 
+A cell that agents avoid may be costly or blocked. So `joint_estimation` (Herman et al. 2016) learns both from the same
+walks by maximizing
+
+    Σ log π_{k,θ}(a | s)  +  Σ ln T_θ(s, a, s′)  +  priors,        R(s, a) = R₀(s, a) − ln(1 + exp k_c(s, a)),
+
+in the costs' k and the logits θ of P(blocked) together. Moves of its agents may fail; otherwise they behave as above.
+It differs from the published algorithm in three ways:
+1. the reward R₀ is known, and there is one cost for each cell instead of linear features;
+2. agents know the true dynamics, where Herman et al. also allow agents with other beliefs;
+3. the priors of `fit_map` and of the costs are added.
+
 References:
     B. D. Ziebart, J. A. Bagnell and A. K. Dey (2010). Modeling interaction via the principle of maximum causal
     entropy. International Conference on Machine Learning.
+    M. Herman, T. Gindele, J. Wagner, F. Schmitt and W. Burgard (2016). Inverse reinforcement learning with
+    simultaneous estimation of rewards and dynamics. Artificial Intelligence and Statistics.
 """
 
 from dataclasses import dataclass
@@ -20,18 +34,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from sidestep.baselines.interface import ModelResult
+from sidestep.baselines.interface import ModelResult, model_result
 from sidestep.errors import NotConverged
 from sidestep.inference.fit import fit
 from sidestep.inference.optimizers import LBFGS
 from sidestep.maps.config import MapConfig
+from sidestep.maps.fit import fit_map
 from sidestep.robots.planners import ModelPlanner
 from sidestep.tabular.backups import Behavior, LogSumExp
 from sidestep.tabular.behavior_model import BehaviorModel, behavior_model
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.graph import Graph, grid_graph
 from sidestep.tabular.grid import Grid
-from sidestep.tabular.models import true_model
+from sidestep.tabular.models import ObstacleGrid, true_model
 from sidestep.tabular.reward import Reward
 from sidestep.tabular.tasks import Task, with_state_costs
 
@@ -76,3 +91,12 @@ def cost_behavior_model(grid: Grid, config: MapConfig) -> BehaviorModel:
     """Return the behavior of maximum causal entropy with a cost of each cell, which is to be learned."""
     behavior = Behavior(LogSumExp(), config.behavior.beta)
     return behavior_model(behavior, aimed_at=np.asarray(grid_graph(grid).successors[..., 0]))
+
+
+def joint_estimation(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
+    """Learn a cost and P(blocked) of each cell; robots plan by P(blocked), as in any learned map."""
+    model, agents = ObstacleGrid(grid, config.prior.mean), cost_behavior_model(grid, config)
+    fit = fit_map(model, demonstrations, config, behavior=agents)
+    result = model_result(fit.model, demonstrations, config)
+    reward = CostlyReward(config.reward.discount, config.reward.step_cost, np.asarray(fit.behavior.costs))
+    return result._replace(reward=reward, behavior=fit.behavior.behavior_of(), converged=fit.converged)

@@ -6,6 +6,9 @@ import typer
 
 from sidestep.cli.options import Folder, LearnOptions, MapFile, TrueMap, Walks, with_learn_options
 
+_CELL_SCORES = "auc", "average_precision", "average_precision_relevant"
+_COLUMNS = *_CELL_SCORES, "legal_fraction", "regret", "arriving_fraction", "heldout_log_likelihood", "seconds"
+
 
 @with_learn_options
 def compare(
@@ -21,7 +24,7 @@ def compare(
     """Compare behavior-aware modeling with its baselines: compare.png, summary.json, the learned map in behavior/."""
     from sidestep._files import write_json
     from sidestep.baselines.comparison import compare_methods
-    from sidestep.cli.display import print_lines, print_notes, print_table, working
+    from sidestep.cli.display import print_lines, print_notes, print_scores, working
     from sidestep.cli.learn import save_learned
     from sidestep.io.maps import read_map_like
     from sidestep.io.walks import read_walks
@@ -49,19 +52,9 @@ def compare(
             save_learned(comparison.learned, out / "behavior", command="learn", files=files)
         write_json(out / "summary.json", {"command": "compare", "files": files, **comparison.summary()})
     checkpoint.unlink(missing_ok=True)
-    columns = {
-        "auc": "AUC",
-        "average_precision": "average\nprecision",
-        "average_precision_relevant": "relevant\nprecision",
-        "legal_fraction": "legal\npaths",
-        "regret": "regret",
-        "arriving_fraction": "arrive",
-        "heldout_log_likelihood": "held-out\nnats a move",
-        "seconds": "seconds",
-    }
     print_lines(*comparison.reasons)
     rows = comparison.method_scores()
-    print_table(rows, columns)
+    print_scores(rows, _COLUMNS)
     for name, scores in rows.items():
         if scores["failure"] is not None:
             print_notes(f"note: {name} failed: {scores['failure']}")

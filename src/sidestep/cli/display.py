@@ -1,7 +1,7 @@
 """What the command line shows: progress, notes and errors on standard error, results on standard output."""
 
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,21 @@ if TYPE_CHECKING:
 
 _console = Console(highlight=False, width=None if sys.stdout.isatty() else 140)
 _errors = Console(stderr=True, highlight=False)
+_HEADINGS = {
+    "auc": "AUC",
+    "average_precision": "average\nprecision",
+    "auc_relevant": "relevant\nAUC",
+    "average_precision_relevant": "relevant\nprecision",
+    "mean_obstacle": "mean on\nobstacles",
+    "mean_free": "mean on\nfree cells",
+    "max_probability": "highest",
+    "legal_fraction": "legal\npaths",
+    "excess_length": "excess\nlength",
+    "arriving_fraction": "arrive",
+    "heldout_log_likelihood": "held-out\nnats a move",
+}
+_CELL_SCORES = "auc", "average_precision", "auc_relevant", "recall", "mean_obstacle", "mean_free", "max_probability"
+_MAP_SCORES = *_CELL_SCORES, "legal_fraction", "excess_length", "regret"
 
 
 def print_lines(*lines: str) -> None:
@@ -78,33 +93,16 @@ def stage_progress() -> Iterator[Callable[[str, int, int], None]]:
         yield report
 
 
-def print_scores(rows: Mapping[str, Mapping[str, Any]]) -> None:
-    """Print the scores of learned maps, those of `evaluate`, by name."""
-    columns = {
-        "auc": "AUC",
-        "average_precision": "average\nprecision",
-        "auc_relevant": "relevant\nAUC",
-        "recall": "recall",
-        "mean_obstacle": "mean on\nobstacles",
-        "mean_free": "mean on\nfree cells",
-        "max_probability": "highest",
-        "legal_fraction": "legal\npaths",
-        "excess_length": "excess\nlength",
-        "regret": "regret",
-    }
-    print_table(rows, columns)
-
-
-def print_table(rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> None:
-    """Print a table with a row for each name.
+def print_scores(rows: Mapping[str, Mapping[str, Any]], columns: Sequence[str] = _MAP_SCORES) -> None:
+    """Print a table of scores with a row for each name.
 
     Args:
         rows: The numbers of each row by key; a dash stands for None.
-        columns: The heading of each key.
+        columns: The keys of the columns; by default those of `evaluate`.
     """
     from rich.table import Table
 
-    table = Table("", *columns.values())
+    table = Table("", *(_HEADINGS.get(key, key) for key in columns))
     for name, scores in rows.items():
         cells = (scores.get(key) for key in columns)
         table.add_row(name, *("–" if number is None else f"{number:.3f}" for number in cells))

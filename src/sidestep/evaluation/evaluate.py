@@ -4,7 +4,7 @@ On small maps paths are planned between all pairs of free cells, on large maps b
 a map is evaluated by its paths only, a method without a planner by its cells only.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import NamedTuple
 
@@ -14,8 +14,7 @@ from scipy.sparse import csr_array
 
 from sidestep.evaluation.metrics import MapScores, PathScores, path_lengths, score_lengths, score_map, shortest_lengths
 from sidestep.evaluation.relevance import relevant_obstacles
-from sidestep.robots.planners import Planner
-from sidestep.robots.replanning import grid_environment
+from sidestep.robots.planners import GoalPlan, Planner, grid_environment
 from sidestep.tabular.graph import walkable_graph
 from sidestep.tabular.grid import Cell, Grid
 
@@ -68,14 +67,6 @@ class Evaluation(PathScores, MapScores):
     def to_dict(self) -> dict[str, float | None]:
         """Return the scores by name."""
         return asdict(self)
-
-
-class _Pairs(NamedTuple):
-    """Starts and goals (states) with a path between them, by ascending goal, and the length of the shortest path."""
-
-    starts: Int[np.ndarray, " pairs"]
-    goals: Int[np.ndarray, " pairs"]
-    shortest: Float[np.ndarray, " pairs"]
 
 
 def evaluate(
@@ -131,18 +122,22 @@ def evaluate(
     random, sample = np.random.default_rng(seed), sample or sample_sizes(truth.size)
     graph = walkable_graph(truth)
     starts, ends = _draw(free, sample.starts, random), free if goals is None else np.intersect1d(free, goals)
-    pairs = _connected_pairs(starts, _draw(ends, sample.goals, random), graph)
-    lengths = _planned_lengths(planner, pairs, graph, callback)
-    scores |= asdict(score_lengths(lengths, pairs.shortest))
+    starts, goals, shortest = _connected_pairs(starts, _draw(ends, sample.goals, random), graph)
+    lengths = np.zeros(len(goals))
+    for own, plan in _plans(planner, goals, "planned paths", callback):
+        lengths[own] = path_lengths(graph, plan.paths_from(starts[own]), goals[own])
+    scores |= asdict(score_lengths(lengths, shortest))
     if not len(lengths):
         return Evaluation(**scores)
     # the execution of a legal path is the path itself; of the others a sample is executed
     legal = np.isfinite(lengths)
     bumping = np.flatnonzero(~legal)
     executed = _draw(bumping, sample.executed, random)
-    excess = _executed_lengths(planner, pairs, executed, truth, callback) - pairs.shortest[executed]
+    environment, excess = grid_environment(truth), -shortest[executed]
+    for own, plan in _plans(planner, goals[executed], "executed paths", callback):
+        excess[own] += plan.executed_lengths(environment, starts[executed][own])
     arriving = legal.sum() + (len(bumping) * np.isfinite(excess).mean() if len(excess) else 0.0)
-    total = np.sum(lengths[legal] - pairs.shortest[legal]) + (len(bumping) * excess.mean() if len(excess) else 0.0)
+    total = np.sum(lengths[legal] - shortest[legal]) + (len(bumping) * excess.mean() if len(excess) else 0.0)
     regret = float(total / len(lengths)) if np.isfinite(total) else None
     return Evaluation(**scores, regret=regret, arriving_fraction=float(arriving / len(lengths)))
 
@@ -183,36 +178,21 @@ def _draw(states: Int[np.ndarray, " states"], most: int, random: np.random.Gener
     return np.sort(random.choice(states, most, replace=False)) if len(states) > most else states
 
 
-def _connected_pairs(starts: Int[np.ndarray, " starts"], goals: Int[np.ndarray, " goals"], graph: csr_array) -> _Pairs:
-    """Return all pairs of a start and another state as the goal that a path connects."""
+def _connected_pairs(
+    starts: Int[np.ndarray, " starts"], goals: Int[np.ndarray, " goals"], graph: csr_array
+) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"], Float[np.ndarray, " pairs"]]:
+    """Return the start and the goal of all pairs of different states that a path connects, and its least length."""
     all_starts, all_goals = np.tile(starts, len(goals)), np.repeat(goals, len(starts))
     shortest = shortest_lengths(graph, all_starts, all_goals)
     kept = np.isfinite(shortest) & (all_starts != all_goals)
-    return _Pairs(all_starts[kept], all_goals[kept], shortest[kept])
+    return all_starts[kept], all_goals[kept], shortest[kept]
 
 
-def _planned_lengths(
-    planner: Planner, pairs: _Pairs, graph: csr_array, callback: StageCallback
-) -> Float[np.ndarray, " pairs"]:
-    """Return the lengths of the planned paths, infinite if not legal; only the paths to one goal are in memory."""
-    lengths, goals, stage = np.full(len(pairs.goals), np.inf), np.unique(pairs.goals), "planned paths"
-    for done, goal in enumerate(goals):
-        callback(stage, done, len(goals))
-        own = pairs.goals == goal
-        lengths[own] = path_lengths(graph, planner.plan_to(int(goal)).paths_from(pairs.starts[own]), pairs.goals[own])
-    callback(stage, len(goals), len(goals))
-    return lengths
-
-
-def _executed_lengths(
-    planner: Planner, pairs: _Pairs, executed: Int[np.ndarray, " executed"], truth: Grid, callback: StageCallback
-) -> Float[np.ndarray, " executed"]:
-    """Return the lengths of the executed paths of some pairs; pairs with the same goal share the first plan."""
-    environment, lengths, goals = grid_environment(truth), np.zeros(len(executed)), pairs.goals[executed]
-    stage = "executed paths"
+def _plans(
+    planner: Planner, goals: Int[np.ndarray, " paths"], stage: str, callback: StageCallback
+) -> Iterator[tuple[Bool[np.ndarray, " paths"], GoalPlan]]:
+    """Yield the plan to each different goal of paths, and which paths have it; only one plan is in memory."""
     for goal in np.unique(goals):
-        callback(stage, int((goals < goal).sum()), len(executed))
-        own = goals == goal
-        lengths[own] = planner.plan_to(int(goal)).executed_lengths(environment, pairs.starts[executed][own])
-    callback(stage, len(executed), len(executed))
-    return lengths
+        callback(stage, int((goals < goal).sum()), len(goals))
+        yield goals == goal, planner.plan_to(int(goal))
+    callback(stage, len(goals), len(goals))

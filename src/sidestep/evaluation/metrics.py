@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer
 from scipy.sparse import csr_array
 
-from sidestep.errors import InputError
+from sidestep.errors import check
 from sidestep.tabular.graph import free_cells, walkable_graph
 from sidestep.tabular.grid import Cell, Grid
 
@@ -72,10 +72,8 @@ def score_map(
         InputError: For arrays of another shape than the map and for numbers that are not finite.
     """
     for field, array in (("blocked", blocked), ("scored", scored), ("relevant", relevant)):
-        if array.shape != truth.shape:
-            raise InputError(f"expected the map's shape {truth.shape}, found {array.shape}", field=field)
-    if not np.isfinite(blocked).all():
-        raise InputError("expected finite numbers", field="blocked")
+        check(array.shape == truth.shape, f"expected the map's shape {truth.shape}, found {array.shape}", field=field)
+    check(np.isfinite(blocked).all(), "expected finite numbers", field="blocked")
     obstacle = scored & (truth.known == Cell.OCCUPIED)
     free = scored & (truth.known == Cell.FREE)
     return MapScores(
@@ -133,13 +131,11 @@ def score_paths(
         >>> score_paths([np.array([0, 3, 4, 5, 2]), np.array([0, 1, 2])], [2, 2], truth)
         PathScores(legal_fraction=0.5, excess_length=0.0)
     """
-    if len(paths) != len(goals):
-        raise InputError(f"expected {len(paths)}, one for each path, found {len(goals)}", field="goals")
+    check(len(paths) == len(goals), f"expected {len(paths)}, one for each path, found {len(goals)}", field="goals")
     if not len(paths):
         return PathScores()
-    empty = [len(path) == 0 for path in paths]
-    if any(empty):
-        raise InputError("expected at least one state", source="path", row=empty.index(True) + 1)
+    for row, path in enumerate(paths, start=1):
+        check(len(path), "expected at least one state", source="path", row=row)
     ends = np.asarray(goals)
     check_states(np.concatenate(paths), truth, "paths")
     check_states(ends, truth, "goals")
@@ -204,8 +200,8 @@ def visit_ranking(visited: Integer[np.ndarray, " moves"], grid: Grid) -> Float[n
 
 def check_states(states: Integer[np.ndarray, " states"], grid: Grid, field: str) -> None:
     """Raise `InputError` for numbers that are not states of the grid."""
-    if len(states) and not (states.min() >= 0 and states.max() < grid.size):
-        raise InputError(f"expected states in 0…{grid.size - 1}", field=field)
+    valid = np.all((states >= 0) & (states < grid.size))
+    check(valid, f"expected states in 0…{grid.size - 1}", field=field)
 
 
 def _mean(values: np.ndarray) -> float | None:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 from scipy.sparse import csr_array
 
-from sidestep.errors import InputError
+from sidestep.errors import check
 from sidestep.evaluation.metrics import check_states
 from sidestep.tabular.graph import clear_cells, clear_moves, free_cells, moves_into, walkable_graph
 from sidestep.tabular.grid import Cell, Grid
@@ -41,19 +41,18 @@ def relevant_obstacles(
         >>> relevant_obstacles(truth, np.array([0]), np.array([2])).tolist()
         [[False, True, False], [False, False, False]]
     """
-    from scipy.sparse.csgraph import connected_components, dijkstra
+    from scipy.sparse.csgraph import dijkstra
 
-    if len(visited) != len(goals):
-        raise InputError(f"expected {len(visited)}, one for each visited state, found {len(goals)}", field="goals")
+    message = f"expected {len(visited)}, one for each visited state, found {len(goals)}"
+    check(len(visited) == len(goals), message, field="goals")
     check_states(visited, truth, "visited")
     check_states(goals, truth, "goals")
     graph = walkable_graph(truth)
-    components = connected_components(graph, directed=False)[1]
     through, past = _moves_of_closed_cells(truth), _prevented_diagonals(truth)
     relevant = np.zeros(truth.size, dtype=bool)
     for goal in np.unique(goals):
         to_goal = dijkstra(graph, indices=int(goal))
-        from_visited = _relative_distances(graph, components, to_goal, np.unique(visited[goals == goal]))
+        from_visited = _relative_distances(graph, to_goal, np.unique(visited[goals == goal]))
         relevant |= _changes_by_opening(from_visited, to_goal, through, past) < -_TOLERANCE
     return (relevant & (truth.known.reshape(-1) == Cell.OCCUPIED)).reshape(truth.shape)
 
@@ -101,10 +100,7 @@ def _changes_by_opening(
 
 
 def _relative_distances(
-    graph: csr_array,
-    components: Int[np.ndarray, " states"],
-    to_goal: Float[np.ndarray, " states"],
-    visited: Integer[np.ndarray, " visited"],
+    graph: csr_array, to_goal: Float[np.ndarray, " states"], visited: Integer[np.ndarray, " visited"]
 ) -> Float[np.ndarray, " states"]:
     """Return min_s d(s, x) − d(s, goal) over visited states s for each state x; infinite where none can reach x.
 
@@ -129,6 +125,7 @@ def _relative_distances(
             shape=(states + 1, states + 1),
         )
         result = dijkstra(extended, indices=states)[:states] - shift
-    longer_than_any_path = 4.0 * (states + 1)
-    result[np.isin(components, components[stranded])] = -longer_than_any_path
+    if len(stranded):
+        longer_than_any_path = 4.0 * (states + 1)
+        result[np.isfinite(dijkstra(graph, indices=stranded, min_only=True))] = -longer_than_any_path
     return result

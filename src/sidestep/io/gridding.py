@@ -22,8 +22,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int
 
-from sidestep.errors import InputError, check
+from sidestep.errors import check
 from sidestep.io.crossings import TOUCH, Occupied, Points, Visits, cells_at, visited_cells
+from sidestep.io.tables import check_rows
 from sidestep.io.walks import Walks
 from sidestep.tabular.demonstrations import Trajectory
 from sidestep.tabular.grid import Cell, Grid
@@ -107,7 +108,10 @@ def grid_walks(walks: Walks, grid: Grid) -> Moves:
     occupied = grid.known == Cell.OCCUPIED
     visits = visited_cells(grid.to_cell_units(walks.positions), walks.offsets, occupied)
     visits = _around_corners(visits, occupied, diagonals=grid.connectivity == 8)
-    _check_unoccupied(visits, occupied, walks)
+    message = "the way to this position leads through a cell that the map shows as occupied "
+    message += "(image row {}, column {}, from 0); expected walks around known obstacles"
+    free = ~occupied[tuple(visits.cell.T)]
+    check_rows(free, message, walks.source, "x", walks.rows[visits.arrival], visits.cell)
     goals = _goal_cells(walks, grid, visits, occupied)
     failures = np.flatnonzero(np.isfinite(walks.failed_moves[:, 0]))
     if grid.connectivity == 8:
@@ -165,7 +169,9 @@ def _moves(visits: Visits, failures: _Failures, goals: Int[np.ndarray, " walks"]
     next_states = np.concatenate([state[entered], state[stayed]])[order]
     walk = np.concatenate([visits.walk[entered], visits.walk[stayed]])[order]
     rows = np.concatenate([walks.rows[visits.arrival[entered]], walks.rows[failures]])[order]
-    _check_moving(walk, walks)
+    moving, first_rows = np.bincount(walk, minlength=len(walks)) > 0, walks.rows[walks.offsets[:-1]]
+    message = "expected at least one move, but walk {!r} never leaves its cell"
+    check_rows(moving, message, walks.source, "walk", first_rows, walks.labels)
     return Moves(states, _actions(steps, grid)[order], next_states, walk, rows, goals, walks.source)
 
 
@@ -174,11 +180,8 @@ def _failed_steps(failures: _Failures, cells: _Steps, walks: Walks, grid: Grid) 
     column, row_up = np.floor(grid.to_cell_units(walks.failed_moves[failures]) + TOUCH).T
     steps = np.stack([grid.shape[0] - 1 - row_up, column], axis=1) - cells
     adjacent = (steps[:, None, :] == grid.steps).all(axis=2).any(axis=1)
-    if not adjacent.all():
-        index = failures[np.argmin(adjacent)]
-        target = tuple(walks.failed_moves[index].tolist())
-        message = f"expected a failed move to one of the {grid.connectivity} adjacent cells, found {target}"
-        raise InputError(message, source=walks.source, row=int(walks.rows[index]), field="failed_x")
+    message = f"expected a failed move to one of the {grid.connectivity} adjacent cells, found ({{}}, {{}})"
+    check_rows(adjacent, message, walks.source, "failed_x", walks.rows[failures], walks.failed_moves[failures])
     return steps.astype(np.int64)
 
 
@@ -196,40 +199,16 @@ def _goal_cells(walks: Walks, grid: Grid, visits: Visits, occupied: Occupied) ->
     corner = np.stack([last[:, 1], grid.shape[0] - 1 - last[:, 0]], axis=1)
     ends_there = np.all((goals >= corner - TOUCH) & (goals <= corner + 1 + TOUCH), axis=1)
     cells = np.where(ends_there[:, None], last, cells_at(goals, occupied))
-    blocked = np.flatnonzero(occupied[cells[:, 0], cells[:, 1]])
-    if blocked.size:
-        index = blocked[0]
-        message = f"the goal {tuple(walks.goals[index].tolist())} lies in a cell that the map shows as occupied"
-        raise InputError(message, source=walks.source, row=int(walks.rows[walks.offsets[index]]), field="goal_x")
+    message = "the goal ({}, {}) lies in a cell that the map shows as occupied"
+    first_rows = walks.rows[walks.offsets[:-1]]
+    check_rows(~occupied[tuple(cells.T)], message, walks.source, "goal_x", first_rows, walks.goals)
     return cells @ np.array([grid.shape[1], 1])
 
 
 def _check_inside(positions: Points, rows: Int[np.ndarray, " points"], prefix: str, walks: Walks, grid: Grid) -> None:
     """Raise `InputError` for the first position outside the map; its columns are x and y after the prefix."""
-    outside = np.flatnonzero(~grid.contains(positions))
-    if outside.size:
-        index = outside[np.argmin(rows[outside])]
-        column = grid.to_cell_units(positions[index][None])[0, 0]
-        field = prefix + ("y" if 0 <= column <= grid.shape[1] else "x")
-        message = f"expected a position on the map, found {tuple(positions[index].tolist())}"
-        raise InputError(message, source=walks.source, row=int(rows[index]), field=field)
-
-
-def _check_unoccupied(visits: Visits, occupied: Occupied, walks: Walks) -> None:
-    """Raise `InputError` for a walk through a cell that is known to be occupied."""
-    blocked = np.flatnonzero(occupied[visits.cell[:, 0], visits.cell[:, 1]])
-    if blocked.size:
-        rows = walks.rows[visits.arrival[blocked]]
-        row, column = visits.cell[blocked[np.argmin(rows)]].tolist()
-        message = "the way to this position leads through a cell that the map shows as occupied "
-        message += f"(image row {row}, column {column}, from 0); expected walks around known obstacles"
-        raise InputError(message, source=walks.source, row=int(rows.min()), field="x")
-
-
-def _check_moving(walk: Int[np.ndarray, " moves"], walks: Walks) -> None:
-    """Raise `InputError` for a walk without a move."""
-    idle = np.bincount(walk, minlength=len(walks)) == 0
-    if idle.any():
-        index = int(np.argmax(idle))
-        message = f"expected at least one move, but walk {walks.labels[index]!r} never leaves its cell"
-        raise InputError(message, source=walks.source, row=int(walks.rows[walks.offsets[index]]), field="walk")
+    inside, column = grid.contains(positions), grid.to_cell_units(positions)[:, 0]
+    first = np.argmin(np.where(inside, np.inf, rows))
+    field = prefix + ("y" if 0 <= column[first] <= grid.shape[1] else "x")
+    message = "expected a position on the map, found ({}, {})"
+    check_rows(inside, message, walks.source, field, rows, positions)

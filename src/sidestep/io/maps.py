@@ -114,23 +114,26 @@ def read_raster(path: str | Path) -> Raster:
     path = Path(path)
     settings = _settings(path)
     keys = ("resolution", "occupied_thresh", "free_thresh")
-    resolution, occupied, free = (_number(_entry(settings, key, path), key, path) for key in keys)
+    resolution, occupied, free = (_number(settings[key], key, path) for key in keys)
     check(resolution > 0, f"expected metres above 0, found {resolution}", source=path, field="resolution")
     for key, threshold in (("occupied_thresh", occupied), ("free_thresh", free)):
         check(0 <= threshold <= 1, f"expected a number from 0 to 1, found {threshold}", source=path, field=key)
     message = f"expected less than occupied_thresh ({occupied}), found {free}"
     check(free < occupied, message, source=path, field="free_thresh")
-    origin, mode, negate = _origin(settings, path), settings.get("mode", "trinary"), _entry(settings, "negate", path)
+    origin, negate, mode = settings["origin"], settings["negate"], settings.get("mode", "trinary")
+    message = f"expected three numbers [x, y, yaw], found {origin!r}"
+    check(isinstance(origin, list) and len(origin) == 3, message, source=path, field="origin")
+    x, y, yaw = (_number(value, "origin", path) for value in origin)
     check(negate in (0, 1), f"expected 0 or 1, found {negate!r}", source=path, field="negate")
     message = f"expected trinary, scale or raw, found {mode!r}"
     check(mode in ("trinary", "scale", "raw"), message, source=path, field="mode")
-    gray, transparent = _gray(_image_path(settings, path))
+    gray, transparent = _gray(_image_path(settings["image"], path))
     occupancy = gray / 255 if negate else (255 - gray) / 255
     if mode == "raw":  # `negate` has no meaning here, as in Nav2.
         percent = np.rint(gray)
         occupancy = np.where(percent <= 100, percent / 100, np.nan)
     occupancy[transparent] = np.nan
-    return Raster(occupancy, mode, resolution, origin, occupied, free)
+    return Raster(occupancy, mode, resolution, (x, y, yaw), occupied, free)
 
 
 def write_map(path: str | Path, blocked: Float[np.ndarray, "rows columns"], grid: Grid) -> None:
@@ -175,7 +178,7 @@ def write_map(path: str | Path, blocked: Float[np.ndarray, "rows columns"], grid
 
 
 def _settings(path: Path) -> dict[str, Any]:
-    """Return the mapping in a YAML file."""
+    """Return the mapping in a YAML file, with all keys that are required."""
     import yaml
 
     content = read_whole(path)
@@ -184,13 +187,9 @@ def _settings(path: Path) -> dict[str, Any]:
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise InputError(f"expected YAML: {' '.join(str(error).split())}", source=path) from error
     check(isinstance(settings, dict), "expected YAML with keys such as 'image: map.pgm'", source=path)
+    for key in ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh"):
+        check(settings.get(key) is not None, "the key is missing", source=path, field=key)
     return settings
-
-
-def _entry(settings: dict[str, Any], key: str, path: Path) -> Any:
-    """Return the value of a required key."""
-    check(settings.get(key) is not None, "the key is missing", source=path, field=key)
-    return settings[key]
 
 
 def _number(value: object, key: str, path: Path) -> float:
@@ -203,18 +202,8 @@ def _number(value: object, key: str, path: Path) -> float:
     return number
 
 
-def _origin(settings: dict[str, Any], path: Path) -> tuple[float, float, float]:
-    """Return x, y (metres) and yaw (radians) of the lower-left corner."""
-    origin = _entry(settings, "origin", path)
-    three = isinstance(origin, list) and len(origin) == 3
-    check(three, f"expected three numbers [x, y, yaw], found {origin!r}", source=path, field="origin")
-    x, y, yaw = (_number(value, "origin", path) for value in origin)
-    return x, y, yaw
-
-
-def _image_path(settings: dict[str, Any], path: Path) -> Path:
+def _image_path(name: object, path: Path) -> Path:
     """Return the path of the image, which must be in the folder of the YAML file or below, links followed."""
-    name = _entry(settings, "image", path)
     check(isinstance(name, str) and name, f"expected the name of an image, found {name!r}", source=path, field="image")
     try:
         folder = path.parent.resolve()
@@ -235,13 +224,9 @@ def _gray(path: Path) -> tuple[Float[np.ndarray, "rows columns"], Bool[np.ndarra
         # Pillow warns of large images and of oddities in headers without naming the file.
         with warnings.catch_warnings(action="ignore"), Image.open(path, formats=("PPM", "PNG")) as image:
             width, height = image.size
-            message = f"expected from 1 to {MOST_PIXELS:,} pixels, found {width:,} by {height:,}"
-            check(0 < width * height <= MOST_PIXELS, message, source=path)
+            if not 0 < width * height <= MOST_PIXELS:
+                raise ValueError(f"{width:,} by {height:,} pixels, but from 1 to {MOST_PIXELS:,} can be read")
             return _gray_of_image(image)
-    except InputError:
-        raise
-    except Image.DecompressionBombError as error:
-        raise InputError(f"expected at most {MOST_PIXELS:,} pixels, found far more", source=path) from error
     except Exception as error:  # Decoders raise errors of any kind on broken files.
         raise InputError(f"expected an image in PGM or PNG format: {error}", source=path) from error
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from pyarrow import parquet
 
 from sidestep._files import read_whole, write_whole
@@ -53,10 +53,34 @@ def write_table(path: str | Path, table: pa.Table) -> None:
         raise InputError(f"the table cannot be written: {error}", source=path) from error
 
 
-def check_rows(valid: Bool[np.ndarray, " rows"], message: str, source: object, field: str) -> None:
-    """Raise `InputError` with `message` for the first row of a table that is not valid, in the column `field`."""
+def check_rows(
+    valid: Bool[np.ndarray, " rows"],
+    message: str,
+    source: object,
+    field: str,
+    rows: Int[np.ndarray, " rows"] | None = None,
+    values: Sequence[object] | np.ndarray = (),
+) -> None:
+    """Raise `InputError` for the first row of a table that is not valid.
+
+    Args:
+        valid: Whether each row is valid.
+        message: The message, with a place `{}` for each number in a row of `values`.
+        source: The name of the table.
+        field: The name of the column.
+        rows: The numbers of the rows; by default 1, 2, …
+        values: The contents of the rows, if the message names them.
+
+    Raises:
+        InputError: If a row is not valid.
+    """
     if not valid.all():
-        raise InputError(message, source=source, row=int(np.argmin(valid)) + 1, field=field)
+        rows = np.arange(1, len(valid) + 1) if rows is None else rows
+        invalid = np.flatnonzero(~valid)
+        index = invalid[np.argmin(rows[invalid])]
+        content = values[index] if len(values) else ()
+        text = message.format(*(content.tolist() if isinstance(content, np.ndarray) else [content]))
+        raise InputError(text, source=source, row=int(rows[index]), field=field)
 
 
 def check_columns(table: pa.Table, names: Sequence[str], source: str) -> None:

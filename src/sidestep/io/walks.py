@@ -24,7 +24,7 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Bool, Float, Int, Integer, Real
 
-from sidestep.errors import InputError, check
+from sidestep.errors import check
 from sidestep.io.minari.walks import read_positions, write_positions
 from sidestep.io.tables import check_columns, check_rows, finite_column, number_column, read_table, write_table
 
@@ -76,12 +76,11 @@ class Walks:
         """
         check(column not in _REQUIRED + _OPTIONAL, "expected a column of metadata", source=self.source, field=column)
         check_columns(self.metadata, (column,), self.source)
-        values = self.metadata[column].to_pylist()
-        for row, first in enumerate(np.repeat(self.offsets[:-1], np.diff(self.offsets)).tolist()):
-            if values[row] is None or values[row] != values[first]:
-                message = f"expected one value in all rows of a walk, found {values[row]!r}"
-                raise InputError(message, source=self.source, row=int(self.rows[row]), field=column)
-        return [values[first] for first in self.offsets[:-1].tolist()]
+        values, first = self.metadata[column].to_pylist(), np.repeat(self.offsets[:-1], np.diff(self.offsets))
+        valid = np.array([own is not None and own == values[index] for own, index in zip(values, first, strict=True)])
+        message = "expected one value in all rows of a walk, found {!r}"
+        check_rows(valid, message, self.source, column, self.rows, values)
+        return [values[index] for index in self.offsets[:-1]]
 
     def select(self, index: Bool[np.ndarray, " walks"] | Integer[np.ndarray, " selected"]) -> "Walks":
         """Return the walks that a mask or an array of indices selects, in that order.
@@ -153,11 +152,8 @@ def walks_from_table(table: pa.Table, source: str = "walks") -> Walks:
 
     def check_pairs(valid: Bool[np.ndarray, " pairs"], field: str, message: str) -> None:
         """Raise `InputError` for the earliest data row that is not valid after the row before it in its walk."""
-        later = np.flatnonzero(~valid & (walk[1:] == walk[:-1])) + 1
-        if later.size:
-            index = later[np.argmin(rows[later])]
-            message = f"{message}, but this row does not follow row {rows[index - 1]} so"
-            raise InputError(message, source=source, row=int(rows[index]), field=field)
+        message += ", but this row does not follow row {} so"
+        check_rows(valid | (walk[1:] != walk[:-1]), message, source, field, rows[1:], rows[:-1])
 
     positions = np.stack([finite_column(table, name, source) for name in ("x", "y")], axis=1)[order]
     steps = _steps(table, source)[order]
@@ -165,17 +161,16 @@ def walks_from_table(table: pa.Table, source: str = "walks") -> Walks:
     if "t" in table.column_names:
         times = finite_column(table, "t", source)[order]
         check_pairs(np.diff(times) >= 0, "t", "expected times that never decrease within a walk")
-    if (np.diff(offsets) == 1).any():
-        index = int(np.argmax(np.diff(offsets) == 1))
-        message = f"expected at least two positions, found one in walk {encoded.dictionary[index].as_py()!r}"
-        raise InputError(message, source=source, row=int(rows[offsets[index]]), field="walk")
+    labels = encoded.dictionary.to_pylist()
+    message = "expected at least two positions, found one in walk {!r}"
+    check_rows(np.diff(offsets) != 1, message, source, "walk", rows[offsets[:-1]], labels)
     goals = _pair(table, "goal", source)[order]
     for field, column in zip(("goal_x", "goal_y"), goals.T, strict=True):
         same = (column[1:] == column[:-1]) | (np.isnan(column[1:]) & np.isnan(column[:-1]))
         check_pairs(same, field, "expected the same goal in all rows of a walk")
     goals = goals[offsets[:-1]]
     return Walks(
-        labels=encoded.dictionary.to_pylist(),
+        labels=labels,
         offsets=offsets.astype(np.int64),
         goals=np.where(np.isnan(goals), positions[offsets[1:] - 1], goals),
         positions=positions,

@@ -95,12 +95,7 @@ def read_dataset(dataset: str | Path, check_spaces: Callable[[Any, Any], None]) 
         metadata = list(opened.storage.get_episode_metadata(opened.episode_indices))
         spaces, whole = (opened.observation_space, opened.action_space), opened.storage.metadata
     check(stored, "expected at least one episode, found none", source=dataset)
-    episodes = []
-    for each, own in zip(stored, metadata, strict=True):
-        terminated, source = bool(each.terminations[-1:].any()), f"{dataset}, episode {each.id}"
-        fields = each.observations, each.actions, each.rewards, terminated, each.infos or {}, own, source
-        episodes.append(Episode(*fields))
-        _check_lengths(episodes[-1])
+    episodes = [_episode(dataset, each, own) for each, own in zip(stored, metadata, strict=True)]
     return Dataset(*spaces, whole, episodes)
 
 
@@ -147,13 +142,16 @@ def _buffer_fields(episode: Episode) -> dict[str, Any]:
     }
 
 
-def _check_lengths(episode: Episode) -> None:
-    moves = len(episode.rewards)
-    check(moves != 0, "expected at least one move, found none", source=episode.source, field="rewards")
-    several = episode.observations
-    for name, values in (several if isinstance(several, Mapping) else {"observations": several}).items():
+def _episode(dataset: str | Path, stored: Any, metadata: Mapping[str, Any]) -> Episode:
+    """Return an episode from one of Minari's; raise `InputError` for one without a move, or of other lengths."""
+    source, moves, observations = f"{dataset}, episode {stored.id}", len(stored.rewards), stored.observations
+    check(moves != 0, "expected at least one move, found none", source=source, field="rewards")
+    several = observations if isinstance(observations, Mapping) else {"observations": observations}
+    for name, values in several.items():
         message = f"expected {moves + 1} observations around {moves} moves, found {len(values)}"
-        check(len(values) == moves + 1, message, source=episode.source, field=name)
+        check(len(values) == moves + 1, message, source=source, field=name)
+    terminated = bool(stored.terminations[-1:].any())
+    return Episode(observations, stored.actions, stored.rewards, terminated, stored.infos or {}, metadata, source)
 
 
 @contextmanager

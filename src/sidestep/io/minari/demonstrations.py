@@ -1,23 +1,30 @@
 """Demonstrations in discrete worlds as Minari datasets, and datasets of discrete spaces as demonstrations.
 
-Observations are states, and actions are numbered as in the model; `sidestep.io.minari.tasks` describes the metadata of
-tasks. The reward of a move (s, a, s′) is R(s, a), plus γ times the terminal reward of s′ if s′ is terminal. The return
-Σ γ^t r_t of an episode is then that of the task, and the rewards are on average those of the Gymnasium environment.
+Observations are states, and actions are numbered as in the model. The reward of a move (s, a, s′) is R(s, a), plus γ
+times the terminal reward of s′ if s′ is terminal. The return Σ γ^t r_t of an episode is then that of the task, and the
+rewards are on average those of the Gymnasium environment.
+
+Complete tasks are in the metadata, so that a dataset suffices for learning. The metadata of the dataset have `tasks`,
+one entry per task: `discount`, `terminal` (a list of states), and `reward` and `terminal_reward`, tables with axes of
+length 1 where allowed in `Task`. The metadata of each episode have `goal` (the terminal state with the largest reward,
+or a list of several), `discount`, and `task`, the number of its entry. In a dataset without `tasks`, the task of each
+episode is to reach its `goal` at its `discount`, as in `reach`.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
 from sidestep.errors import InputError, check
 from sidestep.io.minari.datasets import Dataset, Episode, read_dataset, require_minari, write_dataset
-from sidestep.io.minari.tasks import best_terminal_states, describe_tasks, tasks_of_episodes, world_size
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.grid import Grid
-from sidestep.tabular.tasks import Task
+from sidestep.tabular.tasks import Task, reach
 
 _NO_ENDS: Mapping[int, int] = {}
 
@@ -44,13 +51,12 @@ def write_demonstrations(
     require_minari(dataset)
     from gymnasium.spaces import Discrete
 
-    states, actions = world_size(world)
+    states, actions = _world_size(world)
     own_states, last_action = demonstrations.tasks.terminal.shape[-1], np.asarray(demonstrations.actions).max()
-    if own_states != states or last_action >= actions:
-        expected = f"expected demonstrations in a world of {states} states and {actions} actions"
-        message = f"{expected}, found {own_states} states and action {last_action}"
-        raise InputError(message, field="demonstrations")
-    tasks = describe_tasks(demonstrations.tasks)
+    message = f"expected demonstrations in a world of {states} states and {actions} actions"
+    message += f", found {own_states} states and action {last_action}"
+    check(own_states == states and last_action < actions, message, field="demonstrations")
+    tasks = _describe_tasks(demonstrations.tasks)
     episodes = list(_episodes(demonstrations, tasks, (states, actions), ends))
     write_dataset(dataset, Dataset(Discrete(states - len(ends)), Discrete(actions), {"tasks": tasks}, episodes))
 
@@ -82,7 +88,7 @@ def read_demonstrations(
     Example:
         >>> demonstrations = read_demonstrations("office/walks-v0", grid)  # doctest: +SKIP
     """
-    states, actions = world_size(world)
+    states, actions = _world_size(world)
 
     def check_spaces(observation_space: object, action_space: object) -> None:
         _check_space(observation_space, states - len(ends), dataset, "observation_space")
@@ -90,7 +96,7 @@ def read_demonstrations(
 
     stored = read_dataset(dataset, check_spaces)
     if task is None:
-        tasks, indices = tasks_of_episodes(stored, dataset, world, discount, step_cost)
+        tasks, indices = _tasks_of_episodes(stored, dataset, world, discount, step_cost)
     elif task.terminal.shape == (states,):
         tasks, indices = [task], [0] * len(stored.episodes)
     else:
@@ -117,13 +123,13 @@ def _episodes(
     trajectory = np.asarray(demonstrations.trajectory)
     for moves in np.split(np.arange(len(trajectory)), np.flatnonzero(np.diff(trajectory)) + 1):
         first, last = moves[0], moves[-1]
-        if (after[moves[:-1]] != before[moves[1:]]).any() or (task[moves] != task[first]).any():
-            message = "expected moves that each start where the one before ended, and one task"
-            raise InputError(message, source="trajectory", row=int(trajectory[first]) + 1)
+        connected = (after[moves[:-1]] == before[moves[1:]]).all() and (task[moves] == task[first]).all()
+        message = "expected moves that each start where the one before ended, and one task"
+        check(connected, message, source="trajectory", row=int(trajectory[first]) + 1)
         end = origin.get(int(after[last]), int(after[last]))
         path = np.append(before[moves], end).astype(np.int64)
         entry = tasks[task[first]]
-        goals = best_terminal_states(entry)
+        goals = _best_terminal_states(entry)
         metadata = {"task": int(task[first]), "discount": entry["discount"]}
         metadata |= {"goal": goals[0] if len(goals) == 1 else goals} if goals else {}
         yield Episode(path, acted[moves].astype(np.int64), rewards[moves], bool(ended[last]), {}, metadata)
@@ -154,11 +160,9 @@ def _within(values: object, length: int, count: int, source: str, field: str) ->
     numbers = np.asarray(values)
     message = f"expected {length} whole numbers, found {numbers.dtype} of shape {numbers.shape}"
     check(numbers.shape == (length,) and numbers.dtype.kind in "iu", message, source=source, field=field)
-    outside = (numbers < 0) | (numbers >= count)
-    if outside.any():
-        step = int(np.argmax(outside))
-        message = f"expected a whole number in 0…{count - 1}, found {numbers[step]} at step {step}"
-        raise InputError(message, source=source, field=field)
+    step = int(np.argmax((numbers < 0) | (numbers >= count)))
+    message = f"expected a whole number in 0…{count - 1}, found {numbers[step]} at step {step}"
+    check(0 <= numbers[step] < count, message, source=source, field=field)
     return numbers.astype(np.int64)
 
 
@@ -167,3 +171,111 @@ def _check_space(space: object, count: int, dataset: str | Path, field: str) -> 
 
     fits = isinstance(space, Discrete) and space.n == count and space.start == 0
     check(fits, f"expected Discrete({count}), as the world has, found {space}", source=dataset, field=field)
+
+
+def _describe_tasks(tasks: Task) -> list[dict[str, Any]]:
+    """Return stacked tasks as plain values, one entry per task."""
+    return [
+        {
+            "discount": float(tasks.discount[index]),
+            "terminal": np.flatnonzero(tasks.terminal[index]).tolist(),
+            "terminal_reward": np.asarray(tasks.terminal_reward[index], dtype=np.float64).tolist(),
+            "reward": np.asarray(tasks.reward[index], dtype=np.float64).tolist(),
+        }
+        for index in range(len(tasks.discount))
+    ]
+
+
+def _best_terminal_states(entry: Mapping[str, Any]) -> list[int]:
+    """Return the terminal states of a task with the largest reward; none if the task has no terminal state."""
+    terminal = np.asarray(entry["terminal"], dtype=np.int64)
+    final = np.asarray(entry["terminal_reward"])
+    paid = final[terminal] if len(final) > 1 else np.repeat(final, len(terminal))
+    return terminal[paid == paid.max(initial=-np.inf)].tolist()
+
+
+def _tasks_of_episodes(
+    dataset: Dataset, source: object, world: Grid | Graph, discount: float | None, step_cost: float | None
+) -> tuple[list[Task], list[int]]:
+    """Return the tasks of a dataset, and the index of each episode's task."""
+    entries = dataset.metadata.get("tasks")
+    if entries is not None:
+        check(isinstance(entries, list) and entries, "expected a list of tasks", source=source, field="tasks")
+        tasks = [_task(entry, world, f"{source}, task {index}") for index, entry in enumerate(entries)]
+        return tasks, [_entry_of(episode, entries) for episode in dataset.episodes]
+    towards: dict[tuple[int, float], Task] = {}
+    keys = []
+    for episode in dataset.episodes:
+        metadata = {"discount": discount} | dict(episode.metadata)
+        key = _whole(metadata, "goal", episode.source), _number(metadata, "discount", episode.source)
+        keys.append(key)
+        try:
+            towards[key] = towards.get(key) or reach(world, key[0], discount=key[1], step_cost=step_cost)
+        except InputError as error:
+            raise error.of(episode.source) from error
+    return list(towards.values()), [list(towards).index(key) for key in keys]
+
+
+def _entry_of(episode: Episode, entries: Sequence[Mapping[str, Any]]) -> int:
+    """Return the entry of an episode; goal and discount of its metadata, if any, must be those of the entry."""
+    index = _whole(episode.metadata, "task", episode.source)
+    message = f"expected a task in 0…{len(entries) - 1}, found {index}"
+    check(0 <= index < len(entries), message, source=episode.source, field="task")
+    entry = entries[index]
+    for field, expected in (("goal", _best_terminal_states(entry)), ("discount", entry["discount"])):
+        own = episode.metadata.get(field, expected)
+        message = f"expected {expected} as in task {index}, found {own}"
+        check(np.array_equal(np.atleast_1d(own), np.atleast_1d(expected)), message, source=episode.source, field=field)
+    return index
+
+
+def _number(metadata: Mapping[str, Any], field: str, source: str) -> float:
+    """Return a number in the metadata of an episode."""
+    value = metadata.get(field)
+    message = "neither the episode nor an argument has it: expected a number, or a task for all episodes"
+    check(value is not None, message, source=source, field=field)
+    is_number = np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"
+    check(is_number, f"expected a number, found {value!r}", source=source, field=field)
+    return float(value)
+
+
+def _whole(metadata: Mapping[str, Any], field: str, source: str) -> int:
+    """Return a whole number in the metadata of an episode."""
+    value = _number(metadata, field, source)
+    check(value.is_integer(), f"expected a whole number, found {value:g}", source=source, field=field)
+    return int(value)
+
+
+def _task(entry: Any, world: Grid | Graph, source: str) -> Task:
+    """Return the task of an entry; raise `InputError` for one that does not fit the world."""
+    states, actions = _world_size(world)
+    keys = {"discount", "terminal", "terminal_reward", "reward"}
+    complete = isinstance(entry, Mapping) and keys <= entry.keys()
+    check(complete, "expected discount, terminal, terminal_reward and reward", source=source)
+    discount = _number(entry, "discount", source)
+    message = f"expected a number above 0 and at most 1, found {discount}"
+    check(0 < discount <= 1, message, source=source, field="discount")
+    ends = np.asarray(entry["terminal"])
+    valid = ends.ndim == 1 and (ends.dtype.kind == "i" or not len(ends)) and np.isin(ends, np.arange(states)).all()
+    check(valid, f"expected a list of states in 0…{states - 1}", source=source, field="terminal")
+    terminal = jnp.asarray(np.isin(np.arange(states), ends))
+    reward = jnp.asarray(_table(entry, "reward", (states, actions), source))
+    terminal_reward = jnp.asarray(_table(entry, "terminal_reward", (states,), source))
+    return Task(reward, terminal_reward, terminal, jnp.asarray(discount, jnp.result_type(float)))
+
+
+def _table(entry: Mapping[str, Any], field: str, shape: tuple[int, ...], source: str) -> Float[np.ndarray, "..."]:
+    """Return a table of finite numbers of a shape, of which any axis may have length 1."""
+    try:
+        table = np.asarray(entry[field], dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError("expected a table of numbers", source=source, field=field) from error
+    fits = table.ndim == len(shape) and all(np.isin(table.shape, 1) | (np.array(table.shape) == shape))
+    message = f"expected finite numbers of shape {shape}, found shape {table.shape}"
+    check(fits and np.isfinite(table).all(), message, source=source, field=field)
+    return table
+
+
+def _world_size(world: Grid | Graph) -> tuple[int, int]:
+    """Return the numbers of states and actions of a world."""
+    return (world.size, len(world.steps)) if isinstance(world, Grid) else (world.states, world.actions)

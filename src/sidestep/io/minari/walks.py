@@ -11,6 +11,7 @@ Walks are written in this form. An action is the intended displacement from a po
 last action is 1 if it reaches the goal, and all other rewards are 0.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -20,6 +21,7 @@ from jaxtyping import Float, Shaped
 
 from sidestep.errors import InputError, check
 from sidestep.io.minari.datasets import Dataset, Episode, read_dataset, require_minari, write_dataset
+from sidestep.io.tables import check_rows
 
 _OWN = ("walk", "x", "y", "goal_x", "goal_y")
 """Columns that are not from `infos`."""
@@ -62,7 +64,9 @@ def write_positions(dataset: str, table: pa.Table) -> None:
 def _episodes(table: pa.Table, dataset: str) -> Iterator[Episode]:
     """Yield the episode of each walk."""
     infos = {name: _info(table[name], name, dataset) for name in table.column_names if name not in _OWN}
-    positions, goals = _pair(table, "x", "y"), _pair(table, "goal_x", "goal_y")
+    positions, goals = (
+        np.stack([table[name].to_numpy() for name in names], axis=1) for names in (("x", "y"), ("goal_x", "goal_y"))
+    )
     targets = positions
     if _FAILED[0] in infos:
         failed = np.stack([infos[name] for name in _FAILED], axis=1)
@@ -90,15 +94,9 @@ def _info(column: pa.ChunkedArray, name: str, dataset: str) -> Shaped[np.ndarray
         values = column.to_numpy()
     else:
         raise InputError(f"expected numbers or text, found {kind}; leave the column out", source=dataset, field=name)
-    if column.null_count:
-        row = column.is_null().to_pylist().index(True) + 1
-        message = "a Minari dataset has no empty cells; fill it, or leave the column out"
-        raise InputError(message, source=dataset, row=row, field=name)
+    message = "a Minari dataset has no empty cells; fill it, or leave the column out"
+    check_rows(column.is_valid().to_numpy(), message, dataset, name)
     return values
-
-
-def _pair(table: pa.Table, first: str, second: str) -> Float[np.ndarray, "rows 2"]:
-    return np.stack([table[first].to_numpy(), table[second].to_numpy()], axis=1)
 
 
 def _check_space(space: Any, dataset: str) -> None:
@@ -126,9 +124,8 @@ def _labels(episodes: Sequence[Episode], dataset: str) -> list[Any]:
     if any(label is None for label in labels):
         return list(range(len(labels)))
     labels = [label.item() if isinstance(label, np.generic) else label for label in labels]
-    if len(set(labels)) < len(labels):
-        twice = next(label for label in labels if labels.count(label) > 1)
-        raise InputError(f"expected different walks, found {twice!r} more than once", source=dataset, field="walk")
+    twice = [label for label, count in Counter(labels).items() if count > 1]
+    check(not twice, f"expected different walks, found {twice} more than once", source=dataset, field="walk")
     return labels
 
 
@@ -163,11 +160,10 @@ def _plane(values: Any, rows: int, source: str, field: str) -> Float[np.ndarray,
         raise InputError(f"expected numbers: {error}", source=source, field=field) from error
     message = f"expected x and y in each of {rows} rows, found shape {array.shape}"
     check(array.ndim == 2 and len(array) == rows and array.shape[1] >= 2, message, source=source, field=field)
-    places = array[:, :2]
-    step = int(np.argmin(np.isfinite(places).all(axis=1)))
-    message = f"expected finite numbers, found {places[step].tolist()} at step {step}"
-    check(np.isfinite(places).all(), message, source=source, field=field)
-    return places
+    step = int(np.argmin(np.isfinite(array[:, :2]).all(axis=1)))
+    message = f"expected finite numbers, found {array[step, :2].tolist()} at step {step}"
+    check(np.isfinite(array[step, :2]).all(), message, source=source, field=field)
+    return array[:, :2]
 
 
 def _columns(infos: Mapping[str, Any], rows: int) -> dict[str, pa.Array]:
