@@ -181,7 +181,7 @@ def test_read_walks_without_positions_raises(space, message):
 
 def test_read_walks_with_one_label_twice_raises():
     dataset = store((MAZE, FORCE), maze(), maze(), metadata=[{"walk": "a"}, {"walk": "a"}])
-    refused(dataset, ", field 'walk': expected different walks, found \['a'\] more than once")
+    refused(dataset, r", field 'walk': expected different walks, found \['a'\] more than once")
 
 
 def test_read_walks_of_mixed_infos_raises():

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
 
 from sidestep.errors import InputError, check, check_count
 from sidestep.tabular.demonstrations import Trajectory
@@ -36,19 +35,6 @@ class Environment(NamedTuple):
     ends: Mapping[int, int]
 
 
-class _Outcome(NamedTuple):
-    """An outcome of an action, as in Gymnasium's tables."""
-
-    probability: float
-    state: int
-    reward: float
-    ends: bool
-
-
-_Table = list[list[list[_Outcome]]]
-"""Outcomes by state and action, without those of probability 0."""
-
-
 def from_gymnasium(env: Any, discount: float = 0.99) -> Environment:
     """Return the model and the task of an environment with a transition table.
 
@@ -69,62 +55,47 @@ def from_gymnasium(env: Any, discount: float = 0.99) -> Environment:
     rows = getattr(env.unwrapped, "P", None)
     if rows is None:
         raise InputError("expected an environment with a transition table, `P`", source=env)
-    table = [[[_Outcome(*each) for each in rows[s][a] if each[0] > 0] for a in rows[s]] for s in range(len(rows))]
-    ends = _separate_ends(table)
-    terminal = np.zeros(len(table), dtype=bool)
-    width = max(1, *(len(outcomes) for row in table for outcomes in row))
-    successors = np.tile(np.arange(len(table))[:, None, None], (1, len(table[0]), width))
-    probabilities = np.zeros(successors.shape)
-    for s, row in enumerate(table):
-        for a, outcomes in enumerate(row):
-            for k, outcome in enumerate(outcomes):
-                successors[s, a, k], probabilities[s, a, k] = outcome.state, outcome.probability
-                terminal[outcome.state] |= outcome.ends
+    probabilities, successors, rewards, ending, ends = _outcomes(rows)
+    terminal = np.isin(np.arange(len(successors)), successors[ending])
+    continuing = np.where(ending, 0.0, probabilities)
+    total = continuing.sum(axis=-1)
+    reward = (continuing * rewards).sum(axis=-1) / np.where(total > 0, total, 1.0)
+    # the terminal reward is what ending pays beyond the other outcomes; where there are none, the action pays the rest
+    paid = ending & ~terminal[:, None, None]
+    beside_others = paid & (total > 0)[..., None]
+    final = np.zeros(len(successors))
+    final[successors[beside_others]] = (rewards - reward[..., None])[beside_others]
+    reward = np.where(total > 0, reward, rewards[..., 0] - final[successors[..., 0]])
+    beyond, known = rewards - reward[..., None], final[successors]
+    for place in np.argwhere(paid & ~np.isclose(known, beyond))[:1].tolist():
+        one, other, state = (float(each[*place]) for each in (known, beyond, successors))
+        raise InputError(f"ending in state {state:g} pays {one:g} beyond one action and {other:g} beyond another")
+    reward[terminal] = 0.0
+    possible = jnp.asarray(probabilities > 0)
     logits = jnp.log(jnp.asarray(np.where(probabilities > 0, probabilities, 1.0)))
-    model = TabularModel(graph(successors), logits, jnp.asarray(probabilities > 0))
-    return Environment(model, _task(table, terminal, discount), ends)
+    task = Task(jnp.asarray(reward), jnp.asarray(final / discount), jnp.asarray(terminal), jnp.asarray(float(discount)))
+    return Environment(TabularModel(graph(successors), logits, possible), task, ends)
 
 
-def _separate_ends(table: _Table) -> dict[int, int]:
-    """Change a table so that ends have separate states where necessary; return these by the former states."""
-    outcomes = [(s, outcome) for s, row in enumerate(table) for several in row for outcome in several]
-    ending = {int(outcome.state) for _, outcome in outcomes if outcome.ends}
-    passed = {int(outcome.state) for s, outcome in outcomes if not outcome.ends and s not in ending}
-    ends = {state: len(table) + number for number, state in enumerate(sorted(ending & passed))}
-    for several in (several for row in table for several in row):
-        for number, outcome in enumerate(several):
-            if outcome.ends:
-                several[number] = outcome._replace(state=ends.get(int(outcome.state), outcome.state))
-    table += [[[_Outcome(1.0, state, 0.0, True)]] * len(table[0]) for state in ends.values()]
-    return ends
-
-
-def _task(table: _Table, terminal: Bool[np.ndarray, " states"], discount: float) -> Task:
-    acting = [(s, a, outcomes) for s, row in enumerate(table) if not terminal[s] for a, outcomes in enumerate(row)]
-    reward = np.zeros((len(table), len(table[0])))
-    final = np.full(len(table), np.nan)
-    for s, a, outcomes in acting:
-        continuing = [(outcome.probability, outcome.reward) for outcome in outcomes if not outcome.ends]
-        if continuing:
-            probabilities, rewards = np.array(continuing).T
-            reward[s, a] = probabilities @ rewards / probabilities.sum()
-            _set_terminal_rewards(final, outcomes, reward[s, a])
-    final[np.isnan(final)] = 0.0
-    for s, a, outcomes in acting:
-        if all(outcome.ends for outcome in outcomes):
-            reward[s, a] = outcomes[0].reward - final[outcomes[0].state]
-            _set_terminal_rewards(final, outcomes, reward[s, a])
-    return Task(jnp.asarray(reward), jnp.asarray(final / discount), jnp.asarray(terminal), jnp.asarray(float(discount)))
-
-
-def _set_terminal_rewards(final: Float[np.ndarray, " states"], outcomes: list[_Outcome], reward: float) -> None:
-    """Set the terminal rewards of the ends of an action: their rewards beyond `reward`."""
-    for outcome in outcomes:
-        if outcome.ends:
-            beyond, known = outcome.reward - reward, final[outcome.state]
-            message = f"ending in state {outcome.state} pays {beyond:g} beyond one action and {known:g} beyond another"
-            check(np.isnan(known) or np.isclose(known, beyond), message)
-            final[outcome.state] = beyond
+def _outcomes(rows: Any) -> tuple[Any, ...]:
+    """Return probability, next state, reward and whether the episode ends, of each outcome; and the separate ends."""
+    table = [[[each for each in rows[s][a] if each[0] > 0] for a in rows[s]] for s in range(len(rows))]
+    width = max(1, *(len(outcomes) for row in table for outcomes in row))
+    padded = [[each + [(0.0, s, 0.0, False)] * (width - len(each)) for each in row] for s, row in enumerate(table)]
+    probabilities, states, rewards, ending = np.moveaxis(np.array(padded, dtype=np.float64), -1, 0)
+    successors, ending = states.astype(np.int64), ending > 0
+    # a state needs a separate end if episodes also pass it
+    ended = np.unique(successors[ending])
+    acting = ~np.isin(np.arange(len(table)), ended)[:, None, None]
+    separate = np.intersect1d(ended, successors[(probabilities > 0) & ~ending & acting])
+    new = len(table) + np.arange(len(separate))
+    moved = ending & np.isin(successors, separate)
+    successors[moved] = new[np.searchsorted(separate, successors[moved])]
+    shape = len(new), *successors.shape[1:]
+    added = np.arange(width) == 0, new[:, None, None], 0.0, False
+    arrays = zip((probabilities, successors, rewards, ending), added, strict=True)
+    joined = (np.concatenate([array, np.broadcast_to(row, shape)]) for array, row in arrays)
+    return *joined, dict(zip(separate.tolist(), new.tolist(), strict=True))
 
 
 def slippery(environment: Environment, logit: float = 0.0) -> TiedModel:
