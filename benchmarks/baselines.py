@@ -25,7 +25,7 @@ import numpy as np
 
 from benchmarks import SHARED_DATA, Record, changed, described, flat, option
 from benchmarks.people import CELLS, METHODS, Maze, in_trials, learn_by, read_mazes, show_means
-from sidestep.io.trajectories import walks_from_trajectories
+from sidestep.io.demonstrations import walks_from_trajectories
 from sidestep.maps.config import MapConfig, SimulationConfig
 from sidestep.tabular.grid import Cell
 from sidestep.worlds.offices import office, places

@@ -21,9 +21,9 @@ import numpy as np
 from benchmarks import SHARED_DATA, Record, changed, described, flat, option, peak_bytes, print_table
 from benchmarks.people import Maze, learn_by
 from sidestep.evaluation.relevance import relevant_obstacles
+from sidestep.io.demonstrations import walks_from_trajectories
 from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map
-from sidestep.io.trajectories import walks_from_trajectories
 from sidestep.maps.config import BehaviorConfig, MapConfig, PriorConfig, SimulationConfig
 from sidestep.maps.learn import demonstrations_of
 from sidestep.tabular.grid import Cell, Grid

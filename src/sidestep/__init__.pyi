@@ -18,7 +18,7 @@ from .io.minari.demonstrations import (
     read_demonstrations as read_demonstrations,
     write_demonstrations as write_demonstrations,
 )
-from .io.sensors import read_sensor_map as read_sensor_map, read_sensor_variance as read_sensor_variance
+from .io.maps import read_sensor_map as read_sensor_map, read_sensor_variance as read_sensor_variance
 from .io.walks import Walks as Walks, read_walks as read_walks, write_walks as write_walks
 from .tabular.demonstrations import Demonstrations as Demonstrations, Trajectory as Trajectory, gather as gather
 from .tabular.graph import Graph as Graph, graph as graph, grid_graph as grid_graph

@@ -50,7 +50,7 @@ def table(office):
     """What the command prints."""
     with pytest.MonkeyPatch.context() as patch:
         lines = []
-        patch.setattr("sidestep.cli.display.print_table", lambda rows, columns: lines.append((rows, columns)))
+        patch.setattr("sidestep.cli.display.print_scores", lambda rows, columns: lines.append((rows, columns)))
         assert compare(office, office / "compared", "--seed", 3) == 0
     return lines[0]
 
@@ -125,7 +125,8 @@ def test_compare_methods_with_selection_selects_by_the_walks_that_are_learned_fr
     comparison = compare_methods(*data, config=config, baselines={"transitions": BASELINES["transitions"]})
     train = walks.select(np.sort(np.random.default_rng(3).permutation(80)[16:]))
     selection = select_behavior(grid, grid_walks(train, grid), config)
-    assert comparison.reasons == selection.reasons
+    assert comparison.selection is not None
+    assert comparison.selection.reasons == selection.reasons
     assert comparison.config == selection.config
     assert comparison.config.behavior.learn == ("lapse",)
     assert not comparison.config.behavior.select

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from sidestep.cli.app import main
+from sidestep.io.demonstrations import walks_from_trajectories
 from sidestep.io.maps import write_map
-from sidestep.io.trajectories import walks_from_trajectories
 from sidestep.io.walks import Walks
 from sidestep.maps.config import SimulationConfig
 from sidestep.tabular.grid import Cell, Grid

@@ -160,12 +160,12 @@ def test_read_walks_of_bad_goals_raises(goal, message):
 @pytest.mark.parametrize(
     ("space", "message"),
     [
-        (Discrete(4), r", field 'observations': expected a Box of at least two numbers x, y, found Discrete\(4\)"),
-        (Box(0, 4, (1,)), ", field 'observations': expected a Box of at least two numbers x, y, found Box"),
-        (Box(0, 4, (2, 2)), ", field 'observations': expected a Box of at least two numbers x, y, found Box"),
+        (Discrete(4), r", field 'achieved_goal': expected a Box of at least two numbers x, y, found Discrete\(4\)"),
+        (Box(0, 4, (1,)), ", field 'achieved_goal': expected a Box of at least two numbers x, y, found Box"),
+        (Box(0, 4, (2, 2)), ", field 'achieved_goal': expected a Box of at least two numbers x, y, found Box"),
         (
             Dict({"seen": PLANE}),
-            ", field 'observation_space': expected achieved_goal among the observations, found seen",
+            ", field 'observation_space': expected achieved_goal among the observations, found Dict",
         ),
         (
             Dict({"achieved_goal": PLANE, "desired_goal": Discrete(4)}),

@@ -6,8 +6,7 @@ import yaml
 from PIL import Image
 
 from sidestep.errors import InputError
-from sidestep.io.maps import write_map
-from sidestep.io.sensors import read_sensor_map, read_sensor_variance
+from sidestep.io.maps import read_sensor_map, read_sensor_variance, write_map
 from sidestep.tabular.grid import Grid
 
 GRID = Grid(np.full((2, 3), -1), resolution=0.05, origin=(1.0, -2.0, 0.5))

@@ -190,11 +190,8 @@ def test_read_walks_names_bad_rows(tmp_path, line, column, value, message):
         ("walk,step,x\n0,0,0\n", "field 'y': the column is missing; found walk, step, x"),
         ("walk;step;x;y\n0;0;0;0\n", "field 'walk': the column is missing"),
         ("walk,step,x,y,x\n0,0,0,0,0\n", "field 'x': the column appears more than once"),
-        ("walk,step,x,y,goal_x\n0,0,0,0,0\n", "field 'goal_y': expected goal_x and goal_y, or neither"),
-        (
-            "walk,step,x,y,failed_y\n0,0,0,0,0\n",
-            "field 'failed_x': expected failed_x and failed_y, or neither",
-        ),
+        ("walk,step,x,y,goal_x\n0,0,0,0,0\n0,1,0,0,0\n", "field 'goal_y': the column is missing"),
+        ("walk,step,x,y,failed_y\n0,0,0,0,0\n0,1,0,0,0\n", "field 'failed_x': the column is missing"),
         ("walk,step,x,y\n0,0,0,0\n\n0,1,1\n", "row 2: expected 4 cells as in the header, found 3"),
         ("walk,step,x,y\n0,0,0,0\n0,1,1,1,1\n", "row 2: expected 4 cells as in the header, found 5"),
         (b"walk,step,x,y\n0,0,0,0\n\xff,1,1,1\n", "row 2: expected text in UTF-8"),

@@ -8,8 +8,8 @@ import pyarrow.csv
 import pytest
 
 from helpers.office import BLANK, OFFICE, WALL, call, simulated, summary, write_office, written
+from sidestep.io.demonstrations import walks_from_trajectories
 from sidestep.io.maps import write_map
-from sidestep.io.trajectories import walks_from_trajectories
 from sidestep.io.walks import table_from_walks, write_walks
 from sidestep.maps.annotations import WalkAnnotations
 from sidestep.maps.goal_candidates import GoalCandidates

@@ -8,8 +8,8 @@ import pytest
 
 from helpers.office import BLANK, OFFICE, WALL, call, simulated, summary, write_office
 from sidestep.errors import ImproperTask, InputError
+from sidestep.io.demonstrations import walks_from_trajectories
 from sidestep.io.gridding import grid_walks
-from sidestep.io.trajectories import walks_from_trajectories
 from sidestep.io.walks import write_walks
 from sidestep.maps.config import BehaviorConfig, MapConfig, PriorConfig, SimulationConfig
 from sidestep.maps.learn import learn_map

@@ -10,8 +10,8 @@ from scipy.optimize import brentq
 from scipy.special import expit, logit
 
 from helpers.office import OFFICE, WALL, call, simulated, summary, write_office, written
+from sidestep.io.demonstrations import walks_from_trajectories
 from sidestep.io.maps import write_map
-from sidestep.io.trajectories import walks_from_trajectories
 from sidestep.io.walks import read_walks, write_walks
 from sidestep.maps.config import MapConfig, PriorConfig
 from sidestep.maps.learn import learn_map

@@ -8,8 +8,7 @@ import pytest
 from scipy.sparse.csgraph import dijkstra
 
 from sidestep.errors import InputError
-from sidestep.io.demonstrations import demonstrations_from_walks
-from sidestep.io.trajectories import walks_from_trajectories
+from sidestep.io.demonstrations import demonstrations_from_walks, walks_from_trajectories
 from sidestep.io.walks import read_walks, write_walks
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.demonstrations import gather

@@ -21,19 +21,49 @@ _UNVISITED = 0.98
 
 
 def behavior_aware(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
-    """Learn P(blocked) from actions and transitions, by the fit of `learn_map`."""
+    """Learn P(blocked) from actions and transitions, by the fit of `learn_map`.
+
+    Args:
+        grid: The known map.
+        demonstrations: The walks on it.
+        config: The configuration of the fit.
+
+    Returns:
+        The learned map.
+
+    Raises:
+        InputError: As `fit_map` does.
+    """
     fit = fit_map(ObstacleGrid(grid, config.prior.mean), demonstrations, config)
     result = model_result(fit.model, demonstrations, config)
     return result._replace(behavior=fit.behavior.behavior_of(), converged=fit.converged)
 
 
 def transitions_only(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
-    """Learn P(blocked) from transitions and first cells, whatever the goals of agents."""
+    """Learn P(blocked) from transitions and first cells, whatever the goals of agents.
+
+    Args:
+        grid: The known map.
+        demonstrations: The walks on it.
+        config: The configuration of the fit.
+
+    Returns:
+        The learned map.
+    """
     return behavior_aware(grid, demonstrations, replace(config, fit=replace(config.fit, terms="transitions")))
 
 
 def visit_counts(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
-    """Count visits: P(blocked) = 1/(n + 1) of a cell with n > 0 visits and .98 of one without."""
+    """Count visits: P(blocked) = 1/(n + 1) of a cell with n > 0 visits and .98 of one without.
+
+    Args:
+        grid: The known map.
+        demonstrations: The walks on it.
+        config: The reward and the behavior, for the log-likelihood of other walks.
+
+    Returns:
+        The map, ranked by minus the number of visits.
+    """
     ranking = visit_ranking(np.concatenate(demonstrations.paths()), grid)
     blocked = np.clip(1 / (1 - ranking), None, _UNVISITED).ravel()
     model = ObstacleGrid(grid, np.log(blocked) - np.log1p(-blocked))

@@ -27,6 +27,8 @@ from sidestep.robots.planners import PolicyPlanner
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Grid
 
+_Index = Int[np.ndarray, " visits"]
+
 MAX_ITERATIONS = 2000
 """The most iterations of the regression."""
 _VARIANCES = (0.1, 1.0, 10.0)
@@ -42,7 +44,7 @@ class ClonedPolicy:
 
     Attributes:
         grid: The known map.
-        weights: w of every action.
+        weights: W of every action.
         intercepts: The intercept of every action.
         converged: Whether the regression converged.
         ranking: None, since cells are not ranked.
@@ -57,7 +59,11 @@ class ClonedPolicy:
     heatmap: None = None
 
     def policy(self, goal: int) -> Float[np.ndarray, "states actions"]:
-        """Return π(a | s) for a goal (a state)."""
+        """Return π(a | s) for a goal (a state).
+
+        Args:
+            goal: The goal, a state.
+        """
         states = np.arange(self.grid.size)
         return np.exp(self._log_policy(states, np.full(self.grid.size, goal)))
 
@@ -67,13 +73,15 @@ class ClonedPolicy:
         return PolicyPlanner(self.grid, self.policy)
 
     def log_policies(self, demonstrations: Demonstrations) -> Float[np.ndarray, " moves"]:
-        """Return log π(a | s) of every move in nats."""
+        """Return log π(a | s) of every move in nats.
+
+        Args:
+            demonstrations: Moves on the same map.
+        """
         states, actions, goals = _moves(demonstrations)
         return self._log_policy(states, goals)[np.arange(len(states)), actions]
 
-    def _log_policy(
-        self, states: Int[np.ndarray, " visits"], goals: Int[np.ndarray, " visits"]
-    ) -> Float[np.ndarray, "visits actions"]:
+    def _log_policy(self, states: _Index, goals: _Index) -> Float[np.ndarray, "visits actions"]:
         from scipy.special import log_softmax
 
         return log_softmax(_features(self.grid, states, goals) @ self.weights.T + self.intercepts, axis=-1)
@@ -82,7 +90,17 @@ class ClonedPolicy:
 def behavior_cloning(
     grid: Grid, demonstrations: Demonstrations, config: MapConfig, max_iterations: int = MAX_ITERATIONS
 ) -> ClonedPolicy:
-    """Learn a policy from the actions; `config` is not used, since it has neither a reward nor a behavior model."""
+    """Learn a policy from the actions; `config` is not used, since it has neither a reward nor a behavior model.
+
+    Args:
+        grid: The known map.
+        demonstrations: The walks on it.
+        config: Not used.
+        max_iterations: The most iterations of the regression.
+
+    Returns:
+        A policy for every goal.
+    """
     del config
     walks = np.asarray(demonstrations.trajectory)
     fold, everything = walks % _FOLDS, np.ones(len(walks), dtype=bool)
@@ -122,7 +140,7 @@ def _moves(demonstrations: Demonstrations) -> tuple[Int[np.ndarray, " moves"], .
     return np.asarray(demonstrations.states), np.asarray(demonstrations.actions), goals
 
 
-def _features(grid: Grid, states: Int[np.ndarray, " visits"], goals: Int[np.ndarray, " visits"]) -> csr_array:
+def _features(grid: Grid, states: _Index, goals: _Index) -> csr_array:
     """Return φ(s, g) of each visit, one in a row."""
     columns = grid.shape[1]
     offset = np.stack(np.divmod(goals, columns), axis=-1) - np.stack(np.divmod(states, columns), axis=-1)
@@ -139,6 +157,6 @@ def _features(grid: Grid, states: Int[np.ndarray, " visits"], goals: Int[np.ndar
     return csr_array(hstack(parts))
 
 
-def _one_hot(index: Int[np.ndarray, " visits"], size: int) -> csr_array:
+def _one_hot(index: _Index, size: int) -> csr_array:
     visits = np.arange(len(index))
     return csr_array((np.ones(len(index)), (visits, index)), shape=(len(index), size))

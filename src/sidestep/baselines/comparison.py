@@ -9,7 +9,7 @@ import numpy as np
 
 from sidestep.baselines import BASELINES
 from sidestep.baselines.interface import Method, ModelResult, model_result
-from sidestep.errors import ImproperTask, InputError, NotConverged
+from sidestep.errors import ImproperTask, NotConverged, check
 from sidestep.evaluation import study
 from sidestep.evaluation.study import Problem, Record, run_method
 from sidestep.inference.goals import goal_posterior
@@ -20,6 +20,7 @@ from sidestep.maps.config import MapConfig
 from sidestep.maps.fit import behavior_of
 from sidestep.maps.learn import demonstrations_of, learn_map, sample_walks
 from sidestep.maps.learned_map import LearnedMap
+from sidestep.maps.selection import Selection
 from sidestep.maps.sensors import SensorMap
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Grid
@@ -42,10 +43,9 @@ class Comparison:
     learned: LearnedMap | None
 
     @property
-    def reasons(self) -> list[str]:
-        """The reasons for the selected behavior, if it was selected."""
-        selection = self.learned.learning.selection if self.learned and self.learned.learning else None
-        return selection.reasons if selection else []
+    def selection(self) -> Selection | None:
+        """The selection of the behavior, if there was one."""
+        return self.learned.learning.selection if self.learned and self.learned.learning else None
 
     def method_scores(self) -> dict[str, dict[str, Any]]:
         """Return the scores of each method by name."""
@@ -53,11 +53,11 @@ class Comparison:
 
     def summary(self) -> dict[str, Any]:
         """Return the content of `summary.json`."""
-        learning, heldout = self.learned.learning if self.learned else None, self.problem.heldout
+        heldout = self.problem.heldout
         return {
             "settings": asdict(self.config),
             "connectivity": self.problem.grid.connectivity,
-            "behavior": learning.selection.summary() if learning and learning.selection else {},
+            "behavior": self.selection.summary() if self.selection else {},
             "data": {
                 "walks": self.problem.demonstrations.trajectories,
                 "moves": len(self.problem.demonstrations),
@@ -99,6 +99,9 @@ def compare_methods(
         notify: Called with a line of text at each stage.
         checkpoint: As for `learn_map`.
         resume: As for `learn_map`.
+
+    Returns:
+        The scores of all methods, and the learned map.
 
     Raises:
         InputError: For a fraction that leaves no walk to learn from, or none to score though it is above 0; and as
@@ -142,8 +145,8 @@ def _configured(baseline: Method, config: MapConfig) -> study.Method:
 def _split(walks: Walks, hold_out: float, seed: int) -> tuple[Walks, Walks]:
     """Split walks into those to learn from and those held out."""
     held = round(hold_out * len(walks))
-    if not 0 <= held < len(walks) or (held == 0) != (hold_out == 0):
-        raise InputError(f"expected a fraction of the {len(walks)} walks, found {hold_out}", field="hold_out")
+    valid = 0 <= held < len(walks) and (held == 0) == (hold_out == 0)
+    check(valid, f"expected a fraction of the {len(walks)} walks, found {hold_out}", field="hold_out")
     drawn = np.random.default_rng(seed).permutation(len(walks))
     return walks.select(np.sort(drawn[held:])), walks.select(np.sort(drawn[:held]))
 

@@ -28,12 +28,22 @@ from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, true_model
 from sidestep.tabular.planning import Plan, plan
 
+_Visits = Float[np.ndarray, " cells"]
 _MAX_LOGIT = 6.0
 """The logit of the first forbidden cell."""
 
 
 def constraint_inference(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
-    """Forbid cells one after another; P(blocked) is higher for cells that were forbidden earlier."""
+    """Forbid cells one after another; P(blocked) is higher for cells that were forbidden earlier.
+
+    Args:
+        grid: The known map.
+        demonstrations: The walks on it.
+        config: The reward and the behavior of agents.
+
+    Returns:
+        A map in which forbidden cells have P(blocked) above 1/2.
+    """
     visited = np.zeros(grid.size, dtype=bool)
     visited[np.concatenate(demonstrations.paths())] = True
     candidates = ~visited & (grid.known.ravel() == Cell.UNKNOWN)
@@ -52,9 +62,7 @@ def constraint_inference(grid: Grid, demonstrations: Demonstrations, config: Map
     return model_result(model, demonstrations, config)
 
 
-def _logits(
-    candidates: Bool[np.ndarray, " cells"], forbidden: list[int], visits: Float[np.ndarray, " cells"]
-) -> Float[np.ndarray, " cells"]:
+def _logits(candidates: Bool[np.ndarray, " cells"], forbidden: list[int], visits: _Visits) -> _Visits:
     """Return logits above 0 for forbidden cells, and below for others; expected visits bring these nearer to 0."""
     logits = np.full(len(visits), -_MAX_LOGIT)
     relative = visits / max(visits[candidates].max(initial=0.0), 1e-300)
@@ -65,7 +73,7 @@ def _logits(
 
 def _predict(
     grid: Grid, forbidden: list[int], demonstrations: Demonstrations, behavior: Behavior
-) -> tuple[Float[np.ndarray, " cells"], float]:
+) -> tuple[_Visits, float]:
     """Return the expected visits of each cell, and the log-likelihood of the observed actions."""
     known = grid.passable().known
     known.flat[forbidden] = Cell.OCCUPIED
@@ -83,9 +91,7 @@ def _predict(
     return visits, total
 
 
-def _expected_visits(
-    model: ObstacleGrid, agents: Plan, starts: Float[np.ndarray, " cells"]
-) -> Float[np.ndarray, " cells"]:
+def _expected_visits(model: ObstacleGrid, agents: Plan, starts: _Visits) -> _Visits:
     """Return the expected visits of each cell when agents follow a plan."""
     from scipy.sparse import coo_array, eye_array
     from scipy.sparse.linalg import spsolve

@@ -63,7 +63,11 @@ class ModelResult(NamedTuple):
         return blocked
 
     def log_policies(self, demonstrations: Demonstrations) -> Float[np.ndarray, " moves"]:
-        """Return log π(a | s) of every move for agents that know the model and pursue the reward."""
+        """Return log π(a | s) of every move for agents that know the model and pursue the reward.
+
+        Args:
+            demonstrations: Moves on the same map.
+        """
         goals = np.asarray(demonstrations.tasks.terminal).argmax(axis=-1)
         tasks = stack_tasks([self.reward.reach(self.model.blank, int(goal)) for goal in goals])
         moves = eqx.tree_at(lambda moves: moves.tasks, demonstrations, tasks)

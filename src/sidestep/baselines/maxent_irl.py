@@ -66,7 +66,12 @@ class CostlyReward(Reward):
     costs: Float[np.ndarray, " cells"] | None = None
 
     def reach(self, world: Grid | Graph, goal: int | tuple[float, float]) -> Task:
-        """Return the task of reaching a goal, with the costs of cells."""
+        """Return the task of reaching a goal, with the costs of cells.
+
+        Args:
+            world: A grid, or the graph of any discrete world.
+            goal: A state; on a grid also a position (x, y) in metres.
+        """
         task = super().reach(world, goal)
         if self.costs is None:
             return task
@@ -75,7 +80,19 @@ class CostlyReward(Reward):
 
 
 def maxent_irl(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
-    """Learn a cost of each cell, by which cells are ranked; robots plan by the agents' reward and these costs."""
+    """Learn a cost of each cell, by which cells are ranked; robots plan by the agents' reward and these costs.
+
+    Args:
+        grid: The known map.
+        demonstrations: The walks on it.
+        config: The reward that agents pursue beside the costs, and their β.
+
+    Returns:
+        The known map, with the costs in the reward and as the ranking.
+
+    Raises:
+        NotConverged: Where the costs do not converge.
+    """
     model, agents = true_model(grid.passable()), cost_behavior_model(grid, config)
     optimizer = LBFGS(max_iterations=_ITERATIONS, tolerance=_TOLERANCE)
     result = fit(model, demonstrations, agents, terms=("actions",), optimizer=optimizer)
@@ -88,13 +105,27 @@ def maxent_irl(grid: Grid, demonstrations: Demonstrations, config: MapConfig) ->
 
 
 def cost_behavior_model(grid: Grid, config: MapConfig) -> BehaviorModel:
-    """Return the behavior of maximum causal entropy with a cost of each cell, which is to be learned."""
+    """Return the behavior of maximum causal entropy with a cost of each cell, which is to be learned.
+
+    Args:
+        grid: The known map.
+        config: β in `config.behavior`.
+    """
     behavior = Behavior(LogSumExp(), config.behavior.beta)
     return behavior_model(behavior, aimed_at=np.asarray(grid_graph(grid).successors[..., 0]))
 
 
 def joint_estimation(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
-    """Learn a cost and P(blocked) of each cell; robots plan by P(blocked), as in any learned map."""
+    """Learn a cost and P(blocked) of each cell; robots plan by P(blocked), as in any learned map.
+
+    Args:
+        grid: The known map.
+        demonstrations: The walks on it.
+        config: The configuration of the fit.
+
+    Returns:
+        The learned map, with the costs in the reward.
+    """
     model, agents = ObstacleGrid(grid, config.prior.mean), cost_behavior_model(grid, config)
     fit = fit_map(model, demonstrations, config, behavior=agents)
     result = model_result(fit.model, demonstrations, config)

@@ -34,20 +34,35 @@ _MAP_SCORES = *_CELL_SCORES, "legal_fraction", "excess_length", "regret"
 
 
 def print_lines(*lines: str) -> None:
-    """Print lines of results."""
+    """Print lines of results.
+
+    Args:
+        *lines: The lines, without markup.
+    """
     for line in lines:
         _console.print(line, markup=False, soft_wrap=True)
 
 
 def print_notes(*lines: str) -> None:
-    """Print notes, warnings or errors."""
+    """Print notes, warnings or errors.
+
+    Args:
+        *lines: The lines, without markup.
+    """
     for line in lines:
         _errors.print(line, markup=False, soft_wrap=True)
 
 
 @contextmanager
 def working(text: str) -> Iterator[Callable[[str], None]]:
-    """Show a spinner on a terminal; the result changes its text."""
+    """Show a spinner on a terminal; the result changes its text.
+
+    Args:
+        text: The first text.
+
+    Returns:
+        A context manager with a function that shows another text.
+    """
     with _errors.status(text) as status:
         yield status.update
 
@@ -65,6 +80,12 @@ def fit_progress(iterations: int) -> "Iterator[tuple[FitCallback, Callable[[str]
     """Show a progress bar on a terminal for a fit of at most `iterations`; the results report to it.
 
     When a fit converges cannot be known. So the time is the longest that is left, at the pace of the last ten minutes.
+
+    Args:
+        iterations: The most iterations of the fit.
+
+    Returns:
+        A context manager with two functions: one reports the progress of the fit, the other shows a text.
     """
     with _bar("at most", left="left; {task.fields[state]}") as bar:
         task = bar.add_task("learning", total=iterations, state="compiling")
@@ -81,6 +102,9 @@ def stage_progress() -> Iterator[Callable[[str, int, int], None]]:
     """Show a progress bar on a terminal for each stage, with the time that is left of it.
 
     The size of a later stage is known when it begins, so there is no time for the whole.
+
+    Returns:
+        A context manager with a function that reports a stage, the steps that are done, and their number.
     """
     with _bar(left="left") as bar:
         tasks: "dict[str, TaskID]" = {}

@@ -103,13 +103,27 @@ class LearnOptions:
         return record(**{name: getattr(self, name) for name in names} | others)
 
     def grid(self, map_file: Path) -> "Grid":
-        """Read the map."""
+        """Read the map.
+
+        Args:
+            map_file: The YAML file of the map.
+
+        Returns:
+            The map, with the connectivity of these options.
+        """
         from sidestep.io.maps import read_map
 
         return read_map(map_file, connectivity=connectivity_of(self.connectivity))
 
     def sensor(self, grid: "Grid") -> "SensorMap | None":
-        """Read the map of the sensors, if there is one."""
+        """Read the map of the sensors, if there is one.
+
+        Args:
+            grid: The map.
+
+        Returns:
+            What sensors saw of the map; None without an option.
+        """
         if self.sensor_map is None:
             return None
         from sidestep.maps.sensors import read_sensor
@@ -117,7 +131,11 @@ class LearnOptions:
         return read_sensor(self.sensor_map, grid, _number_or_file(self.sensor_variance))
 
     def annotations(self) -> "WalkAnnotations":
-        """Read the annotations of the walks."""
+        """Read the annotations of the walks.
+
+        Returns:
+            The column of persons, and the candidates for goals.
+        """
         from sidestep.maps.annotations import WalkAnnotations
         from sidestep.maps.goal_candidates import read_goal_candidates
 
@@ -126,12 +144,24 @@ class LearnOptions:
 
 
 def connectivity_of(option: str) -> "Connectivity":
-    """Return the connectivity that an option names."""
+    """Return the connectivity that an option names.
+
+    Args:
+        option: "4" or "8".
+    """
     return 4 if option == "4" else 8
 
 
 def position_of(text: str, option: str) -> tuple[float, float]:
-    """Return the position that an option names as X,Y."""
+    """Return the position that an option names as X,Y.
+
+    Args:
+        text: The value of the option.
+        option: The name of the option, for the error.
+
+    Raises:
+        BadParameter: For a text that is not two numbers with a comma between them.
+    """
     try:
         x, y = (float(part) for part in text.split(","))
     except ValueError:
@@ -147,7 +177,14 @@ def _number_or_file(text: str) -> float | Path:
 
 
 def with_learn_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options of `LearnOptions`; it receives them as one record, `options`."""
+    """Give a command the options of `LearnOptions`; it receives them as one record, `options`.
+
+    Args:
+        command: A command with a parameter `options`, a `LearnOptions`.
+
+    Returns:
+        The same command, with a parameter for each option instead.
+    """
     keyword, hints = inspect.Parameter.KEYWORD_ONLY, get_type_hints(LearnOptions, include_extras=True)
     own = [each for each in inspect.signature(command).parameters.values() if each.name != "options"]
     shared = [
@@ -180,6 +217,9 @@ _OLD_VALUES = {"sharpness": "beta", "lapses": "lapse"}
 
 def present_spelling(arguments: list[str]) -> list[str]:
     """Return the arguments with every option of version 0.1 under its present name.
+
+    Args:
+        arguments: The words of the command line.
 
     Example:
         >>> present_spelling(["learn", "--behavior", "auto", "--lines=2", "--unknown", "lapses"])

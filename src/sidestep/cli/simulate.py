@@ -30,9 +30,9 @@ def simulate(
 
     from sidestep._files import write_json
     from sidestep.cli.display import print_lines, working
+    from sidestep.io.demonstrations import walks_from_trajectories
     from sidestep.io.maps import read_map
     from sidestep.io.tables import write_table
-    from sidestep.io.trajectories import walks_from_trajectories
     from sidestep.io.walks import table_from_walks
     from sidestep.worlds.walks import simulate_walks
 

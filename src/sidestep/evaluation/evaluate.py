@@ -42,8 +42,12 @@ class SampleSizes(NamedTuple):
 def sample_sizes(cells: int) -> SampleSizes:
     """Return the sample sizes for a map: the time of a plan grows with the number of cells.
 
-    >>> sample_sizes(10_000)
-    SampleSizes(starts=150, goals=150, executed=200)
+    Args:
+        cells: The number of cells, at least 1.
+
+    Example:
+        >>> sample_sizes(10_000)
+        SampleSizes(starts=150, goals=150, executed=200)
     """
     plans = max(MIN_PLANS, MAX_CELLS // cells)
     return SampleSizes(MAX_PLACES, min(MAX_PLACES, plans), min(MAX_EXECUTED, plans))

@@ -15,6 +15,8 @@ from sidestep.errors import check
 from sidestep.tabular.graph import free_cells, walkable_graph
 from sidestep.tabular.grid import Cell, Grid
 
+_Cells = Bool[np.ndarray, "rows columns"]
+
 
 @dataclass(frozen=True)
 class MapScores:
@@ -54,12 +56,7 @@ class PathScores:
     excess_length: float | None = None
 
 
-def score_map(
-    blocked: Float[np.ndarray, "rows columns"],
-    truth: Grid,
-    scored: Bool[np.ndarray, "rows columns"],
-    relevant: Bool[np.ndarray, "rows columns"],
-) -> MapScores:
+def score_map(blocked: Float[np.ndarray, "rows columns"], truth: Grid, scored: _Cells, relevant: _Cells) -> MapScores:
     """Score a learned map against the true map.
 
     Args:
@@ -67,6 +64,9 @@ def score_map(
         truth: The true map. Cells that it does not know are left out.
         scored: The cells to score, such as those that were not known beforehand.
         relevant: The relevant obstacles (`relevant_obstacles`).
+
+    Returns:
+        The scores.
 
     Raises:
         InputError: For arrays of another shape than the map and for numbers that are not finite.
@@ -122,6 +122,9 @@ def score_paths(
         goals: The goal (a state) of each path.
         truth: The true map.
 
+    Returns:
+        The scores.
+
     Raises:
         InputError: For a path without states, for a number of goals that differs from that of paths, and for states
             that are not on the map.
@@ -147,7 +150,15 @@ def score_paths(
 
 
 def score_lengths(lengths: Float[np.ndarray, " paths"], shortest: Float[np.ndarray, " paths"]) -> PathScores:
-    """Score planned paths by their lengths (`path_lengths`) and those of the shortest paths (`shortest_lengths`)."""
+    """Score planned paths by their lengths (`path_lengths`) and those of the shortest paths (`shortest_lengths`).
+
+    Args:
+        lengths: The length of each path in cell sides; infinite if it is not legal.
+        shortest: The length of the shortest path in its place; infinite if there is none.
+
+    Returns:
+        The scores.
+    """
     possible = np.isfinite(shortest)
     legal = possible & np.isfinite(lengths)
     return PathScores(_mean(legal[possible]), _mean(lengths[legal] - shortest[legal]))
@@ -193,13 +204,27 @@ def shortest_lengths(
 
 
 def visit_ranking(visited: Integer[np.ndarray, " moves"], grid: Grid) -> Float[np.ndarray, "rows columns"]:
-    """Return minus the number of visits of each cell: a baseline that ranks rarely visited cells highest."""
+    """Return minus the number of visits of each cell: a baseline that ranks rarely visited cells highest.
+
+    Args:
+        visited: The visited states.
+        grid: The map.
+
+    Raises:
+        InputError: For numbers that are not states of the map.
+    """
     check_states(visited, grid, "visited")
     return -np.bincount(visited, minlength=grid.size).reshape(grid.shape).astype(np.float64)
 
 
 def check_states(states: Integer[np.ndarray, " states"], grid: Grid, field: str) -> None:
-    """Raise `InputError` for numbers that are not states of the grid."""
+    """Raise `InputError` for numbers that are not states of the grid.
+
+    Args:
+        states: The numbers.
+        grid: The map.
+        field: What the error calls them.
+    """
     valid = np.all((states >= 0) & (states < grid.size))
     check(valid, f"expected states in 0…{grid.size - 1}", field=field)
 

@@ -6,17 +6,18 @@ algorithm per goal: one from the goal for d(·, g), and one for min_s d(s, ·) �
 connected to every visited state.
 """
 
-from typing import NamedTuple
-
 import numpy as np
-from jaxtyping import Bool, Float, Int, Integer
-from scipy.sparse import csr_array
+from jaxtyping import Bool, Float, Integer
+from scipy.sparse import csr_array, vstack
 
 from sidestep.errors import check
 from sidestep.evaluation.metrics import check_states
 from sidestep.tabular.graph import clear_cells, clear_moves, free_cells, moves_into, walkable_graph
 from sidestep.tabular.grid import Cell, Grid
 
+_Lengths = Float[np.ndarray, " states"]
+_Moves = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Moves that become possible when one cell is opened: origin, target, length, opened cell."""
 _TOLERANCE = 1e-9
 """The least difference of path lengths in cell sides: more than rounding, less than a detour."""
 
@@ -57,20 +58,11 @@ def relevant_obstacles(
     return (relevant & (truth.known.reshape(-1) == Cell.OCCUPIED)).reshape(truth.shape)
 
 
-class _Moves(NamedTuple):
-    """Moves that become possible when one cell is opened."""
-
-    origin: Int[np.ndarray, " moves"]
-    target: Int[np.ndarray, " moves"]
-    length: Float[np.ndarray, " moves"]
-    opened: Int[np.ndarray, " moves"]
-
-
 def _moves_of_closed_cells(truth: Grid) -> _Moves:
     """Return the moves out of each cell that is not free, were it free; reversed, they are the moves into it."""
     required = moves_into(truth)
     state, action = np.nonzero(clear_moves(truth, required) & ~free_cells(truth)[:, None])
-    return _Moves(state, required[state, action, 0], truth.lengths[action], state)
+    return state, required[state, action, 0], truth.lengths[action], state
 
 
 def _prevented_diagonals(truth: Grid) -> _Moves:
@@ -80,28 +72,25 @@ def _prevented_diagonals(truth: Grid) -> _Moves:
     ends_free = clear_moves(truth, required[..., :1]) & free_cells(truth)[:, None]
     state, action = np.nonzero(ends_free & (prevented.sum(axis=-1) == 1))
     cell = required[state, action, 1 + np.argmax(prevented[state, action], axis=-1)]
-    return _Moves(state, required[state, action, 0], truth.lengths[action], cell)
+    return state, required[state, action, 0], truth.lengths[action], cell
 
 
-def _changes_by_opening(
-    from_visited: Float[np.ndarray, " states"], to_goal: Float[np.ndarray, " states"], through: _Moves, past: _Moves
-) -> Float[np.ndarray, " states"]:
+def _changes_by_opening(from_visited: _Lengths, to_goal: _Lengths, through: _Moves, past: _Moves) -> _Lengths:
     """Return the length of the best new path that opening each cell allows, less that of the present path.
 
     A new path leads through the opened cell or takes one diagonal past it: two such diagonals are longer than the two
     straight moves through the cell.
     """
-    path_in, path_out = from_visited.copy(), to_goal.copy()
-    np.minimum.at(path_in, through.opened, from_visited[through.target] + through.length)
-    np.minimum.at(path_out, through.opened, through.length + to_goal[through.target])
+    path_in, path_out, (_, target, length, opened) = from_visited.copy(), to_goal.copy(), through
+    np.minimum.at(path_in, opened, from_visited[target] + length)
+    np.minimum.at(path_out, opened, length + to_goal[target])
+    origin, target, length, opened = past
     change = path_in + path_out
-    np.minimum.at(change, past.opened, from_visited[past.origin] + past.length + to_goal[past.target])
+    np.minimum.at(change, opened, from_visited[origin] + length + to_goal[target])
     return change
 
 
-def _relative_distances(
-    graph: csr_array, to_goal: Float[np.ndarray, " states"], visited: Integer[np.ndarray, " visited"]
-) -> Float[np.ndarray, " states"]:
+def _relative_distances(graph: csr_array, to_goal: _Lengths, visited: Integer[np.ndarray, " visited"]) -> _Lengths:
     """Return min_s d(s, x) − d(s, goal) over visited states s for each state x; infinite where none can reach x.
 
     Plus d(x, goal), this is below 0 where s → x → goal is shorter than the present path. In the component of a visited
@@ -116,14 +105,9 @@ def _relative_distances(
     if len(arriving):
         # the shift makes all lengths positive: 0 means "no edge"
         shift = 1.0 + to_goal[arriving].max()
-        extended = csr_array(
-            (
-                np.concatenate([graph.data, shift - to_goal[arriving]]),
-                np.concatenate([graph.indices, arriving]),
-                np.append(graph.indptr, graph.indptr[-1] + len(arriving)),
-            ),
-            shape=(states + 1, states + 1),
-        )
+        source = csr_array((shift - to_goal[arriving], arriving, [0, len(arriving)]), shape=(1, states))
+        extended = vstack([graph, source], format="csr")
+        extended.resize((states + 1, states + 1))
         result = dijkstra(extended, indices=states)[:states] - shift
     if len(stranded):
         longer_than_any_path = 4.0 * (states + 1)

@@ -35,7 +35,11 @@ class MethodResult(Protocol):
         ...
 
     def log_policies(self, demonstrations: Demonstrations) -> Float[np.ndarray, " moves"]:
-        """Return log π(a | s) of every move in nats; NaN for all moves if the values of a task do not converge."""
+        """Return log π(a | s) of every move in nats; NaN for all moves if the values of a task do not converge.
+
+        Args:
+            demonstrations: Moves on the same map.
+        """
         ...
 
 
@@ -95,14 +99,7 @@ class Record:
         return {**others, **self.evaluation.to_dict()}
 
 
-def run_study(
-    problems: Iterable[Problem],
-    methods: Mapping[str, Method],
-    *,
-    seed: int = 0,
-    paths: bool = True,
-    notify: Callable[[str], None] = lambda _: None,
-) -> list[Record]:
+def run_study(problems: Iterable[Problem], methods: Mapping[str, Method], **options: Any) -> list[Record]:
     """Learn from every problem by every method, and evaluate the results.
 
     A method fails if it raises `ImproperTask` or `NotConverged`; the others go on.
@@ -110,9 +107,7 @@ def run_study(
     Args:
         problems: The problems; they may be made one at a time.
         methods: The methods by name.
-        seed: The seed of `evaluate`.
-        paths: Whether to evaluate planned paths; otherwise cells only, which takes much less time.
-        notify: Called with a line of text before each method learns and before it is evaluated.
+        **options: Options of `run_method`.
 
     Returns:
         A record for each problem and method, problem by problem.
@@ -120,11 +115,7 @@ def run_study(
     Raises:
         InputError: For problems with parts that do not fit each other.
     """
-    return [
-        run_method(problem, name, learn, seed=seed, paths=paths, notify=notify)
-        for problem in problems
-        for name, learn in methods.items()
-    ]
+    return [run_method(each, name, learn, **options) for each in problems for name, learn in methods.items()]
 
 
 def run_method(
@@ -136,7 +127,19 @@ def run_method(
     paths: bool = True,
     notify: Callable[[str], None] = lambda _: None,
 ) -> Record:
-    """Learn from one problem by one method, and evaluate the result; `run_study` describes the arguments."""
+    """Learn from one problem by one method, and evaluate the result.
+
+    Args:
+        problem: The problem.
+        name: The name of the method in the record.
+        learn: The method.
+        seed: The seed of `evaluate`.
+        paths: Whether to evaluate planned paths; otherwise cells only, which takes much less time.
+        notify: Called with a line of text before the method learns and before it is evaluated.
+
+    Returns:
+        The record; without scores if the method raises `ImproperTask` or `NotConverged`.
+    """
     label, visited = f"{problem.name}: {name}", problem.demonstrations.visited_state_goals()
     try:
         notify(f"{label} learns")
@@ -154,6 +157,11 @@ def run_method(
 
 
 def mean_log_likelihood(result: MethodResult, demonstrations: Demonstrations) -> float | None:
-    """Return the mean of log π(a | s) over moves in nats; None if the values of a task do not converge."""
+    """Return the mean of log π(a | s) over moves in nats; None if the values of a task do not converge.
+
+    Args:
+        result: What a method learned.
+        demonstrations: Moves on the same map.
+    """
     mean = float(np.mean(result.log_policies(demonstrations)))
     return mean if np.isfinite(mean) else None

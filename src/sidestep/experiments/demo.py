@@ -13,7 +13,7 @@ import numpy as np
 import sidestep as ss
 from sidestep._files import write_json
 from sidestep.experiments.output import Notify
-from sidestep.io.trajectories import walks_from_trajectories
+from sidestep.io.demonstrations import walks_from_trajectories
 from sidestep.maps.config import SimulationConfig
 from sidestep.plotting.maps import Panel, figure_learned, save
 from sidestep.worlds.offices import office, places

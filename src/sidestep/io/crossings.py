@@ -31,10 +31,10 @@ class Visits:
     """The cells that paths visit, in order, walk after walk; successive visits of a walk are to different cells.
 
     Attributes:
-        walk: the index of the walk.
-        cell: row and column, row 0 at the top.
-        length: the length of the path inside the cell during the visit, in cell sides.
-        arrival: the index of the first position at or after the moment of entry.
+        walk: The index of the walk.
+        cell: Row and column, row 0 at the top.
+        length: The length of the path inside the cell during the visit, in cell sides.
+        arrival: The index of the first position at or after the moment of entry.
     """
 
     walk: Int[np.ndarray, " visits"]
@@ -55,9 +55,9 @@ def visited_cells(points: Points, offsets: Int[np.ndarray, " boundaries"], occup
     or right one, unless that is known to be occupied.
 
     Args:
-        points: positions on the grid in cell units.
-        offsets: points `offsets[i]` to `offsets[i + 1]`, at least two, are those of walk i.
-        occupied: the cells that are known to be occupied.
+        points: Positions on the grid in cell units.
+        offsets: Points `offsets[i]` to `offsets[i + 1]`, at least two, are those of walk i.
+        occupied: The cells that are known to be occupied.
     """
     walks = len(offsets) - 1
     start = np.delete(np.arange(len(points)), offsets[1:] - 1)
@@ -75,7 +75,12 @@ def visited_cells(points: Points, offsets: Int[np.ndarray, " boundaries"], occup
 
 
 def cells_at(points: Points, occupied: Occupied) -> Cells:
-    """Return row and column of the cell of each point; on a border, as `visited_cells` does."""
+    """Return row and column of the cell of each point; on a border, as `visited_cells` does.
+
+    Args:
+        points: Positions on the grid in cell units, shape (points, 2).
+        occupied: The cells that are known to be occupied.
+    """
     rows, columns = occupied.shape
 
     def cells(shift_right: float, shift_up: float) -> Cells:

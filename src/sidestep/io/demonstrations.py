@@ -1,12 +1,15 @@
-"""Demonstrations on a grid, from walks in metres."""
+"""Demonstrations on a grid from walks in metres, and walks from simulated trajectories."""
+
+from collections.abc import Sequence
 
 import numpy as np
+import pyarrow as pa
 from jaxtyping import Int
 
 from sidestep.errors import InputError, check
 from sidestep.io.gridding import Moves, grid_walks
-from sidestep.io.walks import Walks
-from sidestep.tabular.demonstrations import Demonstrations, gather
+from sidestep.io.walks import Walks, position_columns, walks_from_table
+from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.graph import walkable_graph
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.tasks import reach
@@ -18,17 +21,15 @@ def demonstrations_from_walks(
     """Return demonstrations on a grid from walks in metres, with one task for every goal.
 
     Args:
-        walks: positions and goals in metres.
-        grid: the map; moves are 4- or 8-connected as the grid is.
+        walks: Positions and goals in metres.
+        grid: The map; moves are 4- or 8-connected as the grid is.
         discount: γ in (0, 1], as in `reach`.
-        step_cost: the cost of a step of one cell side, as in `reach`.
+        step_cost: The cost of a step of one cell side, as in `reach`.
 
     Raises:
-        InputError: as `grid_walks` and `demonstrations_from_moves` do.
+        InputError: As `grid_walks` and `demonstrations_from_moves` do.
 
     Example:
-        >>> import pyarrow as pa
-        >>> from sidestep.io.walks import walks_from_table
         >>> walks = walks_from_table(pa.table({"walk": [0, 0], "step": [0, 1], "x": [0.5, 2.5], "y": [0.5, 0.5]}))
         >>> demonstrations_from_walks(walks, Grid.unknown(rows=1, columns=3)).next_states.tolist()
         [1, 2]
@@ -44,13 +45,13 @@ def demonstrations_from_moves(
     Moves after a walk has reached its goal are left out, and so are walks that start at their goal.
 
     Args:
-        moves: from `grid_walks`.
-        grid: the map.
+        moves: From `grid_walks`.
+        grid: The map.
         discount: γ in (0, 1], as in `reach`.
-        step_cost: the cost of a step of one cell side, as in `reach`.
+        step_cost: The cost of a step of one cell side, as in `reach`.
 
     Raises:
-        InputError: if no move is left, or for a goal that known obstacles wall off.
+        InputError: If no move is left, or for a goal that known obstacles wall off.
     """
     region = connected_regions(grid)
     walled_off = region[moves.states] != region[moves.goals[moves.walk]]
@@ -65,9 +66,39 @@ def demonstrations_from_moves(
 
 
 def connected_regions(grid: Grid) -> Int[np.ndarray, " states"]:
-    """Return the number of the region of each state; walks are possible within a region, around known obstacles."""
+    """Return the number of the region of each state; walks are possible within a region, around known obstacles.
+
+    Args:
+        grid: The map.
+    """
     if not (grid.known == Cell.OCCUPIED).any():
         return np.zeros(grid.size, dtype=np.int64)
     from scipy.sparse.csgraph import connected_components
 
     return connected_components(walkable_graph(grid.passable()), directed=False)[1]
+
+
+def walks_from_trajectories(trajectories: Sequence[Trajectory], goals: Sequence[int], grid: Grid) -> Walks:
+    """Return walks through the centers of the cells that trajectories visit.
+
+    A move that did not leave its cell becomes a row with `failed_x`, `failed_y`, the center of the intended cell.
+
+    Args:
+        trajectories: States and actions on the grid.
+        goals: The goal (a state) of each task.
+        grid: The map.
+    """
+    lengths = [len(trajectory.states) for trajectory in trajectories]
+    states = np.concatenate([trajectory.states for trajectory in trajectories])
+    goal = np.repeat([goals[trajectory.task] for trajectory in trajectories], lengths)
+    # the action before each row; -1 for the first row of a walk
+    actions = np.concatenate([np.append(-1, trajectory.actions) for trajectory in trajectories])
+    failed = (actions >= 0) & (states == np.append(-1, states[:-1]))
+    row_down, column = grid.steps[actions].T
+    intended = grid.to_metres(grid.to_cell_units(grid.centers(states)) + np.stack([column, -row_down], axis=-1))
+    steps = np.concatenate([np.arange(length) for length in lengths])
+    columns = {"walk": np.repeat(np.arange(len(lengths)), lengths), "step": steps}
+    columns |= position_columns("", grid.centers(states)) | position_columns("goal_", grid.centers(goal))
+    if failed.any():
+        columns |= position_columns("failed_", np.where(failed[:, None], intended, np.nan))
+    return walks_from_table(pa.table(columns), source="trajectories")

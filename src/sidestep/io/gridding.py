@@ -39,13 +39,13 @@ class Moves:
     """Single-cell moves, walk after walk; each move of a walk starts in the next state of the move before.
 
     Attributes:
-        states: the state in which each move starts.
-        actions: an index into `Grid.steps` for each move.
-        next_states: the state in which each move ends, the same state if the move failed.
-        walk: the index of the walk of each move.
-        rows: the data row (from 1) of the position at or after the end of each move, for error messages.
-        goals: the goal state of each walk.
-        source: the name of the file, for error messages.
+        states: The state in which each move starts.
+        actions: An index into `Grid.steps` for each move.
+        next_states: The state in which each move ends, the same state if the move failed.
+        walk: The index of the walk of each move.
+        rows: The data row (from 1) of the position at or after the end of each move, for error messages.
+        goals: The goal state of each walk.
+        source: The name of the file, for error messages.
     """
 
     states: Int[np.ndarray, " moves"]
@@ -71,7 +71,7 @@ class Moves:
         """Return one trajectory for each walk that has a move.
 
         Args:
-            tasks: the index of the task of each such walk; by default 0.
+            tasks: The index of the task of each such walk; by default 0.
         """
         starts = np.flatnonzero(np.diff(self.walk)) + 1
         parts = [np.split(each, starts) for each in (self.states, self.actions, self.next_states)]
@@ -86,12 +86,12 @@ def grid_walks(walks: Walks, grid: Grid) -> Moves:
     """Return the moves of walks on a grid, by the rules of this module.
 
     Args:
-        walks: positions and goals in metres. A goal on a border between cells counts as in the cell where the walk
+        walks: Positions and goals in metres. A goal on a border between cells counts as in the cell where the walk
             ends, if that is one of them.
-        grid: the map; moves are 4- or 8-connected as the grid is.
+        grid: The map; moves are 4- or 8-connected as the grid is.
 
     Raises:
-        InputError: naming file, row and column, for positions and goals outside the map, walks through cells known to
+        InputError: Naming file, row and column, for positions and goals outside the map, walks through cells known to
             be occupied, goals in such cells, failed moves that do not lead to an adjacent cell (which may lie just
             outside the map), and walks without any move.
 

@@ -25,9 +25,9 @@ class Environment(NamedTuple):
     """The model and the task of an environment.
 
     Attributes:
-        model: with the probabilities of the environment's table.
-        task: with the rewards of the environment's table.
-        ends: the separate states of ends, by the environment's state.
+        model: With the probabilities of the environment's table.
+        task: With the rewards of the environment's table.
+        ends: The separate states of ends, by the environment's state.
     """
 
     model: TabularModel
@@ -39,11 +39,11 @@ def from_gymnasium(env: Any, discount: float = 0.99) -> Environment:
     """Return the model and the task of an environment with a transition table.
 
     Args:
-        env: a Gymnasium environment with `env.unwrapped.P`.
+        env: A Gymnasium environment with `env.unwrapped.P`.
         discount: γ in (0, 1].
 
     Raises:
-        InputError: for an environment without a table, a discount outside (0, 1], and a terminal state with different
+        InputError: For an environment without a table, a discount outside (0, 1], and a terminal state with different
             rewards after different actions.
 
     Example:
@@ -102,11 +102,11 @@ def slippery(environment: Environment, logit: float = 0.0) -> TiedModel:
     """Return a model in which all actions slip with one probability: three outcomes, the middle one intended.
 
     Args:
-        environment: with three outcomes per action, such as `FrozenLake-v1`.
+        environment: With three outcomes per action, such as `FrozenLake-v1`.
         logit: θ, the one parameter of the model; P(slip) = 2 e^θ / (1 + 2 e^θ), see `slip_of`.
 
     Raises:
-        InputError: for an environment with another number of outcomes.
+        InputError: For an environment with another number of outcomes.
 
     Example:
         >>> import gymnasium
@@ -123,7 +123,16 @@ def slippery(environment: Environment, logit: float = 0.0) -> TiedModel:
 
 
 def slip_of(model: TiedModel) -> float:
-    """Return P(slip) of a model from `slippery`; see there for an example."""
+    """Return P(slip) of a model from `slippery`.
+
+    Args:
+        model: A model from `slippery`.
+
+    Example:
+        >>> import gymnasium
+        >>> slip_of(slippery(from_gymnasium(gymnasium.make("FrozenLake-v1")), logit=0.0))  # doctest: +ELLIPSIS
+        0.6666...
+    """
     odds = 2 * float(jnp.exp(model.parameters[0]))
     return odds / (1 + odds)
 
@@ -140,15 +149,15 @@ def collect(
     """Return episodes in a Gymnasium environment as trajectories; some may be truncated by a time limit.
 
     Args:
-        env: the environment.
+        env: The environment.
         world: `from_gymnasium(env)`.
-        act: chooses an action in a state, with a random generator.
-        episodes: the number of episodes, at least 1.
-        seed: of the environment's first episode, and of the random generator.
-        task: the index of the task of the trajectories.
+        act: Chooses an action in a state, with a random generator.
+        episodes: The number of episodes, at least 1.
+        seed: Of the environment's first episode, and of the random generator.
+        task: The index of the task of the trajectories.
 
     Raises:
-        InputError: for a number of episodes below 1.
+        InputError: For a number of episodes below 1.
 
     Example:
         >>> import gymnasium

@@ -3,6 +3,10 @@
 Every pixel is a cell and row 0 is the top. A pixel of gray value v has occupancy p = (255 − v)/255, or v/255 where the
 YAML has `negate: 1`; p above `occupied_thresh` is occupied, below `free_thresh` free, anything else unknown. In `raw`
 mode v itself is the occupancy in percent, and above 100 unknown.
+
+A map from a robot's own sensors has P(occupied) of each cell. It is in mode `scale` or `raw`, as mappers save it: the
+occupancy of a pixel *is* the probability, and the thresholds have no meaning. Transparent pixels (`scale`) and values
+above 100 (`raw`) are unknown.
 """
 
 import math
@@ -13,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sidestep._files import read_whole, write_whole
+from sidestep._files import read_array, read_whole, write_whole
 from sidestep.errors import InputError, check
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 
@@ -39,12 +43,12 @@ class Raster(NamedTuple):
     """The contents of the two files of a ROS map, without an interpretation.
 
     Attributes:
-        occupancy: of each cell, row 0 at the top, from 0 to 1; NaN where the map has none.
-        mode: trinary, scale or raw.
-        resolution: the side of a cell in metres.
-        origin: x, y (metres) and yaw (radians) of the lower-left corner.
-        occupied_above: the threshold for occupied cells.
-        free_below: the threshold for free cells.
+        occupancy: Of each cell, row 0 at the top, from 0 to 1; NaN where the map has none.
+        mode: Trinary, scale or raw.
+        resolution: The side of a cell in metres.
+        origin: X, y (metres) and yaw (radians) of the lower-left corner.
+        occupied_above: The threshold for occupied cells.
+        free_below: The threshold for free cells.
     """
 
     occupancy: Float[np.ndarray, "rows columns"]
@@ -59,11 +63,11 @@ def read_map(path: str | Path, connectivity: Connectivity = 4) -> Grid:
     """Return the grid of a ROS map: geometry from the YAML file (metres, radians), known cells from the image.
 
     Args:
-        path: the YAML file.
+        path: The YAML file.
         connectivity: 4 or 8, of the moves on the map; it is not in the file.
 
     Raises:
-        InputError: as `read_raster` does.
+        InputError: As `read_raster` does.
 
     Example:
         >>> grid = read_map("office.yaml")  # doctest: +SKIP
@@ -78,8 +82,12 @@ def read_map(path: str | Path, connectivity: Connectivity = 4) -> Grid:
 def read_map_like(path: str | Path, grid: Grid) -> Grid:
     """Return the grid of another ROS map of the same place, with the connectivity of `grid`.
 
+    Args:
+        path: The YAML file.
+        grid: The map of the same place.
+
     Raises:
-        InputError: as `read_raster` does, and for another size, resolution or origin than that of `grid`.
+        InputError: As `read_raster` does, and for another size, resolution or origin than that of `grid`.
     """
     other = read_map(path, connectivity=grid.connectivity)
     check_geometry(path, other.shape, other.resolution, other.origin, grid)
@@ -89,7 +97,18 @@ def read_map_like(path: str | Path, grid: Grid) -> Grid:
 def check_geometry(
     path: object, shape: tuple[int, ...], resolution: float, origin: tuple[float, float, float], grid: Grid
 ) -> None:
-    """Raise `InputError` if the map in `path` has another size, resolution or origin than `grid`."""
+    """Raise `InputError` if the map in `path` has another size, resolution or origin than `grid`.
+
+    Args:
+        path: The file, for the error.
+        shape: Its numbers of rows and columns.
+        resolution: The side of a cell in metres.
+        origin: x, y (metres) and yaw (radians) of the lower-left corner.
+        grid: The map to which it belongs.
+
+    Raises:
+        InputError: Naming the file and the field that differs.
+    """
     expected, actual = (" × ".join(map(str, each)) for each in (grid.shape, shape))
     check(shape == grid.shape, f"expected the map's {expected} cells, found {actual}", source=path, field="image")
     message = f"expected the map's {grid.resolution} metres a cell, found {resolution}"
@@ -105,10 +124,10 @@ def read_raster(path: str | Path) -> Raster:
     transparent pixels are unknown.
 
     Args:
-        path: the YAML file.
+        path: The YAML file.
 
     Raises:
-        InputError: naming file and key, for YAML that cannot be read, lacks keys or has values of the wrong kind, and
+        InputError: Naming file and key, for YAML that cannot be read, lacks keys or has values of the wrong kind, and
             for an image that is outside the folder of the YAML file, has more than `MOST_PIXELS` or cannot be decoded.
     """
     path = Path(path)
@@ -136,6 +155,51 @@ def read_raster(path: str | Path) -> Raster:
     return Raster(occupancy, mode, resolution, (x, y, yaw), occupied, free)
 
 
+def read_sensor_map(path: str | Path, grid: Grid) -> Float[np.ndarray, "rows columns"]:
+    """Return P(occupied) of each cell of a grid, row 0 at the top; NaN where the sensors have no reading.
+
+    Args:
+        path: The YAML file of a ROS map.
+        grid: The map to which it belongs.
+
+    Raises:
+        InputError: As `read_raster` does, and, naming file and field, for a map in mode `trinary`, which has no
+            probabilities, or of another size, resolution or origin than the grid.
+
+    Example:
+        >>> occupied = read_sensor_map("sensed.yaml", grid)  # doctest: +SKIP
+    """
+    raster = read_raster(path)
+    if raster.mode == "trinary":
+        raise InputError("expected scale or raw: a trinary map has no probabilities", source=path, field="mode")
+    check_geometry(path, raster.occupancy.shape, raster.resolution, raster.origin, grid)
+    return raster.occupancy
+
+
+def read_sensor_variance(path: str | Path, grid: Grid) -> Float[np.ndarray, "rows columns"]:
+    """Return the variance of the logit of each cell's P(occupied), from a `.npy` file; see `sensor_prior`.
+
+    Args:
+        path: The file, with rows top first; NaN or infinite where nothing is known.
+        grid: The map to which it belongs.
+
+    Raises:
+        InputError: For a file without an array of the grid's shape, and for numbers that are not above 0.
+
+    Example:
+        >>> variance = read_sensor_variance("variance.npy", grid)  # doctest: +SKIP
+    """
+    variance, field = read_array(path, kinds="fiu").astype(np.float64), "sensor variance"
+    message = f"expected the map's {grid.shape} rows and columns, found {variance.shape}"
+    check(variance.shape == grid.shape, message, source=path, field=field)
+    wrong = np.argwhere(variance <= 0)
+    if len(wrong):
+        row, column = wrong[0]
+        message = f"expected numbers above 0, found {variance[row, column]:g} in column {column + 1}"
+        raise InputError(message, source=path, row=int(row) + 1, field=field)
+    return variance
+
+
 def write_map(path: str | Path, blocked: Float[np.ndarray, "rows columns"], grid: Grid) -> None:
     """Write P(blocked) as a ROS map in `scale` mode: `NAME.yaml` and `NAME.pgm`.
 
@@ -143,12 +207,12 @@ def write_map(path: str | Path, blocked: Float[np.ndarray, "rows columns"], grid
     atomically, the image first.
 
     Args:
-        path: a name that ends in .yaml or .yml.
+        path: A name that ends in .yaml or .yml.
         blocked: P(blocked) of each cell, from 0 to 1.
-        grid: the geometry of the map.
+        grid: The geometry of the map.
 
     Raises:
-        InputError: for another ending, an array of another shape than the grid, and values outside 0…1.
+        InputError: For another ending, an array of another shape than the grid, and values outside 0…1.
 
     Example:
         >>> write_map("learned.yaml", blocked, grid)  # doctest: +SKIP
@@ -202,7 +266,7 @@ def _number(value: object, key: str, path: Path) -> float:
     return number
 
 
-def _image_path(name: object, path: Path) -> Path:
+def _image_path(name: Any, path: Path) -> Path:
     """Return the path of the image, which must be in the folder of the YAML file or below, links followed."""
     check(isinstance(name, str) and name, f"expected the name of an image, found {name!r}", source=path, field="image")
     try:

@@ -12,6 +12,7 @@ Three tables (CSV or Parquet), each with any number of other columns:
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Bool, Float, Int
 
-from sidestep.errors import InputError, check
+from sidestep.errors import check
 from sidestep.io.tables import check_columns, check_rows, finite_column, read_table
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.graph import Graph
@@ -34,13 +35,13 @@ class Roads:
     """A road network; links are numbered in the order of their table.
 
     Attributes:
-        labels: the label of each link.
-        begins: the number of the node where each link begins.
-        ends: the number of the node where each link ends.
-        lengths: the length of each link in metres.
-        one_way: whether each link is the only direction of its road.
-        turns: the two links of each turn.
-        directions: of each turn, in eighths of a circle, 0 straight on.
+        labels: The label of each link.
+        begins: The number of the node where each link begins.
+        ends: The number of the node where each link ends.
+        lengths: The length of each link in metres.
+        one_way: Whether each link is the only direction of its road.
+        turns: The two links of each turn.
+        directions: Of each turn, in eighths of a circle, 0 straight on.
     """
 
     labels: list[str]
@@ -59,8 +60,12 @@ class Roads:
 def read_roads(links: str | Path, turns: str | Path) -> Roads:
     """Return the road network in a table of links and a table of turns.
 
+    Args:
+        links: The table of links, `.csv` or `.parquet`.
+        turns: The table of turns, `.csv` or `.parquet`.
+
     Raises:
-        InputError: naming file, row and column, for columns that are missing, links that repeat or do not exist,
+        InputError: Naming file, row and column, for columns that are missing, links that repeat or do not exist,
             lengths that are not above 0, turns that repeat or lead onto a link that begins elsewhere, and directions
             other than 0…7.
 
@@ -77,7 +82,7 @@ def read_roads(links: str | Path, turns: str | Path) -> Roads:
     one_way = _whole(table, "oneway", links, 1) == 1
     table = _read(turns, ("link", "action", "next_link"))
     number = {label: index for index, label in enumerate(labels)}
-    pairs = np.stack([_numbered(table, name, turns, number, links) for name in ("link", "next_link")], axis=1)
+    pairs = np.stack([_numbered(table, name, turns, number) for name in ("link", "next_link")], axis=1)
     meets = ends[pairs[:, 0]] == begins[pairs[:, 1]]
     check_rows(meets, "expected a link that begins where the first one ends", turns, "next_link")
     check_rows(_is_first(pairs), "the turn appears more than once", turns, "next_link")
@@ -87,8 +92,12 @@ def read_roads(links: str | Path, turns: str | Path) -> Roads:
 def read_trips(path: str | Path, roads: Roads) -> list[Int[np.ndarray, " _"]]:
     """Return the links of each trip in a table, numbered as in `roads`.
 
+    Args:
+        path: The table of trips, `.csv` or `.parquet`.
+        roads: The road network.
+
     Raises:
-        InputError: naming file, row and column, for columns that are missing, links that do not exist, trips of fewer
+        InputError: Naming file, row and column, for columns that are missing, links that do not exist, trips of fewer
             than two links, without a turn from one link to the next, that begin or end elsewhere than at their origin
             and destination, or that continue after they have reached it.
 
@@ -102,16 +111,16 @@ def read_trips(path: str | Path, roads: Roads) -> list[Int[np.ndarray, " _"]]:
     trips = []
     for row, (cell, (origin, destination)) in enumerate(zip(_labels(table, "links", path), ends, strict=True), start=1):
         trip = cell.split()
-        check(len(trip) >= 2, f"expected at least two links, found {len(trip)}", source=path, row=row, field="links")
+        check_trip = partial(check, source=path, row=row)
+        check_trip(len(trip) >= 2, f"expected at least two links, found {len(trip)}", field="links")
         for link in trip:
-            check(link in number, f"there is no link {link}", source=path, row=row, field="links")
+            check_trip(link in number, f"there is no link {link}", field="links")
         for one, other in pairwise(trip):
             connected = (number[one], number[other]) in turns
-            check(connected, f"there is no turn from {one} to {other}", source=path, row=row, field="links")
+            check_trip(connected, f"there is no turn from {one} to {other}", field="links")
         for field, label, link in (("origin", origin, trip[0]), ("destination", destination, trip[-1])):
-            check(label == link, f"expected {link}, as in its links, found {label}", source=path, row=row, field=field)
-        message = "continues after it has reached its destination"
-        check(destination not in trip[:-1], message, source=path, row=row, field="links")
+            check_trip(label == link, f"expected {link}, as in its links, found {label}", field=field)
+        check_trip(destination not in trip[:-1], "continues after it has reached its destination", field="links")
         trips.append(np.asarray([number[link] for link in trip]))
     return trips
 
@@ -122,13 +131,13 @@ def demonstrations_from_trips(
     """Return demonstrations on the graph of a road network (`road_network`), with one task for every destination.
 
     Args:
-        trips: the links of each trip, from `read_trips`.
-        graph: the graph of the road network.
+        trips: The links of each trip, from `read_trips`.
+        graph: The graph of the road network.
         discount: γ in (0, 1], as in `reach`.
-        step_cost: the cost of a metre, as in `reach`.
+        step_cost: The cost of a metre, as in `reach`.
 
     Raises:
-        InputError: naming the trip, for one without a turn from one link to the next.
+        InputError: Naming the trip, for one without a turn from one link to the next.
     """
     next_links = np.asarray(graph.successors)[:, :, 0]
     goals, task = np.unique([trip[-1] for trip in trips], return_inverse=True)
@@ -152,18 +161,15 @@ def _read(path: str | Path, names: tuple[str, ...]) -> pa.Table:
 def _labels(table: pa.Table, name: str, path: object) -> list[str]:
     """Return a column without empty cells as text."""
     cells = table[name].to_pylist()
-    if None in cells:
-        raise InputError("expected a label, found an empty cell", source=path, row=cells.index(None) + 1, field=name)
+    check_rows(table[name].is_valid().to_numpy(), "expected a label, found an empty cell", path, name)
     return [str(cell) for cell in cells]
 
 
-def _numbered(
-    table: pa.Table, name: str, path: object, number: dict[str, int], links: object
-) -> Int[np.ndarray, " rows"]:
+def _numbered(table: pa.Table, name: str, path: object, number: dict[str, int]) -> Int[np.ndarray, " rows"]:
     """Return the numbers of the links in a column of labels."""
     labels = _labels(table, name, path)
-    for row, label in enumerate(labels, start=1):
-        check(label in number, f"expected a link of {links}, found {label}", source=path, row=row, field=name)
+    valid = np.array([label in number for label in labels])
+    check_rows(valid, "expected a link of the table of links, found {}", path, name, values=labels)
     return np.asarray([number[label] for label in labels])
 
 

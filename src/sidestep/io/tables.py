@@ -24,11 +24,11 @@ def read_table(path: str | Path, labels: tuple[str, ...] = ()) -> pa.Table:
     Columns of a CSV become numbers only where that loses nothing: a column with a cell `003` stays text.
 
     Args:
-        path: the file.
-        labels: columns that stay text unless all their cells are whole numbers.
+        path: The file.
+        labels: Columns that stay text unless all their cells are whole numbers.
 
     Raises:
-        InputError: for another ending, a file that cannot be read or is empty, text that is not UTF-8, a row of another
+        InputError: For another ending, a file that cannot be read or is empty, text that is not UTF-8, a row of another
             length than the header (with its row), and for column names that repeat.
     """
     table = _by_ending(path, _read_csv, _read_parquet)(Path(path))
@@ -43,8 +43,12 @@ def read_table(path: str | Path, labels: tuple[str, ...] = ()) -> pa.Table:
 def write_table(path: str | Path, table: pa.Table) -> None:
     """Write a table as `.csv` or `.parquet` atomically.
 
+    Args:
+        path: A name that ends in .csv or .parquet.
+        table: The table.
+
     Raises:
-        InputError: for another ending, and for a column that CSV cannot represent.
+        InputError: For another ending, and for a column that CSV cannot represent.
     """
     write = _by_ending(path, pyarrow.csv.write_csv, parquet.write_table)
     try:
@@ -84,7 +88,13 @@ def check_rows(
 
 
 def check_columns(table: pa.Table, names: Sequence[str], source: str) -> None:
-    """Raise `InputError` for the first of these columns that is not in a table."""
+    """Raise `InputError` for the first of these columns that is not in a table.
+
+    Args:
+        table: The table.
+        names: The columns that it must have.
+        source: Its name, for the error.
+    """
     for name in names:
         message = f"the column is missing; found {', '.join(table.column_names)}"
         check(name in table.column_names, message, source=source, field=name)
@@ -93,8 +103,13 @@ def check_columns(table: pa.Table, names: Sequence[str], source: str) -> None:
 def number_column(table: pa.Table, name: str, source: str) -> Float[np.ndarray, " rows"]:
     """Return a column as numbers, NaN where a cell is empty.
 
+    Args:
+        table: The table.
+        name: The name of the column.
+        source: The name of the table, for errors.
+
     Raises:
-        InputError: with the row, for infinity and for a cell that is not a number.
+        InputError: With the row, for infinity and for a cell that is not a number.
     """
     column = table[name]
     kinds = ("integer", "floating", "decimal", "string", "large_string", "null")
@@ -121,8 +136,13 @@ def _is_number(cell: pa.Scalar) -> bool:
 def finite_column(table: pa.Table, name: str, source: str) -> Float[np.ndarray, " rows"]:
     """Return a column of numbers without empty cells.
 
+    Args:
+        table: The table.
+        name: The name of the column.
+        source: The name of the table, for errors.
+
     Raises:
-        InputError: as `number_column` does, and, with the row, for an empty cell or NaN.
+        InputError: As `number_column` does, and, with the row, for an empty cell or NaN.
     """
     numbers = number_column(table, name, source)
     valid = ~np.isnan(numbers)

@@ -39,15 +39,21 @@ class Walks:
     """Walks, one after another; the rows of walk i are `offsets[i]` to `offsets[i + 1]`.
 
     Attributes:
-        labels: the label of each walk, as in the table.
-        offsets: the first row of each walk, and the number of rows.
-        goals: x and y (metres) of the goal of each walk.
-        positions: x and y (metres) in each row.
-        failed_moves: x and y (metres) of the target of a failed move; NaN in all other rows.
-        steps: the step of each row.
-        rows: the data row (from 1) of each row in the table that it came from.
-        metadata: the other columns, `t` among them, one row per position.
-        source: the name of the file, for error messages.
+        labels: The label of each walk, as in the table.
+        offsets: The first row of each walk, and the number of rows.
+        goals: X and y (metres) of the goal of each walk.
+        positions: X and y (metres) in each row.
+        failed_moves: X and y (metres) of the target of a failed move; NaN in all other rows.
+        steps: The step of each row.
+        rows: The data row (from 1) of each row in the table that it came from.
+        metadata: The other columns, `t` among them, one row per position.
+        source: The name of the file, for error messages.
+
+    Example:
+        >>> import pyarrow as pa
+        >>> walks = walks_from_table(pa.table({"walk": [0, 0], "step": [0, 1], "x": [0.5, 1.5], "y": [0.5, 0.5]}))
+        >>> [positions.tolist() for positions in walks]
+        [[[0.5, 0.5], [1.5, 0.5]]]
     """
 
     labels: list[object]
@@ -71,8 +77,11 @@ class Walks:
     def per_walk(self, column: str) -> list[object]:
         """Return the value of a metadata column for each walk.
 
+        Args:
+            column: The name of a column of metadata.
+
         Raises:
-            InputError: if the column does not exist, has an empty cell, or has two values within a walk.
+            InputError: If the column does not exist, has an empty cell, or has two values within a walk.
         """
         check(column not in _REQUIRED + _OPTIONAL, "expected a column of metadata", source=self.source, field=column)
         check_columns(self.metadata, (column,), self.source)
@@ -84,6 +93,9 @@ class Walks:
 
     def select(self, index: Bool[np.ndarray, " walks"] | Integer[np.ndarray, " selected"]) -> "Walks":
         """Return the walks that a mask or an array of indices selects, in that order.
+
+        Args:
+            index: A mask over all walks, or indices of walks; negative ones count from the end.
 
         Example:
             >>> first_ten = walks.select(np.arange(10))  # doctest: +SKIP
@@ -102,8 +114,11 @@ def read_walks(path: str | Path) -> Walks:
 
     The module describes the columns.
 
+    Args:
+        path: The file, or `minari:ID`.
+
     Raises:
-        InputError: as `read_table` or `read_positions` do, and as `walks_from_table` does.
+        InputError: As `read_table` or `read_positions` do, and as `walks_from_table` does.
 
     Example:
         >>> walks = read_walks("walks.csv")  # doctest: +SKIP
@@ -115,8 +130,12 @@ def read_walks(path: str | Path) -> Walks:
 def write_walks(path: str | Path, walks: Walks) -> None:
     """Write walks as `.csv`, `.parquet` or `minari:ID` atomically, walk by walk, for `read_walks`.
 
+    Args:
+        path: The file, or `minari:ID` with a new id.
+        walks: The walks.
+
     Raises:
-        InputError: as `write_table` or `write_positions` do.
+        InputError: As `write_table` or `write_positions` do.
 
     Example:
         >>> write_walks("walks.csv", walks)  # doctest: +SKIP
@@ -129,11 +148,11 @@ def walks_from_table(table: pa.Table, source: str = "walks") -> Walks:
     """Return the walks in a table in memory.
 
     Args:
-        table: one row per position, in the columns of this module.
-        source: the name of the table in errors.
+        table: One row per position, in the columns of this module.
+        source: The name of the table in errors.
 
     Raises:
-        InputError: naming row and column, for columns that are missing or lack their partner, an empty table, cells
+        InputError: Naming row and column, for columns that are missing or lack their partner, an empty table, cells
             that are empty, not numbers or not finite, steps unsorted or repeated within a walk, times that decrease,
             goals that change within a walk, half-filled goals and failed moves, and walks of one point.
 
@@ -143,7 +162,8 @@ def walks_from_table(table: pa.Table, source: str = "walks") -> Walks:
         >>> len(walks), walks.goals.tolist()
         (1, [[1.5, 0.5]])
     """
-    _check_columns(table, source)
+    check_columns(table, _REQUIRED, source)
+    check(len(table) > 0, "expected at least one walk, found a table without rows", source=source)
     encoded = _labels(table, source)
     row_walks = encoded.indices.to_numpy()
     order = np.argsort(row_walks, kind="stable")
@@ -183,7 +203,11 @@ def walks_from_table(table: pa.Table, source: str = "walks") -> Walks:
 
 
 def table_from_walks(walks: Walks) -> pa.Table:
-    """Return the table of walks, one row per position; with `failed_x` and `failed_y` only if a move failed."""
+    """Return the table of walks, one row per position; with `failed_x` and `failed_y` only if a move failed.
+
+    Args:
+        walks: The walks.
+    """
     lengths = np.diff(walks.offsets)
     goals = np.repeat(walks.goals, lengths, axis=0)
     labels = pa.array(walks.labels).take(np.repeat(np.arange(len(walks)), lengths))
@@ -196,7 +220,12 @@ def table_from_walks(walks: Walks) -> pa.Table:
 
 
 def position_columns(prefix: str, positions: Float[np.ndarray, "rows 2"]) -> dict[str, Any]:
-    """Return x and y of positions as columns of a table."""
+    """Return x and y of positions as columns of a table.
+
+    Args:
+        prefix: What the names of the columns have before x and y.
+        positions: x and y (metres) in each row.
+    """
     return {f"{prefix}x": positions[:, 0], f"{prefix}y": positions[:, 1]}
 
 
@@ -204,16 +233,6 @@ def _store(path: str | Path) -> tuple[Callable[[Any], pa.Table], Callable[[Any, 
     """Return the functions that read and write walks in a place, and the name of the place for them."""
     store, _, name = PurePath(path).as_posix().partition(":")
     return (*_STORES[store], name) if store in _STORES else (partial(read_table, labels=("walk",)), write_table, path)
-
-
-def _check_columns(table: pa.Table, source: str) -> None:
-    check_columns(table, _REQUIRED, source)
-    names = table.column_names
-    for first, second in (("goal_x", "goal_y"), ("failed_x", "failed_y")):
-        absent = second if first in names else first
-        together = (first in names) == (second in names)
-        check(together, f"expected {first} and {second}, or neither", source=source, field=absent)
-    check(len(table) > 0, "expected at least one walk, found a table without rows", source=source)
 
 
 def _labels(table: pa.Table, source: str) -> pa.DictionaryArray:
@@ -238,8 +257,9 @@ def _steps(table: pa.Table, source: str) -> Real[np.ndarray, " rows"]:
 def _pair(table: pa.Table, name: str, source: str) -> Float[np.ndarray, "rows 2"]:
     """Return x and y of optional positions; in each row both are empty (NaN) or neither is."""
     first, second = f"{name}_x", f"{name}_y"
-    if first not in table.column_names:
+    if not {first, second} & set(table.column_names):
         return np.full((len(table), 2), np.nan)
+    check_columns(table, (first, second), source)
     pair = np.stack([number_column(table, first, source), number_column(table, second, source)], axis=1)
     empty = np.isnan(pair)
     complete = empty[:, 0] == empty[:, 1]

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sidestep.inference.priors import Normal, sensor_prior
-from sidestep.io.sensors import read_sensor_map, read_sensor_variance
+from sidestep.io.maps import read_sensor_map, read_sensor_variance
 from sidestep.maps.config import PriorConfig
 from sidestep.tabular.grid import Cell, Grid
 

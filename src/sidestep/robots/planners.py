@@ -78,7 +78,11 @@ class Planner(Protocol):
         ...
 
     def plan_to(self, goal: int) -> GoalPlan:
-        """Return the plan to reach a state."""
+        """Return the plan to reach a state.
+
+        Args:
+            goal: The goal state.
+        """
         ...
 
 
@@ -99,7 +103,11 @@ class ModelPlanner:
         return np.asarray(self.model.blocked) < 1
 
     def plan_to(self, goal: int) -> GoalPlan:
-        """Return the optimal plan to reach a state."""
+        """Return the optimal plan to reach a state.
+
+        Args:
+            goal: The goal state.
+        """
         task = self.task_of(goal)
         return GoalPlan(
             lambda starts: plan(self.model, task).follow(starts),
@@ -124,7 +132,11 @@ class PolicyPlanner:
         return self.grid.known != Cell.OCCUPIED
 
     def plan_to(self, goal: int) -> GoalPlan:
-        """Return the greedy plan; no action leaves the map or enters a cell known to be occupied."""
+        """Return the greedy plan; no action leaves the map or enters a cell known to be occupied.
+
+        Args:
+            goal: The goal state.
+        """
         required, occupied = moves_into(self.grid), np.append(self.grid.known.ravel() == Cell.OCCUPIED, False)
         possible = (required[..., 0] < self.grid.size) & ~occupied[required].any(axis=-1)
         policy = np.where(possible, self.policy_of(goal), 0.0)
@@ -137,7 +149,11 @@ class PolicyPlanner:
 
 
 def grid_environment(truth: Grid) -> GridEnvironment:
-    """Return the environment of a true map; cells that the map does not know count as obstacles."""
+    """Return the environment of a true map; cells that the map does not know count as obstacles.
+
+    Args:
+        truth: The true map.
+    """
     return GridEnvironment(moves_into(truth), truth.lengths, np.append(truth.known.reshape(-1) != Cell.FREE, False))
 
 

@@ -9,7 +9,13 @@ from sidestep.tabular.solvers.native import compiled
 
 @compiled()
 def executed_length(environment, belief, start):  # pragma: no cover
-    """Return the length of the path that a robot executes; its belief is updated after each bump."""
+    """Return the length of the path that a robot executes; its belief is updated after each bump.
+
+    Args:
+        environment: A `GridEnvironment`.
+        belief: A `BeliefState`; its arrays are changed.
+        start: The start state.
+    """
     required = environment.required
     state, length, moves_since_bump = start, 0.0, 0
     stale = np.zeros(len(belief.success), np.bool_)
@@ -63,7 +69,14 @@ def _backup(belief, required, state, stale):  # pragma: no cover
 
 @compiled()
 def block_and_repair(belief, required, cell, stale):  # pragma: no cover
-    """Block a cell and repair the values, if any; `stale` is False everywhere, before and after."""
+    """Block a cell and repair the values, if any; `stale` is False everywhere, before and after.
+
+    Args:
+        belief: A `BeliefState`; its arrays are changed.
+        required: The cells that must be free for each move.
+        cell: The blocked cell.
+        stale: Working memory, one entry per state.
+    """
     queue = [(0.0, 0) for _ in range(0)]
     for state in required[cell, :, 0]:
         if state < len(stale):

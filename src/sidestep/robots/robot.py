@@ -42,13 +42,24 @@ def risk_averse_robot(
         model: The learned map.
         visited: The cells (states) that walks passed.
         bump_cost: The cost of the first bump at a place in cell sides, at least 0.
+
+    Example:
+        >>> from sidestep.tabular.grid import Grid
+        >>> robot = risk_averse_robot(ObstacleGrid(Grid.unknown(rows=1, columns=3)), visited=[0, 1])
+        >>> robot.plan_to(2).paths_from(np.array([0]))[0].tolist()
+        [0, 1, 2]
     """
     known = mark_visited_free(model, visited)
     return ModelPlanner(known, partial(risk_averse_task, known, bump_cost=bump_cost))
 
 
 def mark_visited_free(model: ObstacleGrid, visited: Int[np.ndarray, " visits"] | Sequence[int]) -> ObstacleGrid:
-    """Return the model in which unknown cells (states) that walks passed are known to be free."""
+    """Return the model in which unknown cells (states) that walks passed are known to be free.
+
+    Args:
+        model: The map.
+        visited: The states.
+    """
     known = np.array(model.known).reshape(-1)
     visited = np.asarray(visited, dtype=np.int64)
     known[visited[known[visited] == Cell.UNKNOWN]] = Cell.FREE

@@ -24,13 +24,13 @@ class Episode(NamedTuple):
     """One episode: observations, and the actions and rewards between them.
 
     Attributes:
-        observations: an array, or several by name, with one row more than there are moves.
-        actions: one per move.
-        rewards: one per move.
-        terminated: whether the episode ended in a terminal state; otherwise it was truncated.
-        infos: other data of each observation.
-        metadata: other data of the whole episode.
-        source: the dataset and Minari's number of the episode (the first is 0), for error messages.
+        observations: An array, or several by name, with one row more than there are moves.
+        actions: One per move.
+        rewards: One per move.
+        terminated: Whether the episode ended in a terminal state; otherwise it was truncated.
+        infos: Other data of each observation.
+        metadata: Other data of the whole episode.
+        source: The dataset and Minari's number of the episode (the first is 0), for error messages.
     """
 
     observations: Any
@@ -46,10 +46,10 @@ class Dataset(NamedTuple):
     """A dataset in memory.
 
     Attributes:
-        observation_space: a space of Gymnasium.
-        action_space: a space of Gymnasium.
-        metadata: of the whole dataset.
-        episodes: at least one.
+        observation_space: A space of Gymnasium.
+        action_space: A space of Gymnasium.
+        metadata: Of the whole dataset.
+        episodes: At least one.
     """
 
     observation_space: Any
@@ -59,7 +59,11 @@ class Dataset(NamedTuple):
 
 
 def require_minari(dataset: str | Path) -> None:
-    """Raise `InputError` if the library Minari is not installed."""
+    """Raise `InputError` if the library Minari is not installed.
+
+    Args:
+        dataset: The name of the dataset, for the error.
+    """
     try:
         import minari  # noqa: F401
     except ImportError as error:
@@ -71,12 +75,12 @@ def read_dataset(dataset: str | Path, check_spaces: Callable[[Any, Any], None]) 
     """Return a dataset on this machine.
 
     Args:
-        dataset: its id or its path.
-        check_spaces: is called with the spaces of observations and actions before any episode is read, and raises
+        dataset: Its id or its path.
+        check_spaces: Is called with the spaces of observations and actions before any episode is read, and raises
             `InputError` for wrong ones (images would fill the memory).
 
     Raises:
-        InputError: for a dataset that does not exist, is broken or empty, and for an episode without a move or with
+        InputError: For a dataset that does not exist, is broken or empty, and for an episode without a move or with
             another number of observations than one more than its moves.
     """
     require_minari(dataset)
@@ -102,8 +106,12 @@ def read_dataset(dataset: str | Path, check_spaces: Callable[[Any, Any], None]) 
 def write_dataset(dataset: str, content: Dataset) -> None:
     """Write a dataset under an id atomically.
 
+    Args:
+        dataset: A new id with a version, such as `office/walks-v0`.
+        content: What to write.
+
     Raises:
-        InputError: for an id that is malformed or exists already, and for data that Minari cannot store.
+        InputError: For an id that is malformed or exists already, and for data that Minari cannot store.
     """
     require_minari(dataset)
     parts = _ID.fullmatch(dataset)

@@ -35,14 +35,14 @@ def write_demonstrations(
     """Write demonstrations and their tasks as a local Minari dataset atomically.
 
     Args:
-        dataset: a new id, such as `"office/walks-v0"`.
-        demonstrations: in `world`.
-        world: gives the numbers of states and actions.
+        dataset: A new id, such as `"office/walks-v0"`.
+        demonstrations: In `world`.
+        world: Gives the numbers of states and actions.
         ends: `Environment.ends` of a Gymnasium environment with separate states for ends of episodes; they are written
             as the environment's states.
 
     Raises:
-        InputError: for an id that is malformed or exists already, demonstrations in another world, and for moves of a
+        InputError: For an id that is malformed or exists already, demonstrations in another world, and for moves of a
             trajectory that do not start where the move before has ended.
 
     Example:
@@ -73,15 +73,15 @@ def read_demonstrations(
     """Return the demonstrations in a local Minari dataset with whole numbers as observations and actions.
 
     Args:
-        dataset: its id, or its path.
-        world: gives the numbers of states and actions.
-        task: of all episodes; by default the task in the metadata of each.
-        discount: of episodes that have a goal but no discount in their metadata.
-        step_cost: of episodes that have only goal and discount in their metadata, as in `reach`.
-        ends: as in `write_demonstrations`.
+        dataset: Its id, or its path.
+        world: Gives the numbers of states and actions.
+        task: Of all episodes; by default the task in the metadata of each.
+        discount: Of episodes that have a goal but no discount in their metadata.
+        step_cost: Of episodes that have only goal and discount in their metadata, as in `reach`.
+        ends: As in `write_demonstrations`.
 
     Raises:
-        InputError: for a dataset that does not exist, is broken or empty, or has other spaces than the world, and,
+        InputError: For a dataset that does not exist, is broken or empty, or has other spaces than the world, and,
             naming the episode and the field, for lengths that do not fit, states and actions outside the spaces, an
             episode that continues after a terminal state, and a task that is missing or not of this world.
 
@@ -231,7 +231,7 @@ def _entry_of(episode: Episode, entries: Sequence[Mapping[str, Any]]) -> int:
 
 def _number(metadata: Mapping[str, Any], field: str, source: str) -> float:
     """Return a number in the metadata of an episode."""
-    value = metadata.get(field)
+    value: Any = metadata.get(field)
     message = "neither the episode nor an argument has it: expected a number, or a task for all episodes"
     check(value is not None, message, source=source, field=field)
     is_number = np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"

@@ -31,8 +31,11 @@ _FAILED = ("failed_x", "failed_y")
 def read_positions(dataset: str) -> pa.Table:
     """Return the walks of a local Minari dataset, by its id or its path, as a table for `sidestep.io.walks`.
 
+    Args:
+        dataset: Its id or its path.
+
     Raises:
-        InputError: for a dataset that does not exist, is broken or empty, has no positions in its observations, or has
+        InputError: For a dataset that does not exist, is broken or empty, has no positions in its observations, or has
             two walks with one label, and, naming the episode and the field, for positions and goals that are not finite
             or of another shape, and for goals that change.
     """
@@ -48,8 +51,12 @@ def read_positions(dataset: str) -> pa.Table:
 def write_positions(dataset: str, table: pa.Table) -> None:
     """Write a table of walks from `table_from_walks` as a local Minari dataset atomically.
 
+    Args:
+        dataset: A new id with a version, such as `office/walks-v0`.
+        table: One row per position.
+
     Raises:
-        InputError: for an id that is malformed or exists already, a table without rows, and a column that is neither
+        InputError: For an id that is malformed or exists already, a table without rows, and a column that is neither
             numbers nor text, or has empty cells.
     """
     require_minari(dataset)
@@ -101,12 +108,12 @@ def _info(column: pa.ChunkedArray, name: str, dataset: str) -> Shaped[np.ndarray
 
 def _check_space(space: Any, dataset: str) -> None:
     """Raise `InputError` for observations without positions."""
-    from gymnasium.spaces import Box, Dict
+    from gymnasium.spaces import Box
 
-    spaces = space.spaces if isinstance(space, Dict) else {"achieved_goal": space}
-    message = f"expected achieved_goal among the observations, found {', '.join(spaces)}"
-    check("achieved_goal" in spaces, message, source=dataset, field="observation_space")
-    for name, each in _places(space.spaces if isinstance(space, Dict) else space).items():
+    places = _places(getattr(space, "spaces", space))
+    message = f"expected achieved_goal among the observations, found {space}"
+    check("achieved_goal" in places, message, source=dataset, field="observation_space")
+    for name, each in places.items():
         fits = isinstance(each, Box) and len(each.shape) == 1 and each.shape[0] >= 2
         check(fits, f"expected a Box of at least two numbers x, y, found {each}", source=dataset, field=name)
 
@@ -114,7 +121,7 @@ def _check_space(space: Any, dataset: str) -> None:
 def _places(observations: Any) -> dict[str, Any]:
     """Return the positions in observations, or in their space, and then the goals, if any."""
     if not isinstance(observations, Mapping):
-        return {"observations": observations}
+        return {"achieved_goal": observations}
     return {name: observations[name] for name in ("achieved_goal", "desired_goal") if name in observations}
 
 
@@ -132,9 +139,9 @@ def _labels(episodes: Sequence[Episode], dataset: str) -> list[Any]:
 def _table(episode: Episode, label: object) -> pa.Table:
     """Return the table of one walk, one row per position."""
     rows = len(episode.rewards) + 1
-    seen = _places(episode.observations)
-    places = {name: _plane(values, rows, episode.source, name) for name, values in seen.items()}
-    positions, goal = next(iter(places.values())), _goal(episode, places.get("desired_goal"))
+    seen = _places(episode.observations).items()
+    places = {name: _plane(values, rows, episode.source, name) for name, values in seen}
+    positions, goal = places["achieved_goal"], _goal(episode, places.get("desired_goal"))
     columns = {"walk": pa.array([label] * rows), "step": np.arange(rows), "x": positions[:, 0], "y": positions[:, 1]}
     if goal is not None:
         columns |= {"goal_x": np.full(rows, goal[0]), "goal_y": np.full(rows, goal[1])}
