@@ -106,11 +106,7 @@ class LBFGS(Optimizer):
 
     def init(self, x: Vector) -> Tree:
         """Return an empty memory."""
-        import optax
-
-        # optax begins with zeros; shapes alone need no compiled code
-        state = jax.eval_shape(optax.scale_by_lbfgs(self.memory_size).init, x)
-        return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), state)
+        return _lbfgs_memory(self.memory_size, x)
 
     def step(self, loss: Loss, x: Vector, value: float, gradient: Vector, state: Tree) -> tuple[Vector, Tree] | None:
         """Return the best point along the L-BFGS direction, or None if no point is better than x."""
@@ -256,16 +252,26 @@ class _Trial(NamedTuple):
 
 
 @keep_program
+def _lbfgs_memory(memory_size: int, x: Float[Array | np.ndarray, " parameters"]) -> Tree:
+    """Return the arrays of optax's empty memory: where programs are kept, a fit does not import optax."""
+    import optax
+
+    return jax.tree.leaves(optax.scale_by_lbfgs(memory_size).init(jnp.asarray(x)))
+
+
+@keep_program
 def _lbfgs_direction(
     memory_size: int,
     gradient: Float[Array | np.ndarray, " parameters"],
-    state: Tree,
+    memory: Tree,
     x: Float[Array | np.ndarray, " parameters"],
 ) -> tuple[Array, Tree]:
     import optax
 
-    direction, state = optax.scale_by_lbfgs(memory_size).update(jnp.asarray(gradient), state, jnp.asarray(x))
-    return jnp.asarray(direction), state
+    x, transformation = jnp.asarray(x), optax.scale_by_lbfgs(memory_size)
+    state = jax.tree.unflatten(jax.tree.structure(jax.eval_shape(transformation.init, x)), memory)
+    direction, state = transformation.update(jnp.asarray(gradient), state, x)
+    return jnp.asarray(direction), jax.tree.leaves(state)
 
 
 def _line_search(direction: Vector, loss: Loss, x: Vector, value: float, gradient: Vector) -> Vector | None:

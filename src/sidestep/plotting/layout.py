@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.transforms import Bbox
 
 DOTS_PER_INCH = 150
 _GAP = 0.12
@@ -51,6 +52,7 @@ def arrange(figure: Figure, widths: Sequence[float], height: float, bar: ColorBa
     rows = -(-len(axes) // columns)
     margins = np.zeros((rows, columns, 4))
     for index, each in enumerate(axes):
+        each.set_title(each.get_title(), y=1.0)  # without a place of its own, a title has each axis measured again
         margins[divmod(index, columns)] = _margins(each, widths[index % columns], height, renderer)
     left, right = margins[:, :, :2].max(axis=0).T
     below, above = margins[::-1, :, 2:].max(axis=1).T
@@ -80,7 +82,9 @@ def _margins(axes: Axes, width: float, height: float, renderer: RendererAgg) -> 
     """Return the reach of labels beyond axes of this size: left, right, below and above, in inches."""
     whole_width, whole_height = axes.figure.get_figure(root=True).get_size_inches()
     axes.set_position((0, 0, width / whole_width, height / whole_height))
-    box = axes.get_tightbbox(renderer, bbox_extra_artists=[]) or axes.bbox
+    # not those of `axes.get_tightbbox`, which measures each axis twice
+    labels = axes.xaxis.get_tightbbox(renderer), axes.yaxis.get_tightbbox(renderer)
+    box = Bbox.union([axes.bbox, axes.title.get_window_extent(renderer), *filter(None, labels)])
     x0, y0, x1, y1 = np.asarray(box.extents) / DOTS_PER_INCH
     return np.maximum([-x0, x1 - width, -y0, y1 - height], 0.0)
 

@@ -218,7 +218,9 @@ def save(figure: Figure, path: str | Path) -> None:
     Raises:
         InputError: where the file system refuses.
     """
-    write_whole(path, lambda file: figure.savefig(file, format="png", dpi=DOTS_PER_INCH))
+    # a file a quarter larger is written in half the time
+    options = {"compress_level": 1}
+    write_whole(path, lambda file: figure.savefig(file, format="png", dpi=DOTS_PER_INCH, pil_kwargs=options))
 
 
 def _draw_panel(axes: Axes, panel: Panel) -> AxesImage | None:
