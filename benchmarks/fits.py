@@ -25,7 +25,7 @@ from sidestep.io.demonstrations import walks_from_trajectories
 from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map
 from sidestep.maps.config import BehaviorConfig, MapConfig, PriorConfig, SimulationConfig
-from sidestep.maps.learn import demonstrations_of
+from sidestep.maps.fit import demonstrations_of
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.reward import Reward
 from sidestep.worlds.offices import office

@@ -31,7 +31,8 @@ from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map
 from sidestep.io.walks import Walks, read_walks
 from sidestep.maps.config import MapConfig
-from sidestep.maps.learn import demonstrations_of, learn_map
+from sidestep.maps.fit import demonstrations_of
+from sidestep.maps.learn import learn_map
 from sidestep.maps.selection import select_behavior
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Connectivity, Grid

@@ -146,7 +146,7 @@ def test_simulate_trajectories_bad_starts_are_refused():
 
 def test_simulate_trajectories_improper_task_is_refused():
     """At β = 1/2 and four actions, every step is worth ln 4/β − 1 > 0."""
-    with pytest.raises(ImproperTask, match="never wants to arrive"):
+    with pytest.raises(ImproperTask, match="an endless path is worth more"):
         simulate(ROOM, Behavior(LogSumExp(), 0.5))
 
 

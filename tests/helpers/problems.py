@@ -111,6 +111,12 @@ def dense_tabular(logits, successors):
     return jnp.einsum("sak,sakt->sat", probabilities, np.eye(len(successors))[successors])
 
 
+def dense(model: TransitionModel):
+    """T[s, a, s′] of a model."""
+    states = np.eye(model.graph.states)[np.asarray(model.graph.successors)]
+    return jnp.einsum("sak,sakt->sat", model.probabilities(), states)
+
+
 class Problem(NamedTuple):
     """A model at a generic point, and its transitions as a dense function of its parameters."""
 

@@ -135,13 +135,14 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--port", type=int)
     parser.add_argument("--process", type=int, default=0)
+    parser.add_argument("--names", nargs="+")
     options = parser.parse_args()
     if options.port:
         jax.distributed.initialize(
             f"127.0.0.1:{options.port}", num_processes=2, process_id=options.process, initialization_timeout=60
         )
     mesh = tasks_mesh()
-    for name in CASES:
+    for name in options.names:
         results = measured(name, mesh)
         results["resumed"] = resumed(name, mesh, options.out / f"{name}.checkpoint")
         results["devices"] = np.array(mesh.size)

@@ -15,17 +15,17 @@ from helpers.spread import CASES, GOALS, measured
 PROGRAM = Path(__file__).parents[1] / "helpers" / "spread.py"
 LIMIT = 240
 """The time limit of child processes in seconds; on idle cores they take a tenth of it."""
-SPREAD = {"4 devices": (1, 4), "2 processes with 2 devices each": (2, 2)}
-"""The number of processes, and of devices of each."""
+SPREAD = {"4 devices": (1, 4, ["jacobi"]), "2 processes with 2 devices each": (2, 2, list(CASES))}
+"""The number of processes, of devices of each, and the solvers."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", SPREAD)
 def test_fit_over_devices_and_processes_equals_fit_on_one_device(tmp_path, case):
     """One test, so that the child processes run once."""
-    processes, devices = SPREAD[case]
-    run_children(tmp_path, processes, devices)
-    for name in CASES:
+    processes, devices, names = SPREAD[case]
+    run_children(tmp_path, processes, devices, names)
+    for name in names:
         results = [dict(np.load(tmp_path / f"{name}-{process}.npz")) for process in range(processes)]
         expected = measured(name, None)
         for own in results:
@@ -67,7 +67,7 @@ def check_refusals(messages):
     assert all(expected in message for message in messages), messages
 
 
-def run_children(out, processes, devices):
+def run_children(out, processes, devices, names):
     """Run the program in several processes at once, and end them all if one fails or takes too long."""
     flags = f"--xla_cpu_use_fusion_emitters=false --xla_force_host_platform_device_count={devices}"
     changes = {
@@ -81,7 +81,7 @@ def run_children(out, processes, devices):
     logs = [(out / f"log-{process}.txt").open("w+") for process in range(processes)]
     children = [
         subprocess.Popen(
-            [sys.executable, str(PROGRAM), str(out), *port, "--process", str(process)],
+            [sys.executable, str(PROGRAM), str(out), *port, "--process", str(process), "--names", *names],
             env=os.environ | changes,
             stdout=log,
             stderr=subprocess.STDOUT,

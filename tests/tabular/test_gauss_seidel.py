@@ -163,10 +163,9 @@ def test_solve_in_nested_batches_and_loops_equals_each_alone():
             np.testing.assert_allclose(mine, theirs, rtol=1e-12, atol=1e-12, err_msg=name)
 
 
-@pytest.mark.parametrize("name", ["hard max", "Boltzmann"])
-def test_solve_of_32_bit_numbers_stays_in_32_bits(name):
+def test_solve_of_32_bit_numbers_stays_in_32_bits():
     problem = random_problem()
-    inputs = (problem.model, generic_task(problem, 0.9), agent(name))
+    inputs = (problem.model, generic_task(problem, 0.9), agent("Boltzmann"))
     exact, exact_slope, _ = values_and_slopes(*inputs)
     narrow = jax.tree.map(lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, inputs)
     solution, slope, adjoint = values_and_slopes(*narrow, solver=GaussSeidel())
@@ -180,7 +179,7 @@ def test_solve_of_32_bit_numbers_stays_in_32_bits(name):
 # Limits
 
 
-@pytest.mark.parametrize(("name", "most"), [("hard max", 0), ("hard max", 1), ("Boltzmann", 1), ("Boltzmann", 3)])
+@pytest.mark.parametrize(("name", "most"), [("hard max", 0), ("Boltzmann", 3)])
 def test_solve_with_too_few_sweeps_has_not_converged(name, most):
     model = some_map()
     wanted = reach(model.graph, 5, discount=0.999)
@@ -190,11 +189,10 @@ def test_solve_with_too_few_sweeps_has_not_converged(name, most):
     assert jnp.isnan(slope).all()
 
 
-@pytest.mark.parametrize("name", ["hard max", "Boltzmann"])
 @pytest.mark.parametrize("where", ["parameters", "reward", "beta"])
-def test_solve_with_a_nan_has_not_converged(name, where):
+def test_solve_with_a_nan_has_not_converged(where):
     model = some_map(4, 5)
-    wanted, behavior = reach(model.graph, 5), agent(name)
+    wanted, behavior = reach(model.graph, 5), agent("Boltzmann")
     if where == "parameters":
         model = model.with_parameters(model.parameters.at[3].set(jnp.nan))
     elif where == "reward":

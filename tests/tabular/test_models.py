@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from helpers.problems import dense_obstacles, dense_tabular, random_problem
+from helpers.problems import dense, dense_obstacles, dense_tabular, random_problem
 from sidestep.errors import InputError
 from sidestep.tabular.graph import graph, grid_graph
 from sidestep.tabular.grid import Cell, Grid
@@ -16,11 +16,6 @@ from sidestep.tabular.models import ObstacleGrid, TabularModel, true_model
 seeds = st.integers(0, 2**32 - 1)
 connectivities = pytest.mark.parametrize("connectivity", [4, 8])
 U, F, O = Cell.UNKNOWN, Cell.FREE, Cell.OCCUPIED  # noqa: E741
-
-
-def dense(model):
-    probabilities, successors = model.probabilities(), np.asarray(model.graph.successors)
-    return jnp.einsum("sak,sakt->sat", probabilities, np.eye(len(successors))[successors])
 
 
 # Grids

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers.problems import dense
 from sidestep.errors import InputError
 from sidestep.inference.fit import fit
 from sidestep.inference.priors import Normal
@@ -34,12 +35,6 @@ def surely(model, state, action):
 
 def logit(chance):
     return np.log(chance) - np.log1p(-np.asarray(chance))
-
-
-def dense(model):
-    """T[s, a, s′]."""
-    states = np.eye(model.graph.states)[np.asarray(model.graph.successors)]
-    return np.einsum("sak,sakt->sat", model.probabilities(), states)
 
 
 def anywhere(graph: Graph, states, discount=0.95) -> Task:
@@ -195,15 +190,12 @@ def test_road_network_turns_that_do_not_exist_are_not_chosen():
     np.testing.assert_allclose(np.exp(behavior.log_policy(result.action_values[1]))[1:], 0, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("turns", "lengths", "match"),
-    [
-        ([[0, 1], [0, 1]], [1.0, 1.0], "turns"),
-        ([[0, 2]], [1.0, 1.0], "turns.*0…1"),
-        ([[0, 1]], [1.0, 0.0], "lengths"),
-        ([[0, 1]], [1.0, np.nan], "lengths"),
-    ],
-)
+@pytest.mark.parametrize(("turns", "lengths", "match"), [
+    ([[0, 1], [0, 1]], [1.0, 1.0], "turns"),
+    ([[0, 2]], [1.0, 1.0], "turns.*0…1"),
+    ([[0, 1]], [1.0, 0.0], "lengths"),
+    ([[0, 1]], [1.0, np.nan], "lengths"),
+])  # fmt: skip
 def test_road_network_of_wrong_arguments_raises(turns, lengths, match):
     with pytest.raises(InputError, match=match):
         road_network(np.array(turns), np.array(lengths))

@@ -101,8 +101,7 @@ def test_simulate_arriving_with_the_last_move_is_allowed():
     assert [len(walk.actions) for walk in walked(Grid(CORRIDOR), [5], [[0, 3]], moves=5)] == [5, 2]
 
 
-@pytest.mark.parametrize("connectivity", [4, 8])
-@pytest.mark.parametrize("ending", [".csv", ".parquet"])
+@pytest.mark.parametrize(("connectivity", "ending"), [(4, ".csv"), (8, ".parquet")])
 def test_write_walks_of_simulated_walks_reads_back_as_their_demonstrations(tmp_path, connectivity, ending):
     """Imperfect agents fail at walls and edges, on a map that is rotated and away from the origin."""
     grid = Grid(ROOMS, resolution=0.3, origin=(-2.0, 5.0, 0.7), connectivity=connectivity)

@@ -17,8 +17,8 @@ from sidestep.io.gridding import Moves, grid_walks
 from sidestep.io.walks import Walks
 from sidestep.maps.annotations import NO_ANNOTATIONS, WalkAnnotations
 from sidestep.maps.config import MapConfig
-from sidestep.maps.fit import behavior_of
-from sidestep.maps.learn import demonstrations_of, learn_map, sample_walks
+from sidestep.maps.fit import behavior_of, demonstrations_of
+from sidestep.maps.learn import learn_map, sample_walks
 from sidestep.maps.learned_map import LearnedMap
 from sidestep.maps.selection import Selection
 from sidestep.maps.sensors import SensorMap

@@ -30,7 +30,13 @@ _FIXED_WORKSPACE = 8
 
 
 class Batch(NamedTuple):
-    """Some tasks, the person of each, and the choices of its demonstrations."""
+    """Some tasks, the person of each, and the choices of its demonstrations.
+
+    Attributes:
+        tasks: Of equal number in all batches of a fit.
+        person: The person of each task.
+        choices: The distinct choices of each task.
+    """
 
     tasks: Task
     person: Int[Array, " tasks"]
@@ -41,9 +47,9 @@ class BatchPlan(NamedTuple):
     """The size of batches, and what is stored between evaluations.
 
     Attributes:
-        size: the number of tasks of a batch, on all devices together.
-        keeps_warm_starts: whether solves start where those of the last evaluation ended.
-        reuses: whether evaluations keep the contributions of batches for the next one.
+        size: The number of tasks of a batch, on all devices together.
+        keeps_warm_starts: Whether solves start where those of the last evaluation ended.
+        reuses: Whether evaluations keep the contributions of batches for the next one.
     """
 
     size: int
@@ -68,13 +74,16 @@ def plan_batches(
     if it fits, so that one compiled function serves other data too.
 
     Args:
-        model: the transition model, for its size.
-        solver: computes the values.
-        tasks: the number of tasks.
-        memory: bytes per device. A batch has at least one task per device, even if that takes more.
-        devices: the number of devices that share a batch.
-        reuse: whether evaluations should reuse the contributions of batches (see `Objective.evaluate`).
-        large_map: the number of states from which a map is large.
+        model: The transition model, for its size.
+        solver: Computes the values.
+        tasks: The number of tasks.
+        memory: Bytes per device. A batch has at least one task per device, even if that takes more.
+        devices: The number of devices that share a batch.
+        reuse: Whether evaluations should reuse the contributions of batches (see `Objective.evaluate`).
+        large_map: The number of states from which a map is large.
+
+    Returns:
+        The plan.
     """
     probabilities, parameters = jax.eval_shape(model.probabilities), jax.eval_shape(lambda: model.parameters)
     states, item = model.graph.states, probabilities.dtype.itemsize
@@ -100,7 +109,13 @@ def plan_batches(
 
 
 def make_batches(demonstrations: Demonstrations, behavior: BehaviorModel, size: int) -> list[Batch]:
-    """Return batches of `size` tasks; the last is padded with terminated tasks without choices."""
+    """Return batches of `size` tasks; the last is padded with terminated tasks without choices.
+
+    Args:
+        demonstrations: The moves and all tasks.
+        behavior: The behavior model, for the persons.
+        size: The number of tasks of a batch.
+    """
     tasks = demonstrations.tasks
     count = len(tasks.terminal)
     missing = -count % size

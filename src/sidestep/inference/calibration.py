@@ -41,7 +41,12 @@ class ScoreStatistics(NamedTuple):
         score: u = ∂ log π(a | s) / ∂ log β.
         information: Σ_a π(a | s) u(s, a)².
         log_policy: log π(a | s), in nats.
-        trajectory: the index of the move's trajectory.
+        trajectory: The index of the move's trajectory.
+
+    Example:
+        >>> scores = ScoreStatistics(*(np.array(each) for each in ([1.0, -1.0], [0.5, 0.5], [-1.0, -1.0], [0, 1])))
+        >>> len(scores.score)
+        2
     """
 
     score: Float[np.ndarray, " moves"]
@@ -56,13 +61,28 @@ def score_statistics(
     """Return the scores of moves under a model that was learned from other trajectories.
 
     Args:
-        model: the learned transition model.
-        demonstrations: held-out trajectories; moves of weight 0 are left out.
-        behavior: the behavior that the scores are of.
-        options: as for `solve`.
+        model: The learned transition model.
+        demonstrations: Held-out trajectories; moves of weight 0 are left out.
+        behavior: The behavior that the scores are of.
+        options: As for `solve`.
+
+    Returns:
+        The scores, one for each move that counts.
 
     Raises:
-        NotConverged: if the values of a task do not converge.
+        NotConverged: If the values of a task do not converge.
+
+    Example:
+        >>> from sidestep.tabular.backups import HardMax
+        >>> from sidestep.tabular.demonstrations import Trajectory, gather
+        >>> from sidestep.tabular.grid import Grid
+        >>> from sidestep.tabular.models import true_model
+        >>> from sidestep.tabular.tasks import reach
+        >>> grid = Grid(np.zeros((1, 3), dtype=int))
+        >>> shown = gather([Trajectory(np.array([0, 1, 2]), np.array([3, 3]), task=0)], [reach(grid, 2)])
+        >>> scores = score_statistics(true_model(grid), shown, Behavior(HardMax(), 5.0))
+        >>> scores.score.shape
+        (2,)
     """
     padded = pad_to_power_of_two(demonstrations)
     converged, *numbers = _scores(model, padded, behavior, options)
@@ -93,7 +113,10 @@ def effective_sample_ratio(held_out: Sequence[ScoreStatistics]) -> float:
     """Return κ = I/J, the ratio of effective to actual steps; infinite where scores do not vary.
 
     Args:
-        held_out: scores of trajectories that the models were not learned from, with distinct trajectory indices.
+        held_out: Scores of trajectories that the models were not learned from, with distinct trajectory indices.
+
+    Returns:
+        κ, above 0.
 
     Example:
         >>> scores = ScoreStatistics(*(np.array(each) for each in ([1.0, -1.0], [0.5, 0.5], [-1.0, -1.0], [0, 1])))
@@ -107,7 +130,12 @@ def effective_sample_ratio(held_out: Sequence[ScoreStatistics]) -> float:
 
 
 class Dispersion(enum.Enum):
-    """Whether scores vary more, less or as much as those of independent steps."""
+    """Whether scores vary more, less or as much as those of independent steps.
+
+    Example:
+        >>> Dispersion.OVERDISPERSED.value
+        'overdispersed'
+    """
 
     OVERDISPERSED = "overdispersed"
     UNDERDISPERSED = "underdispersed"
@@ -121,8 +149,15 @@ def dispersion(ratio: float, trajectories: int, standard_errors: float) -> Dispe
 
     Args:
         ratio: κ (see `effective_sample_ratio`).
-        trajectories: the number of trajectories that it was estimated from.
-        standard_errors: the number of standard errors that count as significant.
+        trajectories: The number of trajectories that it was estimated from.
+        standard_errors: The number of standard errors that count as significant.
+
+    Returns:
+        How κ differs from 1.
+
+    Example:
+        >>> dispersion(0.2, trajectories=100, standard_errors=3.0)
+        <Dispersion.OVERDISPERSED: 'overdispersed'>
     """
     margin = standard_errors * (2 / trajectories) ** 0.5
     if abs(np.log(ratio)) <= margin:

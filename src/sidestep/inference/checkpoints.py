@@ -18,13 +18,17 @@ import numpy as np
 
 from sidestep._files import read_whole, write_whole
 from sidestep._typing import Tree
-from sidestep.errors import InputError
+from sidestep.errors import InputError, check
 
 History = Sequence[Sequence[int | float]]
 
 
 def fingerprint(problem: Tree) -> str:
-    """Return a digest of everything in a pytree: structure, static settings, numbers, types and shapes."""
+    """Return a digest of everything in a pytree: structure, static settings, numbers, types and shapes.
+
+    Args:
+        problem: Arrays and settings.
+    """
     leaves, structure = jax.tree.flatten(problem)
     digest = hashlib.sha256(str(structure).encode())
     for leaf in leaves:
@@ -42,9 +46,13 @@ class Checkpoint(NamedTuple):
     """The file of a fit's checkpoint, and how often it is saved.
 
     Attributes:
-        path: the file.
-        min_interval: the least time between two saves, in seconds.
-        max_fraction: the largest fraction of the time that saving may take, in (0, 1].
+        path: The file.
+        min_interval: The least time between two saves, in seconds.
+        max_fraction: The largest fraction of the time that saving may take, in (0, 1].
+
+    Example:
+        >>> Checkpoint("fit.checkpoint", min_interval=60.0).max_fraction
+        0.1
     """
 
     path: str | Path
@@ -56,8 +64,8 @@ class Saver:
     """Keeps a checkpoint up to date while a fit runs; without one it does nothing.
 
     Args:
-        checkpoint: a file, a `Checkpoint`, or None.
-        key: the fingerprint of the problem.
+        checkpoint: A file, a `Checkpoint`, or None.
+        key: The fingerprint of the problem.
     """
 
     def __init__(self, checkpoint: str | Path | Checkpoint | None, key: str):
@@ -68,15 +76,15 @@ class Saver:
         """Read the checkpoint.
 
         Args:
-            like: arrays of the structure, types and shapes of the state.
-            optional: likewise, of the arrays that a resumed fit can do without.
+            like: Arrays of the structure, types and shapes of the state.
+            optional: Likewise, of the arrays that a resumed fit can do without.
 
         Returns:
             The state, the history, and the optional arrays: `optional` itself if those of the file have other shapes,
             and the arguments if there is no file yet.
 
         Raises:
-            InputError: without a checkpoint, for a file that is not one, or one of a fit of other data or with other
+            InputError: Without a checkpoint, for a file that is not one, or one of a fit of other data or with other
                 settings.
         """
         if self.checkpoint is None:
@@ -90,11 +98,8 @@ class Saver:
             saved_key, history = header["fit"], header["history"]
         except (ValueError, TypeError, KeyError) as error:
             raise InputError("not a checkpoint", source=path) from error
-        if saved_key != self.key:
-            raise InputError(
-                "belongs to a fit of other data or with other settings; start without resuming to replace it",
-                source=path,
-            )
+        message = "belongs to a fit of other data or with other settings; start without resuming to replace it"
+        check(saved_key == self.key, message, source=path)
         try:
             if header.get("optional") != _shapes(optional):
                 return eqx.tree_deserialise_leaves(file, like), history, optional
@@ -107,9 +112,9 @@ class Saver:
         """Write the checkpoint as a whole, unless the last save is too recent.
 
         Args:
-            state: the arrays from which the fit is resumed.
-            history: a row of numbers per iteration.
-            optional: arrays that a resumed fit can do without.
+            state: The arrays from which the fit is resumed.
+            history: A row of numbers per iteration.
+            optional: Arrays that a resumed fit can do without.
         """
 
         def write(file: BinaryIO) -> None:
@@ -125,7 +130,11 @@ class Saver:
         self.next = ended + self.pause(ended - started)
 
     def pause(self, duration: float) -> float:
-        """Return how many seconds to wait after a save of this duration."""
+        """Return how many seconds to wait after a save of this duration.
+
+        Args:
+            duration: Of the save, in seconds.
+        """
         if self.checkpoint is None:
             return 0.0
         return float(max(self.checkpoint.min_interval, duration * (1 / self.checkpoint.max_fraction - 1)))

@@ -36,12 +36,28 @@ class GoalFit(eqx.Module, Generic[Model]):
     """A model learned from trajectories with unknown goals.
 
     Attributes:
-        fit: the last fit.
+        fit: The last fit.
         posterior: P(g | trajectory).
         goal_probabilities: p_g.
-        log_likelihoods: the actions' log-likelihood, before each round and at the end.
-        converged: whether the last fit converged, and the posterior changed by less than the tolerance in the last
+        log_likelihoods: The actions' log-likelihood, before each round and at the end.
+        converged: Whether the last fit converged, and the posterior changed by less than the tolerance in the last
             round.
+
+    Example:
+        >>> from sidestep.inference.fit import fit
+        >>> from sidestep.tabular.backups import HardMax
+        >>> from sidestep.tabular.demonstrations import Trajectory
+        >>> from sidestep.tabular.grid import Grid
+        >>> from sidestep.tabular.models import ObstacleGrid
+        >>> from sidestep.tabular.tasks import reach
+        >>> grid = Grid(np.full((1, 3), -1))
+        >>> walk = Trajectory(np.array([1, 2]), np.array([3]), task=0)
+        >>> ends = [reach(grid, goal) for goal in (0, 2)]
+        >>> agents = Behavior(HardMax(), 50.0)
+        >>> def learn(model, shown):
+        ...     return fit(model, shown, agents, terms=("transitions",))
+        >>> fit_goals(ObstacleGrid(grid), [walk], ends, agents, learn).converged
+        True
     """
 
     fit: Fit[Model]
@@ -61,18 +77,31 @@ def goal_posterior(
     """Return the posterior of each trajectory's goal, and the actions' log-likelihood.
 
     Args:
-        model: the transition model.
-        trajectories: their tasks do not matter.
-        candidates: the tasks that may be the goals.
-        behavior: the behavior of the agents.
+        model: The transition model.
+        trajectories: Their tasks do not matter.
+        candidates: The tasks that may be the goals.
+        behavior: The behavior of the agents.
         goal_probabilities: p_g, by default equal.
 
     Returns:
         P(g | trajectory), and Σ_i log Σ_g p_g Π_t π_g in nats.
 
     Raises:
-        InputError: for a trajectory that cannot have any of the goals, and as `gather` does.
-        NotConverged: if the values of a candidate do not converge.
+        InputError: For a trajectory that cannot have any of the goals, and as `gather` does.
+        NotConverged: If the values of a candidate do not converge.
+
+    Example:
+        >>> from sidestep.tabular.backups import HardMax
+        >>> from sidestep.tabular.demonstrations import Trajectory
+        >>> from sidestep.tabular.grid import Grid
+        >>> from sidestep.tabular.models import true_model
+        >>> from sidestep.tabular.tasks import reach
+        >>> grid = Grid(np.zeros((1, 3), dtype=int))
+        >>> walk = Trajectory(np.array([1, 2]), np.array([3]), task=0)
+        >>> ends = [reach(grid, goal) for goal in (0, 2)]
+        >>> posterior, _ = goal_posterior(true_model(grid), [walk], ends, Behavior(HardMax(), 50.0))
+        >>> int(posterior[0].argmax())  # a walk to the right has the right end as its goal
+        1
     """
     if goal_probabilities is None:
         goal_probabilities = np.full(len(candidates), 1 / len(candidates))
@@ -104,16 +133,35 @@ def fit_goals(
         result = fit_goals(model, trajectories, tasks, behavior, lambda model, demos: fit(model, demos, behavior))
 
     Args:
-        model: the transition model to start from.
-        trajectories: their tasks do not matter.
-        candidates: the tasks that may be the goals.
-        behavior: the behavior of the agents.
-        learn: a fit of weighted demonstrations that starts at a model, with the same behavior.
-        rounds: the largest number of rounds, at least 1.
-        tolerance: the largest change of a posterior probability that counts as none.
+        model: The transition model to start from.
+        trajectories: Their tasks do not matter.
+        candidates: The tasks that may be the goals.
+        behavior: The behavior of the agents.
+        learn: A fit of weighted demonstrations that starts at a model, with the same behavior.
+        rounds: The largest number of rounds, at least 1.
+        tolerance: The largest change of a posterior probability that counts as none.
+
+    Returns:
+        The model, and the posterior of each goal.
 
     Raises:
-        InputError: as `goal_posterior` does.
+        InputError: As `goal_posterior` does.
+
+    Example:
+        >>> from sidestep.inference.fit import fit
+        >>> from sidestep.tabular.backups import HardMax
+        >>> from sidestep.tabular.demonstrations import Trajectory
+        >>> from sidestep.tabular.grid import Grid
+        >>> from sidestep.tabular.models import ObstacleGrid
+        >>> from sidestep.tabular.tasks import reach
+        >>> grid = Grid(np.full((1, 3), -1))
+        >>> walk = Trajectory(np.array([1, 2]), np.array([3]), task=0)
+        >>> ends = [reach(grid, goal) for goal in (0, 2)]
+        >>> agents = Behavior(HardMax(), 50.0)
+        >>> def learn(model, shown):
+        ...     return fit(model, shown, agents, terms=("transitions",))
+        >>> fit_goals(ObstacleGrid(grid), [walk], ends, agents, learn).posterior.shape
+        (1, 2)
     """
     check_count(rounds, 1, "rounds")
     posterior, log_likelihood = goal_posterior(model, trajectories, candidates, behavior)
@@ -134,7 +182,13 @@ def weighted_demonstrations(
     candidates: Sequence[Task],
     posterior: Float[np.ndarray, "trajectories candidates"],
 ) -> Demonstrations:
-    """Return each trajectory as a demonstration of each possible candidate, weighted by the posterior."""
+    """Return each trajectory as a demonstration of each possible candidate, weighted by the posterior.
+
+    Args:
+        trajectories: Their tasks do not matter.
+        candidates: The tasks that may be the goals.
+        posterior: P(g | trajectory).
+    """
     # improbable candidates too: while the pairs stay the same, no function is compiled anew
     pairs = np.argwhere(posterior > 0)
     demos = gather([trajectories[index]._replace(task=int(candidate)) for index, candidate in pairs], candidates)

@@ -51,14 +51,23 @@ AXIS = "tasks"
 
 
 class Parameters(NamedTuple):
-    """All that is learned: the parameters of the transition model and of behavior."""
+    """All that is learned.
+
+    Attributes:
+        model: The parameters of the transition model.
+        behavior: Those of behavior.
+    """
 
     model: Tree
     behavior: BehaviorParameters
 
 
 class Problem(eqx.Module):
-    """All that the objective depends on besides the parameters; arguments as for `fit`."""
+    """All that the objective depends on besides the parameters.
+
+    Attributes:
+        model, behavior, demonstrations, prior, terms, options, tempering: As the arguments of `fit`.
+    """
 
     model: TransitionModel
     behavior: BehaviorModel
@@ -80,16 +89,37 @@ class Problem(eqx.Module):
 
 
 class SolveSummary(NamedTuple):
-    """The solves of some tasks; `unreachable` marks choices in states from which the goal cannot be reached."""
+    """The solves of some tasks.
 
-    sweeps: Int[Array, " tasks"]
-    residual: Float[Array, " tasks"]
-    converged: Bool[Array, " tasks"]
-    unreachable: Bool[Array, "tasks choices"]
+    Attributes:
+        sweeps, residual, converged: As in `Solution`.
+        unreachable: Whether each choice was taken in a state from which the goal cannot be reached.
+    """
+
+    sweeps: Int[Array | np.ndarray, " tasks"]
+    residual: Float[Array | np.ndarray, " tasks"]
+    converged: Bool[Array | np.ndarray, " tasks"]
+    unreachable: Bool[Array | np.ndarray, "tasks choices"]
+
+
+def joined(batches: Sequence[SolveSummary]) -> SolveSummary:
+    """Return the solves of all batches, as NumPy arrays.
+
+    Args:
+        batches: At least one.
+    """
+    return SolveSummary(*(np.concatenate(leaves) for leaves in zip(*batches, strict=True)))
 
 
 class BatchResult(NamedTuple):
-    """The actions' log-likelihood over a batch, the gradient of the loss, the next warm starts, and the solves."""
+    """The evaluation of a batch.
+
+    Attributes:
+        actions: The actions' log-likelihood, in nats.
+        gradient: The gradient of the loss.
+        warm_starts: For the next evaluation.
+        solves: How the solves went.
+    """
 
     actions: Array
     gradient: Tree
@@ -98,9 +128,16 @@ class BatchResult(NamedTuple):
 
 
 class Contribution(NamedTuple):
-    """The actions' log-likelihood over a batch and the gradient of the loss at `parameters`.
+    """What a batch contributes to the objective at some parameters.
 
     `all_states` is false if only the states that mattered before were solved.
+
+    Attributes:
+        parameters: Where it was computed.
+        actions: The actions' log-likelihood, in nats.
+        gradient: The gradient of the loss.
+        solves: How the solves went.
+        all_states: False if only the states that mattered before were solved.
     """
 
     parameters: Tree
@@ -110,7 +147,11 @@ class Contribution(NamedTuple):
     all_states: bool
 
     def change(self, parameters: Tree) -> float:
-        """Return a first-order bound of the change of `actions` up to these parameters; 0 only at the same ones."""
+        """Return a first-order bound of the change of `actions` up to these parameters; 0 only at the same ones.
+
+        Args:
+            parameters: Other parameters.
+        """
         steps = jax.tree.map(np.subtract, parameters, self.parameters)
         if not any(step.any() for step in jax.tree.leaves(steps)):
             return 0.0
@@ -119,9 +160,16 @@ class Contribution(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """The objective, its three parts, the gradient of the loss (minus the objective), and the solves of each batch.
+    """The objective at some parameters.
 
     `contributions` are those of the batches, for the next evaluation to reuse; none where the plan does not reuse.
+
+    Attributes:
+        objective: The sum of the three parts, in nats.
+        actions, transitions, prior: The parts.
+        gradient: The gradient of the loss, which is minus the objective.
+        solves: How the solves of each batch went.
+        contributions: Those of the batches, for the next evaluation to reuse; none where the plan does not reuse.
     """
 
     objective: float
@@ -132,11 +180,6 @@ class Evaluation(NamedTuple):
     solves: list[SolveSummary]
     contributions: list[Contribution]
 
-    @property
-    def terms(self) -> tuple[float, float, float, float]:
-        """Return the objective and its parts."""
-        return self[:4]
-
 
 class Objective:
     """The objective of a problem, evaluated batch by batch.
@@ -145,24 +188,25 @@ class Objective:
     same arguments.
 
     Args:
-        problem: the problem.
-        plan: the size of batches (see `plan_batches`), by default for a single device and 2 GiB.
-        mesh: the devices over which tasks are spread (see `tasks_mesh`); None for one device.
+        problem: The problem.
+        plan: The size of batches (see `plan_batches`), by default for a single device and 2 GiB.
+        mesh: The devices over which tasks are spread (see `tasks_mesh`); None for one device.
 
     Raises:
-        InputError: if processes have different problems.
+        InputError: If processes have different problems.
     """
 
     def __init__(self, problem: Problem, plan: BatchPlan | None = None, mesh: Mesh | None = None):
         self.problem, self.mesh = problem, mesh
         self.plan = plan or plan_batches(problem.model, problem.solver, len(problem.demonstrations.tasks.terminal))
-        _check_same_problem(problem, mesh)
+        if jax.process_count() > 1:  # copies tell whether all processes have the same problem
+            _replicate(np.frombuffer(bytes.fromhex(fingerprint(problem)), np.uint8), mesh)
         uses_actions = "actions" in problem.terms
         batches = make_batches(problem.demonstrations, problem.behavior, self.plan.size) if uses_actions else []
         self.batches = [_shard(batch, mesh) for batch in batches]
         # batches and arrivals replace the demonstrations
         self.constants = eqx.tree_at(
-            lambda problem: (problem.demonstrations, problem.behavior.person),
+            lambda all: (all.demonstrations, all.behavior.person),
             problem,
             (None, None),
             is_leaf=lambda leaf: leaf is None,
@@ -188,7 +232,11 @@ class Objective:
         return self.place([cold]) * len(self.batches)
 
     def place(self, starts: list[WarmStart]) -> list[WarmStart]:
-        """Return warm starts on the devices of their tasks."""
+        """Return warm starts on the devices of their tasks.
+
+        Args:
+            starts: Of each batch.
+        """
         return [_shard(start, self.mesh) for start in starts]
 
     def evaluate(
@@ -205,11 +253,11 @@ class Objective:
 
         Args:
             parameters: θ.
-            warm_starts: where the solves start: `cold_starts()`, or the second value of an earlier call.
-            tolerance: that of the solves, where the solver leaves it open.
-            known: the contributions of an earlier evaluation with the same tolerance. Those at the same θ are reused.
-            reuse_below: reuse contributions that change by less than this, to first order (nats).
-            partial_below: solve only the states that mattered where a contribution changes by less than this fraction
+            warm_starts: Where the solves start: `cold_starts()`, or the second value of an earlier call.
+            tolerance: That of the solves, where the solver leaves it open.
+            known: The contributions of an earlier evaluation with the same tolerance. Those at the same θ are reused.
+            reuse_below: Reuse contributions that change by less than this, to first order (nats).
+            partial_below: Solve only the states that mattered where a contribution changes by less than this fraction
                 of it.
 
         Returns:
@@ -256,7 +304,15 @@ class Objective:
     def evaluate_batch(
         self, problem: Problem, parameters: Tree, batch: Batch, start: WarmStart, all_states: bool
     ) -> BatchResult:
-        """Evaluate the actions' part of a batch; if not `all_states`, solve only the states that mattered before."""
+        """Evaluate the actions' part of a batch; if not `all_states`, solve only the states that mattered before.
+
+        Args:
+            problem: The problem, on the devices.
+            parameters: θ, on the devices.
+            batch: The tasks.
+            start: Where their solves start.
+            all_states: Whether all states are solved.
+        """
         if self.mesh is None:
             return _batch_result(problem, parameters, batch, start, np.asarray(all_states))
         result = _sharded_batch_result(problem, parameters, batch, start, np.asarray(all_states), self.mesh)
@@ -273,6 +329,9 @@ def tasks_mesh(devices: Sequence[Any] | None = None) -> Mesh:
 
     Args:
         devices: JAX devices; by default all devices of all processes.
+
+    Returns:
+        The mesh, with one axis.
 
     Example:
         >>> tasks_mesh(jax.devices()[:1]).size
@@ -404,17 +463,8 @@ def _shard(tree: Tree, mesh: Mesh | None) -> Tree:
     return jax.tree.map(put, tree)
 
 
-def _check_same_problem(problem: Problem, mesh: Mesh | None) -> None:
-    if jax.process_count() > 1:
-        _replicate(np.frombuffer(bytes.fromhex(fingerprint(problem)), np.uint8), mesh)
-
-
 def _with_tolerance(problem: Problem, tolerance: float | Array | None) -> Problem:
     if tolerance is None:
         return problem
-    return eqx.tree_at(
-        lambda problem: problem.options.solver.tolerance,
-        problem,
-        jnp.asarray(tolerance),
-        is_leaf=lambda leaf: leaf is None,
-    )
+    replaced = jnp.asarray(tolerance)
+    return eqx.tree_at(lambda each: each.options.solver.tolerance, problem, replaced, is_leaf=lambda leaf: leaf is None)

@@ -7,7 +7,8 @@ minus the objective. To add an optimizer, subclass `Optimizer`.
 
 import abc
 import warnings
-from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,29 +22,27 @@ from sidestep._typing import Tree
 Vector = Float[np.ndarray, " parameters"]
 
 
-@runtime_checkable
-class Loss(Protocol):
-    """A function to minimize."""
+Loss = Callable[..., tuple[float, Vector]]
+"""A function `loss(x, *, approximate=False)` to minimize, which returns its value and gradient at x.
 
-    def __call__(self, x: Vector, *, approximate: bool = False) -> tuple[float, Vector]:
-        """Return the loss and its gradient at x.
-
-        Args:
-            x: the parameters.
-            approximate: allow a cheaper value, which omits what has hardly changed since the last evaluation.
-        """
-        ...
+`approximate` allows a cheaper value, which omits what has hardly changed since the last evaluation.
+"""
 
 
 class Optimizer(eqx.Module):
     """An iterative method that minimizes a loss.
 
     Attributes:
-        max_iterations: the largest number of steps.
-        tolerance: the fit has converged when `convergence` is at most this.
-        solve_tolerance: the tolerance of the solves of large maps until the optimizer has converged with it.
-        approximates: whether `step` asks for approximate losses.
-        measure: a format for the number that `convergence` returns.
+        max_iterations: The largest number of steps.
+        tolerance: The fit has converged when `convergence` is at most this.
+        solve_tolerance: The tolerance of the solves of large maps until the optimizer has converged with it.
+        approximates: Whether `step` asks for approximate losses.
+        measure: A format for the number that `convergence` returns.
+        resumes_with: The attributes that an interrupted fit must share with the one that resumes it.
+
+    Example:
+        >>> isinstance(LBFGS(), Optimizer)
+        True
     """
 
     max_iterations: eqx.AbstractVar[int]
@@ -51,35 +50,56 @@ class Optimizer(eqx.Module):
     solve_tolerance: ClassVar[float] = 1e-7
     approximates: ClassVar[bool] = False
     measure: ClassVar[str] = "the largest gradient is {:.2g}"
+    resumes_with: ClassVar[tuple[str, ...]] = ()
 
     @property
-    @abc.abstractmethod
     def key(self) -> str:
         """Return what an interrupted fit must share with the one that resumes it."""
+        return f"{type(self).__name__} {[getattr(self, name) for name in self.resumes_with]}"
 
     @abc.abstractmethod
     def init(self, x: Vector) -> Tree:
-        """Return the state before the first step from x."""
+        """Return the state before the first step from x.
+
+        Args:
+            x: The start.
+
+        Returns:
+            Any tree of arrays.
+        """
 
     @abc.abstractmethod
     def step(self, loss: Loss, x: Vector, value: float, gradient: Vector, state: Tree) -> tuple[Vector, Tree] | None:
         """Return the next point and state, or None if no step decreases the loss.
 
         Args:
-            loss: the function to minimize.
-            x: the present point.
-            value: the loss at x.
-            gradient: the gradient of the loss at x.
-            state: the state that `init` or the last step returned.
+            loss: The function to minimize.
+            x: The present point.
+            value: The loss at x.
+            gradient: The gradient of the loss at x.
+            state: The state that `init` or the last step returned.
+
+        Returns:
+            The next point and state, or None.
         """
 
     def convergence(self, gradient: Vector, state: Tree) -> float:
-        """Return the number that `terminate` compares with the tolerance: the largest component of the gradient."""
+        """Return the number that `terminate` compares with the tolerance: the largest component of the gradient.
+
+        Args:
+            gradient: The gradient of the loss at the present point.
+            state: The present state.
+        """
         del state
         return float(np.abs(gradient).max())
 
     def terminate(self, gradient: Vector, state: Tree) -> bool:
-        """Return whether the optimizer has converged at a point with this gradient."""
+        """Return whether the optimizer has converged at a point with this gradient.
+
+        Args:
+            gradient: The gradient of the loss at the present point.
+            state: The present state.
+        """
         return self.convergence(gradient, state) <= self.tolerance
 
 
@@ -90,19 +110,23 @@ class LBFGS(Optimizer):
     the search fails; 2. where no point is better, the memory is cleared and the search is repeated once.
 
     Attributes:
-        max_iterations: the largest number of steps.
-        tolerance: the fit has converged when no component of the gradient is larger (nats per unit of θ).
-        memory_size: the number of steps from which the curvature is estimated.
+        max_iterations: The largest number of steps.
+        tolerance: The fit has converged when no component of the gradient is larger (nats per unit of θ).
+        memory_size: The number of steps from which the curvature is estimated.
+
+    Example:
+        >>> def loss(x, *, approximate=False):
+        ...     return float(x @ x), 2 * x
+        >>> optimizer, x = LBFGS(), np.array([1.0])
+        >>> after, _ = optimizer.step(loss, x, *loss(x), optimizer.init(x))
+        >>> bool(abs(after[0]) < 1)
+        True
     """
 
     max_iterations: int = eqx.field(default=500, static=True)
     tolerance: float = eqx.field(default=1e-4, static=True)
     memory_size: int = eqx.field(default=20, static=True)
-
-    @property
-    def key(self) -> str:
-        """Return what an interrupted fit must share with the one that resumes it."""
-        return f"L-BFGS {self.memory_size}"
+    resumes_with: ClassVar[tuple[str, ...]] = ("memory_size",)
 
     def init(self, x: Vector) -> Tree:
         """Return an empty memory."""
@@ -125,19 +149,23 @@ class Adam(Optimizer):
     It needs no line search, and so works with the fixed-policy gradient too.
 
     Attributes:
-        max_iterations: the number of steps, unless it converges before; the length of the cosine.
-        learning_rate: the first learning rate, in units of θ.
-        tolerance: the fit has converged when no component of the gradient is larger (nats per unit of θ).
+        max_iterations: The number of steps, unless it converges before; the length of the cosine.
+        learning_rate: The first learning rate, in units of θ.
+        tolerance: The fit has converged when no component of the gradient is larger (nats per unit of θ).
+
+    Example:
+        >>> def loss(x, *, approximate=False):
+        ...     return float(x @ x), 2 * x
+        >>> optimizer, x = Adam(), np.array([1.0])
+        >>> after, _ = optimizer.step(loss, x, *loss(x), optimizer.init(x))
+        >>> bool(abs(after[0]) < 1)
+        True
     """
 
     max_iterations: int = eqx.field(default=2000, static=True)
     learning_rate: float = eqx.field(default=0.2, static=True)
     tolerance: float = eqx.field(default=1e-2, static=True)
-
-    @property
-    def key(self) -> str:
-        """Return what an interrupted fit must share with the one that resumes it."""
-        return f"Adam {self.learning_rate} {self.max_iterations}"
+    resumes_with: ClassVar[tuple[str, ...]] = ("learning_rate", "max_iterations")
 
     def _transformation(self) -> Any:
         import optax
@@ -174,11 +202,19 @@ class Rprop(Optimizer):
     4. A trial without some parameters is evaluated approximately first, and again if it is acceptable.
 
     Attributes:
-        max_iterations: the largest number of steps; each may take several evaluations.
-        tolerance: the fit has converged when the gradient predicts a smaller gain of the next step (nats, all
+        max_iterations: The largest number of steps; each may take several evaluations.
+        tolerance: The fit has converged when the gradient predicts a smaller gain of the next step (nats, all
             parameters together).
-        initial_step: the first step size of each parameter, in units of θ.
-        max_step: the largest step size, in units of θ.
+        initial_step: The first step size of each parameter, in units of θ.
+        max_step: The largest step size, in units of θ.
+
+    Example:
+        >>> def loss(x, *, approximate=False):
+        ...     return float(x @ x), 2 * x
+        >>> optimizer, x = Rprop(), np.array([1.0])
+        >>> after, _ = optimizer.step(loss, x, *loss(x), optimizer.init(x))
+        >>> bool(abs(after[0]) < 1)
+        True
     """
 
     max_iterations: int = eqx.field(default=500, static=True)
@@ -188,11 +224,7 @@ class Rprop(Optimizer):
     solve_tolerance: ClassVar[float] = 1e-5
     approximates: ClassVar[bool] = True
     measure: ClassVar[str] = "the next step promises {:.2g} nats"
-
-    @property
-    def key(self) -> str:
-        """Return what an interrupted fit must share with the one that resumes it."""
-        return f"Rprop {self.initial_step} {self.max_step}"
+    resumes_with: ClassVar[tuple[str, ...]] = ("initial_step", "max_step")
 
     def init(self, x: Vector) -> Vector:
         """Return the first step sizes."""
@@ -287,17 +319,12 @@ def _line_search(direction: Vector, loss: Loss, x: Vector, value: float, gradien
         points[value] = point
         return value
 
+    def gradient_at(point: Vector) -> Vector:
+        return loss(point.astype(x.dtype))[1]
+
     with warnings.catch_warnings():
         # a search without a point of the required curvature warns; its best point may be better than x all the same
         warnings.simplefilter("ignore", RuntimeWarning)
-        line_search(
-            value_at,
-            lambda point: loss(point.astype(x.dtype))[1],
-            x,
-            direction,
-            gfk=gradient,
-            old_fval=value,
-            maxiter=20,
-        )
+        line_search(value_at, gradient_at, x, direction, gfk=gradient, old_fval=value, maxiter=20)
     best = min(points)
     return None if best >= value else points[best]

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sidestep._typing import FloatTree
-from sidestep.errors import InputError
+from sidestep.errors import check
 
 Numbers = float | Float[Array | np.ndarray, "..."]
 MIN_PROBABILITY = 1 / 1020
@@ -34,8 +34,8 @@ def _as_floats(numbers: Numbers) -> Float[Array, "..."]:
 
 
 def _checked_strength(strength: float) -> Float[Array, ""]:
-    if not (np.isfinite(strength) and strength >= 0):
-        raise InputError(f"expected a finite number, at least 0, found {strength}", field="strength")
+    valid = np.isfinite(strength) and strength >= 0
+    check(valid, f"expected a finite number, at least 0, found {strength}", field="strength")
     return _as_floats(strength)
 
 
@@ -43,6 +43,10 @@ class Prior(eqx.Module):
     """A density over parameters, up to a constant.
 
     To add a prior, subclass it and write `log_density` in JAX.
+
+    Example:
+        >>> isinstance(Normal(), Prior)
+        True
     """
 
     @abc.abstractmethod
@@ -67,7 +71,7 @@ class Normal(Prior):
         variance: σ², likewise, above 0.
 
     Raises:
-        InputError: for a mean that is not finite, or a variance that is not finite and above 0.
+        InputError: For a mean that is not finite, or a variance that is not finite and above 0.
 
     Example:
         >>> float(Normal(mean=-2.0, variance=2.0).log_density(jnp.array([0.0])))
@@ -79,10 +83,9 @@ class Normal(Prior):
 
     def __init__(self, mean: Numbers = -2.0, variance: Numbers = 2.0):
         self.mean, self.variance = _as_floats(mean), _as_floats(variance)
-        if not np.isfinite(self.mean).all():
-            raise InputError("expected finite numbers", field="prior mean")
-        if not (np.isfinite(self.variance).all() and (np.asarray(self.variance) > 0).all()):
-            raise InputError("expected numbers above 0", field="prior variance")
+        check(np.isfinite(self.mean).all(), "expected finite numbers", field="prior mean")
+        positive = np.isfinite(self.variance) & (np.asarray(self.variance) > 0)
+        check(positive.all(), "expected numbers above 0", field="prior variance")
 
     def log_density(self, parameters: FloatTree) -> Float[Array, ""]:
         """Return −Σ (θ − b)²/(2σ²) over all parameters."""
@@ -103,24 +106,23 @@ def sensor_prior(
     Args:
         probability: p = P(blocked) of each cell, from 0 to 1; NaN for a cell that the sensor did not observe. It is
             clipped to [`MIN_PROBABILITY`, 1 − `MIN_PROBABILITY`].
-        variance: the variance of the logit, above 0: one number or one per cell; NaN or infinite for unobserved cells.
-        unobserved: the prior of the logits of unobserved cells.
+        variance: The variance of the logit, above 0: one number or one per cell; NaN or infinite for unobserved cells.
+        unobserved: The prior of the logits of unobserved cells.
 
     Returns:
         A prior with one mean and one variance per cell.
 
     Raises:
-        InputError: for probabilities outside [0, 1] or variances that are not above 0.
+        InputError: For probabilities outside [0, 1] or variances that are not above 0.
 
     Example:
         >>> sensor_prior(np.array([[0.5, np.nan]]), 1.0, Normal(-2.0, 4.0)).mean.tolist()
         [0.0, -2.0]
     """
     variances = np.broadcast_to(np.asarray(variance, dtype=np.float64), probability.shape)
-    if (variances <= 0).any():
-        raise InputError(f"expected numbers above 0, found {variances[variances <= 0][0]}", field="sensor variance")
-    if ((probability < 0) | (probability > 1)).any():
-        raise InputError("expected numbers from 0 to 1", field="sensor map")
+    least = np.nanmin(variances, initial=np.inf)
+    check(least > 0, f"expected numbers above 0, found {least}", field="sensor variance")
+    check(not ((probability < 0) | (probability > 1)).any(), "expected numbers from 0 to 1", field="sensor map")
     observed = ~np.isnan(probability) & np.isfinite(variances)
     p = np.clip(np.where(observed, probability, 0.5), MIN_PROBABILITY, 1 - MIN_PROBABILITY)
     mean, spread = (np.broadcast_to(each, p.size) for each in (unobserved.mean, unobserved.variance))
@@ -132,12 +134,17 @@ class GaussianMRF(Prior):
     """A Gaussian Markov random field: neighboring parameters are similar.
 
     Attributes:
-        independent: the prior of each parameter without its neighbors.
-        pairs: the indices of neighboring parameters; `borders(grid)` for the cells of a grid.
+        independent: The prior of each parameter without its neighbors.
+        pairs: The indices of neighboring parameters; `borders(grid)` for the cells of a grid.
         strength: s, in nats, at least 0; neighbors differ by about 1/√(2s).
 
     Raises:
-        InputError: for a strength below 0 or not finite.
+        InputError: For a strength below 0 or not finite.
+
+    Example:
+        >>> prior = GaussianMRF(Normal(0.0, 1.0), np.array([[0, 1]]), strength=2.0)
+        >>> float(prior.log_density(jnp.array([0.0, 1.0])))
+        -2.5
     """
 
     independent: Normal
@@ -155,12 +162,17 @@ class WallPrior(Prior):
     """Walls are lines: a cell between two blocked cells of its row or column is more probably blocked.
 
     Attributes:
-        independent: the prior of each cell's logit without its neighbors.
-        known: the state of each cell as in `Grid.known`; known cells are part of lines.
+        independent: The prior of each cell's logit without its neighbors.
+        known: The state of each cell as in `Grid.known`; known cells are part of lines.
         strength: s, in nats, at least 0: the gain of one blocked cell in a line.
 
     Raises:
-        InputError: for a strength below 0 or not finite.
+        InputError: For a strength below 0 or not finite.
+
+    Example:
+        >>> prior = WallPrior(Normal(0.0, 1.0), np.array([[1, -1, 1]]), strength=1.0)  # between two walls
+        >>> float(prior.log_density(jnp.zeros(3)))
+        0.5
     """
 
     independent: Normal
@@ -185,8 +197,13 @@ class FreeCellEvidence(Prior):
     """Evidence that cells are free: an agent was observed in them, at the start of a trajectory for example.
 
     Attributes:
-        prior: the prior without this evidence.
-        counts: the number of observations of an agent in each cell, 0 or more; 0 for known cells.
+        prior: The prior without this evidence.
+        counts: The number of observations of an agent in each cell, 0 or more; 0 for known cells.
+
+    Example:
+        >>> prior = FreeCellEvidence(Normal(0.0, 1.0), jnp.array([1.0, 0.0]))
+        >>> round(float(prior.log_density(jnp.zeros(2))), 3)  # ln(1/2)
+        -0.693
     """
 
     prior: Prior

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int
 
-from sidestep.errors import InputError
+from sidestep.errors import check
 from sidestep.io.gridding import Moves
 from sidestep.io.walks import Walks
 from sidestep.maps.config import BehaviorConfig
@@ -20,15 +20,26 @@ class WalkAnnotations:
         person_column: The column that names the person of each walk. Each person then has their own β, and all are
             pooled.
         goal_candidates: The goals that walks may have had. The walks then do not name their own.
+
+    Example:
+        >>> WalkAnnotations(person_column="person").goal_candidates is None
+        True
     """
 
     person_column: str | None = None
     goal_candidates: GoalCandidates | None = None
 
     def check(self, config: BehaviorConfig, resume: bool) -> None:
-        """Raise `InputError` for settings that exclude each other.
+        """Check that settings do not exclude each other.
 
         With unknown goals the behavior is known and the same for all walks, and there is no checkpoint.
+
+        Args:
+            config: The behavior to learn with.
+            resume: Whether a checkpoint is resumed.
+
+        Raises:
+            InputError: If they do.
         """
         if self.goal_candidates is None:
             return
@@ -41,11 +52,14 @@ class WalkAnnotations:
             "horizon": config.horizon is not None,
         }
         for field, is_set in refused.items():
-            if is_set:
-                raise InputError("cannot be combined with candidates for goals", field=field)
+            check(not is_set, "cannot be combined with candidates for goals", field=field)
 
     def without_goals(self, walks: Walks) -> Walks:
-        """Return the walks; with candidates for goals, each walk's own goal is its last position."""
+        """Return the walks; with candidates for goals, each walk's own goal is its last position.
+
+        Args:
+            walks: The walks.
+        """
         if self.goal_candidates is None:
             return walks
         return replace(walks, goals=walks.positions[walks.offsets[1:] - 1])
@@ -57,6 +71,11 @@ NO_ANNOTATIONS = WalkAnnotations()
 
 def persons_of(walks: Walks, moves: Moves, column: str) -> tuple[list[object], Int[np.ndarray, " trajectories"]]:
     """Return the names of the persons, and the index of the person of each trajectory.
+
+    Args:
+        walks: The walks.
+        moves: Their moves.
+        column: The column that names the person of each walk.
 
     Raises:
         InputError: As `Walks.per_walk` does.

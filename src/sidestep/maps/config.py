@@ -5,10 +5,9 @@ line can show the defaults without delay.
 """
 
 from dataclasses import dataclass, field
-from math import isfinite
 from typing import Any, Literal, get_args
 
-from sidestep.errors import InputError, check_count
+from sidestep.errors import check, check_count, check_positive
 from sidestep.tabular.reward import Reward
 
 BackupName = Literal["boltzmann", "max", "logsumexp", "mellowmax"]
@@ -32,6 +31,10 @@ class BehaviorConfig:
 
     Raises:
         InputError: For an unknown backup or parameter.
+
+    Example:
+        >>> BehaviorConfig(beta=5.0, learn=("lapse",)).backup
+        'boltzmann'
     """
 
     backup: BackupName = "boltzmann"
@@ -56,6 +59,10 @@ class PriorConfig:
         mean: The mean of each logit; 0 stands for P(blocked) = 1/2.
         variance: The variance of each logit, above 0.
         wall_prior: The weight of `WallPrior` in nats, at least 0: the worth of a blocked cell between two others.
+
+    Example:
+        >>> PriorConfig(mean=0.0).variance
+        8.0
     """
 
     mean: float = -1.5
@@ -76,6 +83,10 @@ class FitConfig:
 
     Raises:
         InputError: For a value out of these ranges.
+
+    Example:
+        >>> FitConfig(terms="actions").gradient
+        'exact'
     """
 
     terms: Terms = "both"
@@ -87,10 +98,9 @@ class FitConfig:
     def __post_init__(self) -> None:
         _check_choice(self.terms, Terms, "terms")
         _check_choice(self.gradient, GradientName, "gradient")
-        if self.max_iterations is not None and self.max_iterations < 1:
-            raise InputError(f"expected at least 1, found {self.max_iterations}", field="max_iterations")
-        if not (isfinite(self.memory) and self.memory > 0):
-            raise InputError(f"expected GiB above 0, found {self.memory}", field="memory")
+        if self.max_iterations is not None:
+            check_count(self.max_iterations, 1, "max_iterations")
+        check_positive(self.memory, "memory")
 
 
 @dataclass(frozen=True)
@@ -149,5 +159,4 @@ class SimulationConfig:
 
 
 def _check_choice(value: str, choices: Any, field: str) -> None:
-    if value not in get_args(choices):
-        raise InputError(f"expected one of {', '.join(get_args(choices))}, found {value!r}", field=field)
+    check(value in get_args(choices), f"expected one of {', '.join(get_args(choices))}, found {value!r}", field=field)

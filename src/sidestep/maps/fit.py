@@ -12,33 +12,50 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sidestep.inference.fit import Fit, fit
-from sidestep.inference.maximize import Progress
+from sidestep.inference.fit import Fit, Progress, fit
 from sidestep.inference.optimizers import LBFGS, Adam, Optimizer, Rprop
-from sidestep.inference.priors import FreeCellEvidence, Normal, Prior, WallPrior
-from sidestep.maps.config import BehaviorConfig, FitConfig, MapConfig, PriorConfig, Terms
+from sidestep.inference.priors import FreeCellEvidence, Normal, WallPrior
+from sidestep.io.demonstrations import demonstrations_from_moves
+from sidestep.io.gridding import Moves
+from sidestep.maps.config import BehaviorConfig, FitConfig, MapConfig
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import BACKUPS, Behavior
 from sidestep.tabular.behavior_model import BehaviorModel, behavior_model
 from sidestep.tabular.demonstrations import Demonstrations
-from sidestep.tabular.grid import Cell
-from sidestep.tabular.likelihood import Term
+from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.likelihood import ALL_TERMS
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.solve import SolveOptions
 
-TERMS: dict[Terms, tuple[Term, ...]] = {
-    "both": ("actions", "transitions"),
-    "actions": ("actions",),
-    "transitions": ("transitions",),
-}
 _BLOCKED_LOGIT = 8.0
 """The first logit of an unvisited cell of a large map: some 3,000 tries, longer than most detours."""
 _TOLERANCE_PER_MOVE = 1e-3
 """A large map is learned when the next step promises less than this for each move of the walks (nats)."""
 
 
+def demonstrations_of(moves: Moves, grid: Grid, config: MapConfig) -> Demonstrations:
+    """Return the demonstrations of gridded walks with the reward of a configuration.
+
+    Args:
+        moves: From `grid_walks`.
+        grid: The map.
+        config: The configuration, for its reward.
+
+    Raises:
+        InputError: As `demonstrations_from_moves` does.
+    """
+    return demonstrations_from_moves(moves, grid, discount=config.reward.discount, step_cost=config.reward.step_cost)
+
+
 def behavior_of(config: BehaviorConfig) -> Behavior:
-    """Return the behavior that a configuration describes; raise `InputError` for a β or lapse out of range."""
+    """Return the behavior that a configuration describes.
+
+    Args:
+        config: The configuration.
+
+    Raises:
+        InputError: For a β or lapse out of range.
+    """
     return Behavior(BACKUPS[config.backup](), config.beta, config.lapse)
 
 
@@ -63,7 +80,7 @@ def fit_map(
     behavior: BehaviorModel | None = None,
     initialize: bool = True,
     callback: Callable[[Progress], None] | None = None,
-    checkpoint: Path | None = None,
+    checkpoint: str | Path | None = None,
     resume: bool = False,
 ) -> Fit[ObstacleGrid]:
     """Fit an obstacle grid to demonstrations.
@@ -87,7 +104,9 @@ def fit_map(
     """
     behavior = behavior or behavior_model_of(config)
     weights = np.asarray(demonstrations.weights)
-    prior = _prior(config.prior, model, cell_prior)
+    prior = cell_prior or Normal(config.prior.mean, config.prior.variance)
+    if config.prior.wall_prior:
+        prior = WallPrior(prior, model.known, config.prior.wall_prior)
     if config.fit.terms != "actions":
         prior = FreeCellEvidence(prior, to_jax(_first_cells(model, demonstrations, weights)))
     optimizer = optimizer_for(config.fit, model.graph.states, round(float(weights.sum())))
@@ -101,7 +120,7 @@ def fit_map(
         behavior,
         prior=prior,
         tempering=config.behavior.tempering,
-        terms=TERMS[config.fit.terms],
+        terms=ALL_TERMS if config.fit.terms == "both" else (config.fit.terms,),
         options=SolveOptions(gradient=config.fit.gradient, horizon=config.behavior.horizon),
         optimizer=optimizer,
         memory=config.fit.memory * 2**30,
@@ -132,7 +151,11 @@ def optimizer_for(config: FitConfig, cells: int, moves: int) -> Optimizer:
 
 
 def max_iterations(config: FitConfig) -> int:
-    """Return the most iterations that a fit may take, whatever the map."""
+    """Return the most iterations that a fit may take, whatever the map.
+
+    Args:
+        config: The configuration of the fit.
+    """
     return max(optimizer_for(config, cells, moves=1).max_iterations for cells in (0, config.large_map))
 
 
@@ -143,11 +166,6 @@ def _first_cells(
     first = demonstrations.first_moves()
     counts = np.bincount(np.asarray(demonstrations.states)[first], weights[first], minlength=model.graph.states)
     return np.where(np.asarray(model.known).ravel() == Cell.UNKNOWN, counts, 0.0)
-
-
-def _prior(config: PriorConfig, model: ObstacleGrid, cell_prior: Normal | None) -> Prior:
-    cell_prior = cell_prior or Normal(config.mean, config.variance)
-    return WallPrior(cell_prior, model.known, config.wall_prior) if config.wall_prior else cell_prior
 
 
 def _block_unvisited(

@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sidestep.errors import InputError
-from sidestep.inference.fit import Fit
+from sidestep.errors import check
+from sidestep.inference.fit import Fit, Progress
 from sidestep.inference.goals import GoalFit, fit_goals
-from sidestep.inference.maximize import Progress
 from sidestep.inference.priors import Normal
 from sidestep.io.demonstrations import connected_regions
 from sidestep.io.gridding import Moves
@@ -32,6 +31,10 @@ class GoalCandidates:
     Attributes:
         positions: x, y of each candidate in metres, two candidates at least.
         source: The file, for error messages.
+
+    Example:
+        >>> len(GoalCandidates(np.array([[0.5, 0.5], [2.5, 0.5]])).positions)
+        2
     """
 
     positions: Float[np.ndarray, "candidates 2"]
@@ -69,21 +72,39 @@ class GoalPosterior(NamedTuple):
 def read_goal_candidates(path: str | Path) -> GoalCandidates:
     """Read a table with columns `goal_x`, `goal_y` in metres, one row a candidate.
 
+    Args:
+        path: A CSV or Parquet file.
+
+    Returns:
+        The candidates.
+
     Raises:
         InputError: For columns that are missing or not finite, and fewer than two rows.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "goals.csv"
+        ...     _ = path.write_text("goal_x,goal_y\\n0.5,0.5\\n2.5,0.5\\n")
+        ...     read_goal_candidates(path).positions.tolist()
+        [[0.5, 0.5], [2.5, 0.5]]
     """
     from sidestep.io.tables import check_columns, finite_column, read_table
 
     table = read_table(path)
     check_columns(table, ("goal_x", "goal_y"), str(path))
     positions = np.stack([finite_column(table, name, str(path)) for name in ("goal_x", "goal_y")], axis=1)
-    if len(positions) < 2:
-        raise InputError(f"expected at least 2 candidates, found {len(positions)}", source=path)
+    check(len(positions) > 1, f"expected at least 2 candidates, found {len(positions)}", source=path)
     return GoalCandidates(positions, str(path))
 
 
 def candidate_states(candidates: GoalCandidates, grid: Grid, moves: Moves) -> Int[np.ndarray, " candidates"]:
     """Return the states of candidates on a grid.
+
+    Args:
+        candidates: Their positions.
+        grid: The map.
+        moves: The moves of all walks.
 
     Raises:
         InputError: With the row, for positions outside the map, in known obstacles or separated by these from a
@@ -103,8 +124,7 @@ def candidate_states(candidates: GoalCandidates, grid: Grid, moves: Moves) -> In
 
 
 def _refuse(bad: Bool[np.ndarray, " candidates"], candidates: GoalCandidates, expected: str) -> None:
-    if bad.any():
-        raise InputError(expected, source=candidates.source, row=int(np.argmax(bad)) + 1, field="goal_x, goal_y")
+    check(not bad.any(), expected, source=candidates.source, row=int(np.argmax(bad)) + 1, field="goal_x, goal_y")
 
 
 def fit_with_unknown_goals(
@@ -129,6 +149,9 @@ def fit_with_unknown_goals(
         cell_prior: The prior of the cells' logits; by default that of the configuration.
         callback: Called with the progress of every iteration of every fit.
 
+    Returns:
+        The map, and the posterior over the goal of each walk.
+
     Raises:
         InputError: As `candidate_states` and `fit_goals` do.
     """
@@ -147,7 +170,13 @@ def fit_with_unknown_goals(
 
 
 def write_goal_posterior(path: Path, posterior: GoalPosterior, grid: Grid) -> None:
-    """Write a table of `walk, goal_x, goal_y, probability`, one row for each walk and candidate."""
+    """Write a table of `walk, goal_x, goal_y, probability`, one row for each walk and candidate.
+
+    Args:
+        path: A CSV or Parquet file.
+        posterior: The posterior.
+        grid: The map, for the positions of candidates.
+    """
     import pyarrow as pa
 
     from sidestep.io.tables import write_table

@@ -1,4 +1,4 @@
-"""Learning a map from walks: the one function that makes learned maps.
+"""Learning a map from walks: the one function that makes learned maps, and the record of how it made one.
 
 The command line, the comparison, the demo and the benchmarks call `learn_map`.
 """
@@ -6,26 +6,22 @@ The command line, the comparison, the demo and the benchmarks call `learn_map`.
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
-from sidestep.errors import InputError
-from sidestep.inference.fit import Fit
-from sidestep.inference.maximize import Progress
-from sidestep.inference.priors import Normal
-from sidestep.io.demonstrations import demonstrations_from_moves
+from sidestep.errors import check
+from sidestep.inference.fit import Fit, Progress
 from sidestep.io.gridding import Moves, grid_walks
 from sidestep.io.walks import Walks
 from sidestep.maps.annotations import NO_ANNOTATIONS, WalkAnnotations, persons_of
 from sidestep.maps.config import MapConfig
-from sidestep.maps.fit import behavior_model_of, fit_map
+from sidestep.maps.fit import behavior_model_of, demonstrations_of, fit_map
 from sidestep.maps.goal_candidates import GoalPosterior, fit_with_unknown_goals
 from sidestep.maps.learned_map import LearnedMap
-from sidestep.maps.learning import DataCounts, Learning
-from sidestep.maps.selection import select_behavior
+from sidestep.maps.selection import Selection, select_behavior
 from sidestep.maps.sensors import SensorMap, cell_prior, seen_cells
 from sidestep.tabular.demonstrations import Demonstrations, split_by_person
 from sidestep.tabular.grid import Cell, Grid
@@ -33,6 +29,82 @@ from sidestep.tabular.models import ObstacleGrid
 
 _NEGLIGIBLE_PREFERENCE = 0.05
 """A difference of two actions' log-probabilities (nats) that says next to nothing."""
+
+
+@dataclass(frozen=True)
+class DataCounts:
+    """The size of what a map was learned from.
+
+    Attributes:
+        walks, moves: What counted.
+        walks_left_out: Walks that start at their goal.
+        moves_left_out: Moves after the arrival at the goal.
+        goals: Different goals.
+        unknown_cells: Cells that had to be learned.
+        sensed_cells: Of these, cells that sensors have seen.
+    """
+
+    walks: int
+    walks_left_out: int
+    moves: int
+    moves_left_out: int
+    goals: int
+    unknown_cells: int
+    sensed_cells: int
+
+
+@dataclass(frozen=True, eq=False)
+class Learning:
+    """How a map was learned.
+
+    Attributes:
+        config: The configuration, with what the selection chose.
+        fit: The fit: model, behavior, history, convergence.
+        demonstrations: The moves that counted.
+        data: Their numbers.
+        selection: The selection of the behavior, if there was one.
+        persons: β of each person, where persons were named.
+        goals: The posterior over goals, where walks did not name them.
+        sensor: What sensors had seen.
+        notes: What one should know before one trusts the numbers.
+        resumed: Whether the fit continued from a checkpoint.
+        seconds: The time it took.
+        peak_memory_bytes: The most memory of the process; None where the system does not say.
+    """
+
+    config: MapConfig
+    fit: Fit[ObstacleGrid]
+    demonstrations: Demonstrations
+    data: DataCounts
+    selection: Selection | None
+    persons: dict[str, float]
+    goals: GoalPosterior | None
+    sensor: SensorMap | None
+    notes: tuple[str, ...]
+    resumed: bool
+    seconds: float
+    peak_memory_bytes: int | None
+
+    def summary(self) -> dict[str, Any]:
+        """Return the content of `summary.json`: plain numbers, texts, lists and dictionaries."""
+        behavior = self.fit.behavior.behavior_of()
+        return {
+            "settings": asdict(self.config),
+            "sensor": self.sensor.summary() if self.sensor else None,
+            "behavior": {
+                "beta": float(behavior.beta),
+                "lapse": None if behavior.lapse is None else float(behavior.lapse),
+                **({"persons": self.persons} if self.persons else {}),
+                **({"goals": self.goals.summary()} if self.goals else {}),
+                **(self.selection.summary() if self.selection else {}),
+            },
+            "data": asdict(self.data),
+            "resumed": self.resumed,
+            "notes": list(self.notes),
+            **self.fit.summary(),
+            "seconds": self.seconds,
+            "peak_memory_bytes": self.peak_memory_bytes,
+        }
 
 
 def learn_map(
@@ -83,45 +155,59 @@ def learn_map(
     config = config or MapConfig()
     annotations.check(config.behavior, resume)
     walks = annotations.without_goals(sample_walks(walks, config))
-    moves = grid_walks(walks, grid)
-    prior = cell_prior(sensor, config.prior)
-    checkpoint = None if checkpoint is None else Path(checkpoint)
-    resumed = resume and checkpoint is not None and checkpoint.exists()
+    moves, prior = grid_walks(walks, grid), cell_prior(sensor, config.prior)
+    resumed = resume and checkpoint is not None and Path(checkpoint).exists()
     selection = select_behavior(grid, moves, config, prior, notify) if config.behavior.select else None
     config = selection.config if selection else config
     model = ObstacleGrid(grid, np.broadcast_to(np.asarray(prior.mean), grid.size))
-    result = _fit_walks(model, grid, walks, moves, annotations, config, prior, callback, checkpoint, resume)
-    blocked = np.asarray(result.fit.model.blocked, dtype=np.float64)
+    candidates, goals, names, person = annotations.goal_candidates, None, [], None
+    if candidates is not None:
+        goals = fit_with_unknown_goals(model, grid, moves, candidates, walks.labels, config, prior, callback)
+        fit, demonstrations = goals.fit.fit, demonstrations_of(goals.moves, grid, config)
+    else:
+        demonstrations = demonstrations_of(moves, grid, config)
+        if annotations.person_column is not None:
+            names, person_of_walk = persons_of(walks, moves, annotations.person_column)
+            demonstrations, person = split_by_person(demonstrations, person_of_walk)
+            learn = tuple(dict.fromkeys((*config.behavior.learn, "beta")))
+            config = replace(config, behavior=replace(config.behavior, learn=learn))
+        behavior = behavior_model_of(config, person)
+        run: dict[str, Any] = {"callback": callback, "checkpoint": checkpoint, "resume": resume}
+        fit = fit_map(model, demonstrations, config, cell_prior=prior, behavior=behavior, **run)
     learning = Learning(
-        **result._asdict(),
-        data=_counts(grid, moves, result.demonstrations, sensor),
+        config=config,
+        fit=fit,
+        demonstrations=demonstrations,
+        data=_counts(grid, moves, demonstrations, sensor),
         selection=selection,
+        persons={str(name): float(fit.behavior.behavior_of(index).beta) for index, name in enumerate(names)},
+        goals=goals,
         sensor=sensor,
-        notes=_notes(grid, result.demonstrations, config, resume and not resumed),
+        notes=_notes(grid, demonstrations, config, resume and not resumed),
         resumed=resumed,
         seconds=round(time.monotonic() - started, 3),
         peak_memory_bytes=peak_memory(),
     )
-    return LearnedMap(grid, blocked, result.demonstrations.visited_state_goals(), config.reward, learning)
+    blocked = np.asarray(fit.model.blocked, dtype=np.float64)
+    return LearnedMap(grid, blocked, demonstrations.visited_state_goals(), config.reward, learning)
 
 
 def sample_walks(walks: Walks, config: MapConfig) -> Walks:
     """Return the walks, or `config.max_walks` of them drawn by the seed.
+
+    Args:
+        walks: All walks.
+        config: The configuration.
 
     Raises:
         InputError: For a number of walks below 1 or above all.
     """
     if config.max_walks is None:
         return walks
-    if not 1 <= config.max_walks <= len(walks):
-        raise InputError(f"expected 1…{len(walks)} walks, found {config.max_walks}", field="max_walks")
+    in_range = 1 <= config.max_walks <= len(walks)
+    check(in_range, f"expected 1…{len(walks)} walks, found {config.max_walks}", field="max_walks")
     drawn = np.random.default_rng(config.seed).choice(len(walks), config.max_walks, replace=False)
     return walks.select(np.sort(drawn))
-
-
-def demonstrations_of(moves: Moves, grid: Grid, config: MapConfig) -> Demonstrations:
-    """Return the demonstrations of gridded walks with the reward of a configuration."""
-    return demonstrations_from_moves(moves, grid, discount=config.reward.discount, step_cost=config.reward.step_cost)
 
 
 def peak_memory() -> int | None:
@@ -132,54 +218,6 @@ def peak_memory() -> int | None:
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak
-
-
-class _WalkFit(NamedTuple):
-    config: MapConfig
-    fit: Fit[ObstacleGrid]
-    demonstrations: Demonstrations
-    persons: dict[str, float]
-    goals: GoalPosterior | None
-
-
-def _fit_walks(
-    model: ObstacleGrid,
-    grid: Grid,
-    walks: Walks,
-    moves: Moves,
-    annotations: WalkAnnotations,
-    config: MapConfig,
-    prior: Normal,
-    callback: Callable[[Progress], None] | None,
-    checkpoint: Path | None,
-    resume: bool,
-) -> _WalkFit:
-    """Fit with unknown goals, with a β for each person, or with walks that are alike."""
-    candidates = annotations.goal_candidates
-    if candidates is not None:
-        posterior = fit_with_unknown_goals(model, grid, moves, candidates, walks.labels, config, prior, callback)
-        demonstrations = demonstrations_of(posterior.moves, grid, config)
-        return _WalkFit(config, posterior.fit.fit, demonstrations, {}, posterior)
-    demonstrations = demonstrations_of(moves, grid, config)
-    behavior, names = None, None
-    if annotations.person_column is not None:
-        names, person = persons_of(walks, moves, annotations.person_column)
-        demonstrations, person_of_task = split_by_person(demonstrations, person)
-        learn = tuple(dict.fromkeys((*config.behavior.learn, "beta")))
-        config = replace(config, behavior=replace(config.behavior, learn=learn))
-        behavior = behavior_model_of(config, person_of_task)
-    fit = fit_map(
-        model,
-        demonstrations,
-        config,
-        cell_prior=prior,
-        behavior=behavior,
-        callback=callback,
-        checkpoint=checkpoint,
-        resume=resume,
-    )
-    betas = {str(name): float(fit.behavior.behavior_of(index).beta) for index, name in enumerate(names or ())}
-    return _WalkFit(config, fit, demonstrations, betas, None)
 
 
 def _counts(grid: Grid, moves: Moves, demonstrations: Demonstrations, sensor: SensorMap | None) -> DataCounts:
@@ -209,6 +247,6 @@ def _notes(grid: Grid, demonstrations: Demonstrations, config: MapConfig, nothin
         notes.append(
             f"half of the walks have {moves} moves or more; so far from the goal a step towards it and one away "
             f"differ by {preference:.1g} in log-probability, and walks say next to nothing: "
-            "consider --step-cost 1 --discount 1"
+            "consider a step cost of 1 and a discount of 1"
         )
     return tuple(notes)

@@ -19,17 +19,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sidestep._files import read_array, read_json, write_array, write_json
-from sidestep.errors import InputError
+from sidestep.errors import InputError, check
 from sidestep.io.maps import read_map, write_map
 from sidestep.robots.planners import ModelPlanner
 from sidestep.robots.robot import BUMP_COST, risk_averse_robot
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.reward import Reward
+from sidestep.tabular.tasks import state_at
 
 if TYPE_CHECKING:
     import sidestep.evaluation.evaluate
-    import sidestep.maps.learning
+    import sidestep.maps.learn
 
 Position = tuple[float, float]
 
@@ -61,13 +62,19 @@ class LearnedMap:
         visited: The (state, goal) pairs that the walks passed.
         reward: The reward that the agents pursued.
         learning: How the map was learned; None for a map that was loaded from a folder.
+
+    Example:
+        >>> grid = Grid(np.array([[0, -1, 0]]))
+        >>> learned = LearnedMap(grid, np.array([[0.0, 0.1, 0.0]]), np.array([[0, 2]]), Reward(0.95))
+        >>> learned.unknown.tolist()
+        [[False, True, False]]
     """
 
     grid: Grid
     blocked: Float[np.ndarray, "rows columns"]
     visited: Int[np.ndarray, "visits 2"]
     reward: Reward
-    learning: "sidestep.maps.learning.Learning | None" = None
+    learning: "sidestep.maps.learn.Learning | None" = None
 
     @property
     def unknown(self) -> Bool[np.ndarray, "rows columns"]:
@@ -91,6 +98,9 @@ class LearnedMap:
 
         Args:
             bump_cost: The cost of the first bump at a place in cell sides, at least 0.
+
+        Returns:
+            The robot's planner.
         """
         return risk_averse_robot(self.model, self.visited[:, 0], bump_cost)
 
@@ -102,13 +112,16 @@ class LearnedMap:
             goal: x, y in metres.
             bump_cost: As for `robot`.
 
+        Returns:
+            The path.
+
         Raises:
             InputError: For positions outside the map or in known obstacles, and where there is no path.
         """
-        first, last = _state(self.grid, start, "start"), _state(self.grid, goal, "goal")
+        first, last = state_at(self.grid, start, "start"), state_at(self.grid, goal, "goal")
         states = self.robot(bump_cost).plan_to(last).paths_from(np.array([first]))[0]
-        if states[-1] != last:
-            raise InputError(f"expected a path from {start} to {goal} in the learned map, found none", field="goal")
+        arrives = states[-1] == last
+        check(arrives, f"expected a path from {start} to {goal} in the learned map, found none", field="goal")
         positions = self.grid.centers(states)
         length = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
         return PlannedPath(states, positions, self.blocked.reshape(-1)[states], length)
@@ -128,13 +141,20 @@ class LearnedMap:
             seed: Draws starts and goals on maps too large for all pairs.
             bump_cost: As for `robot`.
             callback: Called with a stage, what is done of it and what there is to do.
+
+        Returns:
+            The scores of the map and of the paths.
         """
         from sidestep.evaluation.evaluate import evaluate
 
         return evaluate(self.robot(bump_cost), self.blocked, truth, self.unknown, self.visited, seed, callback)
 
     def summary(self) -> dict[str, Any]:
-        """Return the numbers of `summary.json`."""
+        """Return the numbers of `summary.json`.
+
+        Returns:
+            Plain numbers, texts, lists and dictionaries.
+        """
         reward = {"reward": {"discount": self.reward.discount, "step_cost": self.reward.step_cost}}
         summary = {"settings": reward} if self.learning is None else self.learning.summary()
         return {"connectivity": self.grid.connectivity, **summary}
@@ -166,24 +186,35 @@ class LearnedMap:
 def load_map(folder: str | Path) -> LearnedMap:
     """Load a learned map from the folder that `LearnedMap.save` or `sidestep learn` has written.
 
+    Args:
+        folder: The folder.
+
+    Returns:
+        The map, without the record of how it was learned.
+
     Raises:
         InputError: For a file that is missing or does not fit.
+
+    Example:
+        >>> import tempfile
+        >>> grid = Grid(np.array([[0, -1, 0]]))
+        >>> learned = LearnedMap(grid, np.array([[0.0, 0.1, 0.0]]), np.array([[0, 2]]), Reward(0.95))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     learned.save(folder)
+        ...     load_map(folder).blocked.tolist()
+        [[0.0, 0.1, 0.0]]
     """
     folder = Path(folder)
     connectivity, reward = _settings(folder / "summary.json")
     geometry = read_map(folder / "map.yaml", connectivity=connectivity)
     blocked = read_array(folder / "blocked.npy", kinds="f")
-    if blocked.shape != geometry.shape or not ((blocked >= 0) & (blocked <= 1)).all():
-        raise InputError(
-            f"expected probabilities in the map's shape {geometry.shape}, found shape {blocked.shape}",
-            source=folder / "blocked.npy",
-        )
+    fits = blocked.shape == geometry.shape and ((blocked >= 0) & (blocked <= 1)).all()
+    message = f"expected probabilities in the map's shape {geometry.shape}, found shape {blocked.shape}"
+    check(fits, message, source=folder / "blocked.npy")
     visited = read_array(folder / "visited.npy", kinds="iu")
-    if visited.ndim != 2 or visited.shape[1] != 2 or not ((visited >= 0) & (visited < blocked.size)).all():
-        raise InputError(
-            f"expected pairs of states in 0…{blocked.size - 1}, found shape {visited.shape}",
-            source=folder / "visited.npy",
-        )
+    fits = visited.ndim == 2 and visited.shape[1] == 2 and ((visited >= 0) & (visited < blocked.size)).all()
+    message = f"expected pairs of states in 0…{blocked.size - 1}, found shape {visited.shape}"
+    check(fits, message, source=folder / "visited.npy")
     known = np.where(blocked == 0, Cell.FREE, np.where(blocked == 1, Cell.OCCUPIED, Cell.UNKNOWN))
     grid = replace(geometry, known=known.astype(np.int64))
     return LearnedMap(grid, blocked.astype(np.float64), visited.astype(np.int64), reward)
@@ -207,27 +238,15 @@ def add_to_summary(folder: Path, out: Path, key: str | None, summary: dict[str, 
 def _settings(path: Path) -> tuple[Connectivity, Reward]:
     """Read the connectivity and the reward that a map was learned with."""
     summary = read_json(path)
-    settings = summary.get("settings") if isinstance(summary, dict) else None
-    reward = settings.get("reward") if isinstance(settings, dict) else None
-    if not isinstance(reward, dict) or not {"discount", "step_cost"} <= set(reward) or "connectivity" not in summary:
-        raise InputError(
-            "expected connectivity and settings.reward with discount and step_cost, as `sidestep learn` writes them",
-            source=path,
-        )
-    if summary["connectivity"] not in (4, 8):
-        raise InputError(f"expected 4 or 8, found {summary['connectivity']!r}", source=path, field="connectivity")
-    discount, step_cost = reward["discount"], reward["step_cost"]
-    if not isinstance(discount, int | float) or not 0 < discount <= 1:
-        raise InputError(f"expected a number above 0 and at most 1, found {discount!r}", source=path, field="discount")
-    if step_cost is not None and not (isinstance(step_cost, int | float) and 0 < step_cost < np.inf):
-        raise InputError(f"expected a number above 0, found {step_cost!r}", source=path, field="step_cost")
-    return summary["connectivity"], Reward(float(discount), None if step_cost is None else float(step_cost))
-
-
-def _state(grid: Grid, position: Position, name: str) -> int:
-    if not grid.contains(np.array([position], dtype=np.float64))[0]:
-        raise InputError(f"{position} lies outside the map", field=name)
-    state = grid.state(position)
-    if grid.known.flat[state] == Cell.OCCUPIED:
-        raise InputError(f"{position} lies in a known obstacle", field=name)
-    return state
+    try:
+        connectivity, reward = summary["connectivity"], summary["settings"]["reward"]
+        discount = float(reward["discount"])
+        step_cost = None if reward["step_cost"] is None else float(reward["step_cost"])
+    except (KeyError, TypeError, ValueError) as error:
+        message = "expected connectivity and settings.reward with discount and step_cost, as `sidestep learn` writes"
+        raise InputError(message, source=path) from error
+    check(connectivity in (4, 8), f"expected 4 or 8, found {connectivity!r}", source=path, field="connectivity")
+    check(0 < discount <= 1, f"expected a number in (0, 1], found {discount}", source=path, field="discount")
+    positive = step_cost is None or 0 < step_cost < np.inf
+    check(positive, f"expected a number above 0, found {step_cost}", source=path, field="step_cost")
+    return connectivity, Reward(discount, step_cost)

@@ -21,13 +21,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sidestep.errors import ImproperTask, InputError, NotConverged
+from sidestep.errors import ImproperTask, NotConverged, check
 from sidestep.inference.calibration import Dispersion, dispersion, effective_sample_ratio, score_statistics
 from sidestep.inference.priors import Normal
-from sidestep.io.demonstrations import demonstrations_from_moves
 from sidestep.io.gridding import Moves
 from sidestep.maps.config import BehaviorConfig, MapConfig
-from sidestep.maps.fit import fit_map
+from sidestep.maps.fit import demonstrations_of, fit_map
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import transition_probabilities
@@ -90,7 +89,13 @@ class Trial:
 
 @dataclass(frozen=True)
 class Selection:
-    """A selected configuration, the reasons for it, and all trials."""
+    """A selected configuration.
+
+    Attributes:
+        config: What was selected.
+        reasons: Why, in words.
+        trials: The score of every configuration that was tried.
+    """
 
     config: MapConfig
     reasons: list[str]
@@ -117,37 +122,41 @@ def select_behavior(
         cell_prior: The prior of the cells' logits; by default that of the configuration.
         notify: Called with a line of text for every fit.
 
+    Returns:
+        The selected configuration, and why.
+
     Raises:
         InputError: For fewer than two walks, for settings that are selected here and set too, and as a fit does.
     """
     for field, is_set in (("learn", config.behavior.learn), ("tempering", config.behavior.tempering != 1)):
-        if is_set:
-            raise InputError("cannot be set where the behavior is selected by held-out walks", field=field)
+        check(not is_set, "cannot be set where the behavior is selected by held-out walks", field=field)
     config = replace(config, behavior=replace(config.behavior, learn=("lapse",), select=False))
     trials: list[Trial] = []
     passed_over: list[str] = []
 
-    def attempt(candidate: MapConfig) -> Trial:
-        reward = candidate.reward
-        shown = demonstrations_from_moves(moves, grid, discount=reward.discount, step_cost=reward.step_cost)
-        trials.append(_cross_validate(ObstacleGrid(grid, candidate.prior.mean), shown, candidate, cell_prior, notify))
-        return trials[-1]
-
-    def attempt_if_proper(candidate: MapConfig) -> list[Trial]:
-        """Return the trial, or nothing where the task has no values."""
+    def attempt(candidate: MapConfig) -> list[Trial]:
+        """Return the trial; nothing where the task has no values, unless it is the configuration's own."""
         try:
-            return [attempt(candidate)]
+            model, shown = ObstacleGrid(grid, candidate.prior.mean), demonstrations_of(moves, grid, candidate)
+            trials.append(_cross_validate(model, shown, candidate, cell_prior, notify))
+            return trials[-1:]
         except (ImproperTask, NotConverged) as error:
+            if candidate is config:
+                raise
             name, beta = _reward_name(candidate.reward), candidate.behavior.beta
             passed_over.append(f"{name} with β = {beta:g} was passed over: {error}")
             return []
 
-    own = [attempt(config), *attempt_if_proper(_with_beta(config, _BETA_FACTOR * config.behavior.beta))]
-    kind = _other_reward(config)
-    other = [*attempt_if_proper(kind), *attempt_if_proper(_with_beta(kind, _BETA_FACTOR * kind.behavior.beta))]
-    gains = _best(other).log_likelihood - _best(own).log_likelihood if other else None
-    trial = (other if gains is not None and _is_worth_it(gains, own[0].moves) else own)[0]
-    trial = _raise_beta(trial, attempt_if_proper)
+    own, other = (
+        [*attempt(kind), *attempt(_with_beta(kind, _BETA_FACTOR * kind.behavior.beta))]
+        for kind in (config, _other_reward(config))
+    )
+    trial, gains = own[0], None
+    if other:
+        gains = _best(other).log_likelihood - _best(own).log_likelihood
+        is_worth_it = gains.sum() > max(_STANDARD_ERRORS * _standard_error(gains), _WORTH * trial.moves)
+        trial = other[0] if is_worth_it else trial
+    trial = _raise_beta(trial, attempt)
     below = dispersion(trial.ratio, len(trial.log_likelihood), _STANDARD_ERRORS) is Dispersion.OVERDISPERSED
     behavior = replace(trial.config.behavior, tempering=trial.ratio if below else 1.0)
     selected = replace(trial.config, behavior=behavior)
@@ -168,10 +177,6 @@ def _raise_beta(trial: Trial, attempt: Callable[[MapConfig], list[Trial]]) -> Tr
             break
         trial = doubled[0]
     return trial
-
-
-def _is_worth_it(gains: Float[np.ndarray, " walks"], moves: int) -> bool:
-    return bool(gains.sum() > max(_STANDARD_ERRORS * _standard_error(gains), _WORTH * moves))
 
 
 def _standard_error(differences: Float[np.ndarray, " walks"]) -> float:
@@ -198,8 +203,7 @@ def _cross_validate(
 ) -> Trial:
     """Learn from the complement of each fold, and score the fold."""
     count = demonstrations.trajectories
-    if count < 2:
-        raise InputError(f"expected at least 2 walks to select by, found {count}", field="select_behavior")
+    check(count >= 2, f"expected at least 2 walks to select by, found {count}", field="select_behavior")
     fold_of = np.random.default_rng(config.seed).permutation(count) % min(FOLDS, count)
     actions, transitions, statistics, lapse_values = np.zeros(count), np.zeros(count), [], []
     for fold in range(fold_of.max() + 1):

@@ -22,6 +22,10 @@ class SensorMap:
         variance: The variance of each cell's logit, above 0; one number or one a cell.
         source: The file of the map, for the summary.
         variance_source: The file of the variances, for the summary.
+
+    Example:
+        >>> SensorMap(np.array([[0.9, np.nan]])).variance
+        0.5
     """
 
     probability: Float[np.ndarray, "rows columns"]
@@ -30,7 +34,11 @@ class SensorMap:
     variance_source: str | None = None
 
     def summary(self) -> dict[str, Any]:
-        """Return the entries of `summary.json`: the file of the map, and the variance or its file."""
+        """Return the entries of `summary.json`: the file of the map, and the variance or its file.
+
+        Returns:
+            Plain numbers and texts.
+        """
         variance = float(self.variance) if isinstance(self.variance, float | int) else self.variance_source
         return {"map": self.source, "variance": variance}
 
@@ -43,8 +51,21 @@ def read_sensor(map_file: str | Path, grid: Grid, variance: float | str | Path =
         grid: The grid.
         variance: The variance of each logit, above 0, or a `.npy` file with one number a cell.
 
+    Returns:
+        What the sensors saw.
+
     Raises:
         InputError: For files that do not fit the grid.
+
+    Example:
+        >>> import tempfile
+        >>> from sidestep.io.maps import write_map
+        >>> grid = Grid.unknown(rows=1, columns=2)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "seen.yaml"
+        ...     write_map(path, np.array([[0.9, 0.1]]), grid)
+        ...     read_sensor(path, grid).probability.round(1).tolist()
+        [[0.9, 0.1]]
     """
     probability = read_sensor_map(map_file, grid)
     if isinstance(variance, float | int):
@@ -53,7 +74,12 @@ def read_sensor(map_file: str | Path, grid: Grid, variance: float | str | Path =
 
 
 def seen_cells(sensor: SensorMap | None, grid: Grid) -> Float[np.ndarray, "rows columns"]:
-    """Return P(occupied) of the unknown cells that sensors have seen, and NaN elsewhere."""
+    """Return P(occupied) of the unknown cells that sensors have seen, and NaN elsewhere.
+
+    Args:
+        sensor: What sensors saw, if anything.
+        grid: The map.
+    """
     if sensor is None:
         return np.full(grid.shape, np.nan)
     seen = np.isfinite(sensor.variance) & (grid.known == Cell.UNKNOWN)
@@ -61,6 +87,11 @@ def seen_cells(sensor: SensorMap | None, grid: Grid) -> Float[np.ndarray, "rows 
 
 
 def cell_prior(sensor: SensorMap | None, config: PriorConfig) -> Normal:
-    """Return the prior of the cells' logits; unseen cells have that of the configuration."""
+    """Return the prior of the cells' logits; unseen cells have that of the configuration.
+
+    Args:
+        sensor: What sensors saw, if anything.
+        config: The prior of unseen cells.
+    """
     elsewhere = Normal(config.mean, config.variance)
     return elsewhere if sensor is None else sensor_prior(sensor.probability, sensor.variance, elsewhere)

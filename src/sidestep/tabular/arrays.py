@@ -10,8 +10,11 @@ def to_jax(array: Shaped[ArrayLike, "..."], dtype: type | np.dtype | None = None
     """Return a NumPy array as a JAX array; unlike `jnp.asarray`, this compiles nothing, whatever the shape.
 
     Args:
-        array: anything that NumPy makes an array of, or a JAX array; do not change it afterwards, memory may be shared.
-        dtype: the type of its numbers, by default that of `array` (32-bit unless `jax_enable_x64` is set).
+        array: Anything that NumPy makes an array of, or a JAX array; do not change it afterwards, memory may be shared.
+        dtype: The type of its numbers, by default that of `array` (32-bit unless `jax_enable_x64` is set).
+
+    Returns:
+        The JAX array.
     """
     if isinstance(array, jax.Array):
         return jnp.asarray(array, dtype)

@@ -20,11 +20,10 @@ from typing import ClassVar, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Scalar
 
-from sidestep.errors import InputError
+from sidestep.errors import InputError, check, check_positive
 from sidestep.tabular.arrays import to_jax
 
 Gradient = Literal["exact", "fixed_policy"]
@@ -38,27 +37,59 @@ class Backup(eqx.Module):
     """The value of a state as a function of the values of its actions, at inverse temperature β.
 
     Attributes:
-        above_maximum: whether the backup is never below the best action's value; otherwise it is never above.
+        above_maximum: Whether the backup is never below the best action's value; otherwise it is never above.
     """
 
     above_maximum: ClassVar[bool] = False
 
     @abc.abstractmethod
     def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
-        """Return V = B(q) over the last axis, differentiable in both arguments with the exact gradient."""
+        """Return V = B(q) over the last axis, differentiable in both arguments with the exact gradient.
+
+        Args:
+            q: Q of the actions, on the last axis.
+            beta: The inverse temperature β, above 0.
+
+        Returns:
+            V of each state.
+        """
 
     @abc.abstractmethod
     def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
-        """Return the exact gradient ∂V/∂q; it sums to one over the last axis."""
+        """Return the exact gradient ∂V/∂q; it sums to one over the last axis.
+
+        Args:
+            q: Q of the actions, on the last axis.
+            beta: The inverse temperature β, above 0.
+
+        Returns:
+            ∂V/∂Q of each action.
+        """
 
     def fixed_policy_weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
-        """Return the weights of the average under the policy held fixed: π for the soft backups (eq. 9)."""
+        """Return the weights of the average under the policy held fixed: π for the soft backups (eq. 9).
+
+        Args:
+            q: Q of the actions, on the last axis.
+            beta: The inverse temperature β, above 0.
+
+        Returns:
+            The weight of each action, at least 0; they sum to one.
+        """
         return jax.nn.softmax(beta * _below_best(q), axis=-1)
 
     def bonus(self, entropy: Values, actions: int | None, beta: Float[Scalar, ""]) -> Values:
         """Return V − Σ_a π(a) Q(a), from the policy's entropy; 0 by default.
 
         `actions` is the number of actions, `None` where an action is a vector.
+
+        Args:
+            entropy: The entropy of the policy in each state, in nats.
+            actions: The number of actions; None where an action is a vector.
+            beta: The inverse temperature β, above 0.
+
+        Returns:
+            V − Σ_a π(a) Q(a) of each state.
         """
         del actions, beta
         return jnp.zeros_like(entropy)
@@ -68,7 +99,7 @@ class HardMax(Backup):
     """V = max_a Q(a): agents with an optimal policy (eq. 2).
 
     Attributes:
-        tie: actions within this relative difference of the best value (or within rounding) are ties and have equal
+        tie: Actions within this relative difference of the best value (or within rounding) are ties and have equal
             parts of the gradient (eq. 10). It is small, because in a nearly trapped state values are far larger than
             the differences that matter.
 
@@ -172,7 +203,11 @@ class Mellowmax(Backup):
         return self.fixed_policy_weights(q, beta)
 
     def bonus(self, entropy: Values, actions: int | None, beta: Float[Scalar, ""]) -> Values:
-        """Return the policy's entropy minus that of acting at random, over β."""
+        """Return the policy's entropy minus that of acting at random, over β.
+
+        Raises:
+            InputError: Where an action is a vector.
+        """
         if actions is None:
             raise InputError("the mellowmax needs a finite number of actions: expected another", field="backup")
         return (entropy - jnp.log(actions)) / beta
@@ -191,12 +226,12 @@ class Behavior(eqx.Module):
     random action instead; the values of states do not account for that.
 
     Attributes:
-        backup: the value of a state from the values of its actions.
-        beta: the inverse temperature β, above 0, in units of one over reward.
-        lapse: the fraction of random actions, at least 0 and below 1; None for none.
+        backup: The value of a state from the values of its actions.
+        beta: The inverse temperature β, above 0, in units of one over reward.
+        lapse: The fraction of random actions, at least 0 and below 1; None for none.
 
     Raises:
-        InputError: for β ≤ 0 or not finite, and for a lapse out of its range.
+        InputError: For β ≤ 0 or not finite, and for a lapse out of its range.
 
     Example:
         >>> float(Behavior(BoltzmannAverage(), beta=5.0).beta)
@@ -217,16 +252,20 @@ class Behavior(eqx.Module):
         self.backup = backup
         self.beta = to_jax(beta, jnp.result_type(float))
         self.lapse = None if lapse is None else to_jax(lapse, jnp.result_type(float))
-        if not isinstance(self.beta, Tracer) and not 0 < float(self.beta) < np.inf:
-            raise InputError(f"expected a finite number above 0, found {beta}", field="beta")
-        if self.lapse is not None and not isinstance(self.lapse, Tracer) and not 0 <= float(self.lapse) < 1:
-            raise InputError(f"expected a probability, at least 0 and below 1, found {lapse}", field="lapse")
+        if not isinstance(self.beta, Tracer):
+            check_positive(float(self.beta), "beta")
+        if self.lapse is not None and not isinstance(self.lapse, Tracer):
+            valid = 0 <= float(self.lapse) < 1
+            check(valid, f"expected a probability, at least 0 and below 1, found {lapse}", field="lapse")
 
     def log_policy(self, q: ActionValues) -> ActionValues:
         """Return log π(a | s) from action values.
 
         Args:
             q: Q(s, a), with actions on the last axis.
+
+        Returns:
+            Log-probabilities, of the shape of `q`.
         """
         chosen = jax.nn.log_softmax(self.beta.astype(q.dtype) * _below_best(q), axis=-1)
         if self.lapse is None:

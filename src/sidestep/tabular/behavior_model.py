@@ -7,9 +7,9 @@
     costs             R(s, a) − ln(1 + exp k_c(s, a))          of aiming at state c(s, a), whatever the goal
 
 Each is known, or learned together with θ from the likelihood of the actions. Learned parameters have a normal prior
-around their start, with standard deviation 1 for e, g and the mean of the b_p, `reward_weight_std` for the w, and 2 for
-the k around −4 (a cost of .02, within a factor of seven). One person's b differs from the mean with standard deviation
-½: this partial pooling pulls a person with few moves towards the others.
+around their start, with standard deviation 1 for e, g, the w and the mean of the b_p, and 2 for the k around −4 (a
+cost of .02, within a factor of seven). One person's b differs from the mean with standard deviation ½: this partial
+pooling pulls a person with few moves towards the others.
 """
 
 from collections.abc import Sequence
@@ -22,9 +22,10 @@ import numpy as np
 from jax.scipy.special import logit
 from jaxtyping import Array, Float, Int
 
-from sidestep.errors import InputError
+from sidestep.errors import InputError, check
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior
+from sidestep.tabular.graph import check_states
 from sidestep.tabular.tasks import Task, with_state_costs
 
 LEARNABLE = ("beta", "lapse", "discount")
@@ -60,14 +61,19 @@ class BehaviorModel(eqx.Module):
     """How agents behave: what is known, and what is learned; made by `behavior_model`.
 
     Attributes:
-        behavior: the known numbers, and the start of a learned β and lapse.
-        parameters: the learned numbers.
-        start: the mean of their prior.
-        person: the person of each task, where persons are distinguished (see
+        behavior: The known numbers, and the start of a learned β and lapse.
+        parameters: The learned numbers.
+        start: The mean of their prior.
+        person: The person of each task, where persons are distinguished (see
             `sidestep.tabular.demonstrations.split_by_person`).
         features: φ(s, a); an axis of length 1 holds for all states or all actions.
         aimed_at: c(s, a), where states have costs.
-        reward_weight_std: the standard deviation of the prior of w.
+
+    Example:
+        >>> from sidestep.tabular.backups import BoltzmannAverage
+        >>> model = behavior_model(Behavior(BoltzmannAverage(), 7.0), learn=["lapse"])
+        >>> round(float(model.behavior_of().lapse), 2)  # where a learned lapse starts
+        0.05
     """
 
     behavior: Behavior
@@ -76,13 +82,15 @@ class BehaviorModel(eqx.Module):
     person: Int[Array, " tasks"] | None
     features: Float[Array, "#states #actions features"] | None
     aimed_at: Int[Array, "states actions"] | None
-    reward_weight_std: float = eqx.field(static=True)
 
     def with_parameters(self, parameters: BehaviorParameters) -> "BehaviorModel":
         """Return the same model at other parameters.
 
         Args:
-            parameters: with None for the same numbers.
+            parameters: With None for the same numbers.
+
+        Returns:
+            The model.
         """
         return eqx.tree_at(lambda model: model.parameters, self, parameters, is_leaf=lambda leaf: leaf is None)
 
@@ -95,7 +103,10 @@ class BehaviorModel(eqx.Module):
         """Return the behavior of one person.
 
         Args:
-            person: its index; None for a typical person, of the mean log β.
+            person: Its index; None for a typical person, of the mean log β.
+
+        Returns:
+            The behavior, with the learned β and lapse.
         """
         log_beta, logit_lapse = self.parameters.log_beta, self.parameters.logit_lapse
         beta, lapse = self.behavior.beta, self.behavior.lapse
@@ -109,7 +120,10 @@ class BehaviorModel(eqx.Module):
         """Return tasks with the agents' discount, reward weights and costs.
 
         Args:
-            tasks: one task or a stack of tasks.
+            tasks: One task or a stack of tasks.
+
+        Returns:
+            As many tasks as given.
         """
         if self.costs is not None and self.aimed_at is not None:
             tasks = with_state_costs(tasks, self.costs, self.aimed_at)
@@ -130,7 +144,7 @@ class BehaviorModel(eqx.Module):
         for value, mean, std in (
             (now.logit_lapse, start.logit_lapse, 1.0),
             (now.logit_discount, start.logit_discount, 1.0),
-            (now.reward_weights, start.reward_weights, self.reward_weight_std),
+            (now.reward_weights, start.reward_weights, 1.0),
             (now.cost_parameters, start.cost_parameters, _COST_STD),
         ):
             if value is not None and mean is not None:
@@ -146,23 +160,25 @@ def behavior_model(
     person: Int[np.ndarray, " tasks"] | None = None,
     features: Float[np.ndarray, "#states #actions features"] | None = None,
     reward_weights: Float[np.ndarray, " features"] | None = None,
-    reward_weight_std: float = 1.0,
     aimed_at: Int[np.ndarray, "states actions"] | None = None,
 ) -> BehaviorModel:
     """Return a model of agents that behave as `behavior` describes, except for what is learned.
 
     Args:
-        behavior: the known behavior, and the start of a learned β and lapse (.05 if it has no lapse).
-        learn: names out of `LEARNABLE`.
-        discount: the start of a learned discount, between 0 and 1.
-        person: the person of each task, 0…persons − 1; with it, each person's β is learned.
+        behavior: The known behavior, and the start of a learned β and lapse (.05 if it has no lapse).
+        learn: Names out of `LEARNABLE`.
+        discount: The start of a learned discount, between 0 and 1.
+        person: The person of each task, 0…persons − 1; with it, each person's β is learned.
         features: φ(s, a) of rewards with learned weights; an axis of length 1 holds for all states or all actions.
-        reward_weights: their start, in units of reward; 0 by default.
-        reward_weight_std: the standard deviation of their prior, in units of reward.
-        aimed_at: the state that each action aims at; with it, the costs of states are learned.
+        reward_weights: Their start, in units of reward; 0 by default. Their prior has standard deviation 1, so scale
+            the features.
+        aimed_at: The state that each action aims at; with it, the costs of states are learned.
+
+    Returns:
+        The behavior model, with the learned numbers at their start.
 
     Raises:
-        InputError: for a name that is not in `LEARNABLE`, a learned discount that is not between 0 and 1, persons
+        InputError: For a name that is not in `LEARNABLE`, a learned discount that is not between 0 and 1, persons
             that are not numbered from 0, features or weights that are not finite, another number of weights than of
             features, and aims that are not states.
 
@@ -172,10 +188,10 @@ def behavior_model(
         7.0
     """
     unknown = [name for name in learn if name not in LEARNABLE]
-    if unknown:
-        raise InputError(f"expected some of {LEARNABLE}, found {unknown[0]!r}", field="learn")
-    if person is not None and not np.array_equal(np.unique(person), np.arange(np.max(person) + 1)):
-        raise InputError("expected persons numbered from 0, each with a task", field="person")
+    check(not unknown, f"expected some of {LEARNABLE}, found {unknown}", field="learn")
+    if person is not None:
+        numbered = np.array_equal(np.unique(person), np.arange(np.max(person) + 1))
+        check(numbered, "expected persons numbered from 0, each with a task", field="person")
     log_beta = logit_lapse = logit_discount = weights = cost_parameters = None
     if "beta" in learn or person is not None:
         log_beta = jnp.full(1 if person is None else int(np.max(person)) + 1, jnp.log(behavior.beta))
@@ -186,10 +202,14 @@ def behavior_model(
             raise InputError(f"to be learned, it must start between 0 and 1: found {discount}", field="discount")
         logit_discount = logit(jnp.asarray(discount, jnp.result_type(float)))
     if features is not None:
-        weights = _initial_weights(features, reward_weights)
+        finite = features.ndim == 3 and np.isfinite(features).all()
+        check(finite, "expected finite numbers of shape (states, actions, features)", field="features")
+        initial = np.zeros(features.shape[-1]) if reward_weights is None else np.asarray(reward_weights)
+        complete = initial.shape == features.shape[-1:] and np.isfinite(initial).all()
+        check(complete, f"expected {features.shape[-1]} finite numbers, found {initial}", field="reward_weights")
+        weights = to_jax(initial, jnp.result_type(float))
     if aimed_at is not None:
-        if aimed_at.min() < 0 or aimed_at.max() >= len(aimed_at):
-            raise InputError(f"expected states 0…{len(aimed_at) - 1}", field="aimed_at")
+        check_states(aimed_at, len(aimed_at), "aimed_at")
         cost_parameters = to_jax(np.full(len(aimed_at), _COST_MEAN))
     start = BehaviorParameters(log_beta, logit_lapse, logit_discount, weights, cost_parameters)
     return BehaviorModel(
@@ -199,16 +219,4 @@ def behavior_model(
         None if person is None else to_jax(person, jnp.int32),
         None if features is None else to_jax(features, jnp.result_type(float)),
         None if aimed_at is None else to_jax(aimed_at, jnp.int32),
-        reward_weight_std,
     )
-
-
-def _initial_weights(
-    features: Float[np.ndarray, "#states #actions features"], weights: Float[np.ndarray, " features"] | None
-) -> Float[Array, " features"]:
-    if features.ndim != 3 or not np.isfinite(features).all():
-        raise InputError("expected finite numbers of shape (states, actions, features)", field="features")
-    weights = np.zeros(features.shape[-1]) if weights is None else np.asarray(weights)
-    if weights.shape != features.shape[-1:] or not np.isfinite(weights).all():
-        raise InputError(f"expected {features.shape[-1]} finite numbers, found {weights}", field="reward_weights")
-    return to_jax(weights, jnp.result_type(float))

@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from typing_extensions import TypeVar
 
-from sidestep.errors import InputError
+from sidestep.errors import InputError, check
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.tasks import Task, stack_tasks
 
@@ -27,7 +27,7 @@ class Trajectory(NamedTuple):
     Attributes:
         states: s₁ … s_{τ+1}; integers in discrete worlds, vectors in continuous ones.
         actions: a₁ … a_τ; indices where there are finitely many actions, vectors otherwise.
-        task: the index of the task that the agent pursued.
+        task: The index of the task that the agent pursued.
 
     Example:
         >>> Trajectory(np.array([0, 1, 2]), np.array([3, 3]), task=0).task
@@ -43,13 +43,20 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
     """The moves (s, a, s′) of many trajectories on many tasks, one after another; made by `gather`.
 
     Attributes:
-        states: the state before each move; integers in discrete worlds, vectors in continuous ones.
-        actions: the action of each move.
-        next_states: the state after each move.
-        task: the index (into `tasks`) of the task of each move.
-        trajectory: the index of the trajectory of each move; 0, 1, … in order.
-        tasks: all tasks, stacked.
-        weights: how much each move counts in the likelihood of discrete worlds; 1 by default.
+        states: The state before each move; integers in discrete worlds, vectors in continuous ones.
+        actions: The action of each move.
+        next_states: The state after each move.
+        task: The index (into `tasks`) of the task of each move.
+        trajectory: The index of the trajectory of each move; 0, 1, … in order.
+        tasks: All tasks, stacked.
+        weights: How much each move counts in the likelihood of discrete worlds; 1 by default.
+
+    Example:
+        >>> from sidestep.tabular.grid import Grid
+        >>> from sidestep.tabular.tasks import reach
+        >>> walk = Trajectory(np.array([0, 1, 2]), np.array([3, 3]), task=0)
+        >>> gather([walk, walk], [reach(Grid.unknown(rows=1, columns=3), 2)]).trajectories
+        2
     """
 
     states: Shaped[Array, "moves *state"]
@@ -77,7 +84,10 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         """Return the same moves, with weight 1 for those of the chosen trajectories and 0 for the others.
 
         Args:
-            trajectories: whether each trajectory counts.
+            trajectories: Whether each trajectory counts.
+
+        Returns:
+            Demonstrations of the same length, so that no function is compiled anew.
         """
         weights = np.asarray(trajectories, dtype=np.float64)[np.asarray(self.trajectory)]
         return eqx.tree_at(lambda demonstrations: demonstrations.weights, self, to_jax(weights))
@@ -109,8 +119,19 @@ def split_by_person(
     """Return the same moves with a separate task for every person that pursues it, and the person of each task.
 
     Args:
-        demonstrations: the moves of all persons.
-        person: the person of each trajectory, 0…persons − 1.
+        demonstrations: The moves of all persons.
+        person: The person of each trajectory, 0…persons − 1.
+
+    Returns:
+        The demonstrations with the split tasks, and the index of the person of each task.
+
+    Example:
+        >>> from sidestep.tabular.grid import Grid
+        >>> from sidestep.tabular.tasks import reach
+        >>> walk = Trajectory(np.array([0, 1, 2]), np.array([3, 3]), task=0)
+        >>> shown = gather([walk, walk], [reach(Grid.unknown(rows=1, columns=3), 2)])
+        >>> split_by_person(shown, np.array([0, 1]))[1].tolist()  # the goal of both is now two tasks
+        [0, 1]
     """
     of_moves = np.asarray(person)[np.asarray(demonstrations.trajectory)]
     pairs, task = np.unique(np.stack([np.asarray(demonstrations.task), of_moves], axis=1), axis=0, return_inverse=True)
@@ -123,11 +144,14 @@ def gather(trajectories: Sequence[Trajectory], tasks: Sequence[Task]) -> Demonst
     """Return demonstrations from trajectories in any discrete world.
 
     Args:
-        trajectories: at least one, each with at least one move.
-        tasks: the tasks that `Trajectory.task` counts through.
+        trajectories: At least one, each with at least one move.
+        tasks: The tasks that `Trajectory.task` counts through.
+
+    Returns:
+        The moves of all trajectories, one after another, with their tasks.
 
     Raises:
-        InputError: for no or an empty trajectory, lengths that do not fit, a task or state that does not exist, or a
+        InputError: For no or an empty trajectory, lengths that do not fit, a task or state that does not exist, or a
             trajectory that continues after a terminal state of its task.
 
     Example:
@@ -139,8 +163,7 @@ def gather(trajectories: Sequence[Trajectory], tasks: Sequence[Task]) -> Demonst
     """
     stacked = stack_tasks(tasks)
     terminal = np.asarray(stacked.terminal)
-    if not trajectories:
-        raise InputError("expected at least one trajectory", field="trajectories")
+    check(trajectories, "expected at least one trajectory", field="trajectories")
     for row, (states, actions, task) in enumerate(trajectories, start=1):
         if len(actions) == 0 or len(states) != len(actions) + 1:
             message = f"expected moves and one state more, found {len(actions)} and {len(states)}"
@@ -157,7 +180,12 @@ def gather(trajectories: Sequence[Trajectory], tasks: Sequence[Task]) -> Demonst
 
 
 def flatten(trajectories: Sequence[Trajectory], tasks: Task) -> Demonstrations[Task]:
-    """Return the moves of trajectories, one after another, without checks."""
+    """Return the moves of trajectories, one after another, without checks.
+
+    Args:
+        trajectories: At least one, each with at least one move.
+        tasks: The tasks that `Trajectory.task` counts through, stacked.
+    """
     lengths = [len(trajectory.actions) for trajectory in trajectories]
     return Demonstrations(
         states=flat_moves([trajectory.states[:-1] for trajectory in trajectories]),
@@ -170,7 +198,11 @@ def flatten(trajectories: Sequence[Trajectory], tasks: Task) -> Demonstrations[T
 
 
 def flat_moves(parts: Sequence[np.ndarray]) -> Int[Array, " moves"]:
-    """Return pieces of a flat array of integers, one after another."""
+    """Return pieces of a flat array of integers, one after another.
+
+    Args:
+        parts: One-dimensional arrays.
+    """
     return to_jax(np.concatenate(parts), np.int32)
 
 
@@ -180,31 +212,31 @@ def pad_to_power_of_two(demonstrations: Demonstrations[Task]) -> Demonstrations[
     The padding of the moves repeats the first one with weight 0. That of the tasks ends in every state, so that there
     is nothing to solve. Of results for every move, those from `len(demonstrations)` on are to be dropped.
     Demonstrations that JAX is tracing are returned unchanged: their length is already fixed.
+
+    Args:
+        demonstrations: Moves and tasks of a discrete world.
     """
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(demonstrations)):
         return demonstrations
-    padded_moves = next_power_of_two(max(len(demonstrations), _MIN_MOVES))
-    padded_tasks = next_power_of_two(max(len(demonstrations.tasks.terminal), _MIN_TASKS))
 
-    def repeated(leaf: Array, count: int) -> Array:
-        array = np.asarray(leaf)
-        return to_jax(np.concatenate([array, np.repeat(array[:1], count - len(array), axis=0)]))
+    def padded(tree: Any, count: int, least: int) -> tuple[Any, Bool[np.ndarray, " padded"]]:
+        """Return the first row again in each row of padding, and which rows are padding."""
+        rows = np.arange(next_power_of_two(max(count, least)))
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[np.where(rows < count, rows, 0)], tree), rows >= count
 
-    def extended(leaf: Array, count: int, fill: bool | float) -> Array:
-        return to_jax(np.concatenate([leaf, np.full((count - len(leaf), *leaf.shape[1:]), fill, leaf.dtype)]))
-
-    own, pursued = demonstrations, demonstrations.tasks
-    moves = own.states, own.actions, own.next_states, own.task, own.trajectory
-    reward, terminal_reward, discount = (
-        repeated(leaf, padded_tasks) for leaf in (pursued.reward, pursued.terminal_reward, pursued.discount)
-    )
-    return Demonstrations(
-        *(repeated(leaf, padded_moves) for leaf in moves),
-        tasks=Task(reward, terminal_reward, extended(pursued.terminal, padded_tasks, fill=True), discount),
-        weights=extended(own.weights, padded_moves, fill=0.0),
-    )
+    tasks, is_padding = padded(demonstrations.tasks, len(demonstrations.tasks.terminal), _MIN_TASKS)
+    tasks = eqx.tree_at(lambda task: task.terminal, tasks, tasks.terminal | is_padding[:, None])
+    moves = eqx.tree_at(lambda each: each.tasks, demonstrations, None)
+    moves, is_padding = padded(moves, len(demonstrations), _MIN_MOVES)
+    changes = tasks, np.where(is_padding, 0, moves.weights)
+    whole = eqx.tree_at(lambda each: (each.tasks, each.weights), moves, changes, is_leaf=lambda leaf: leaf is None)
+    return jax.tree.map(to_jax, whole)
 
 
 def next_power_of_two(count: int) -> int:
-    """Return the smallest power of two that is at least `count`."""
+    """Return the smallest power of two that is at least `count`.
+
+    Args:
+        count: At least 1.
+    """
     return 1 << (count - 1).bit_length()

@@ -16,10 +16,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.errors import InputError
+from sidestep.errors import check
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.solve import Solution, SolveOptions, solve
+from sidestep.tabular.solve import Solution, SolveOptions, decision_process, solve
 from sidestep.tabular.solvers.base import DecisionProcess
 from sidestep.tabular.tasks import Task
 
@@ -82,8 +82,7 @@ def forward_gradient(
         "Towards Behavior-Aware Model Learning from Human-Generated Trajectories", eqs. 7 to 10.
     """
     options = options or SolveOptions()
-    if options.horizon is not None:
-        raise InputError(f"expected no horizon, found {options.horizon}", field="options")
+    check(options.horizon is None, f"expected no horizon, found {options.horizon}", field="options")
     solver = options.solver_for(behavior.backup, model.graph.states)
     solution = solve(model, task, behavior, options=SolveOptions(solver=solver))
     values = jax.lax.stop_gradient(solution.values)
@@ -91,20 +90,16 @@ def forward_gradient(
 
     def process(parameters: Float[Array, " parameters"]) -> DecisionProcess:
         probabilities = model.with_parameters(unravel(parameters)).probabilities()
-        cast = (jnp.asarray(leaf, probabilities.dtype) for leaf in (task.reward, task.terminal_reward, task.discount))
-        reward, terminal_reward, discount = cast
-        return DecisionProcess(model.graph.successors, probabilities, reward, terminal_reward, task.terminal, discount)
+        return decision_process(model, probabilities, task)
 
     def model_term(direction: Float[Array, " parameters"]) -> Float[Array, "states actions"]:
         """γ Σ_s′ V(s′) ∇T_θ(s, a, s′), the second term of eq. 7, in one direction of θ."""
         return jax.jvp(lambda x: process(x).action_values(values), (parameters,), (direction,))[1]
 
     now = process(parameters)
-    q, beta = now.action_values(values), behavior.beta.astype(values.dtype)
     backup = behavior.backup
-    weights = (
-        backup.weights(q, beta) if options.gradient == "exact" else backup.fixed_policy_weights(q, beta)
-    )  # eq. 8, 9, 10
+    weigh = backup.weights if options.gradient == "exact" else backup.fixed_policy_weights  # eq. 8, 9, 10
+    weights = weigh(now.action_values(values), behavior.beta.astype(values.dtype))
     weights = jnp.where(now.terminal[:, None], 0, weights)
     next_state = now.discount * now.probabilities  # γ T_θ(s, a, s′) of the first term of eq. 7
     own = jax.lax.map(

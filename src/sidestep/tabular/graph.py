@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.errors import InputError
+from sidestep.errors import check
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.grid import Cell, Grid
 
@@ -23,9 +23,15 @@ class Graph(eqx.Module):
     """The possible outcomes of each action, and its length; made by `graph` or `grid_graph`.
 
     Attributes:
-        successors: the state, in 0…states − 1, that outcome k of action a in state s leads to.
-        lengths: the length of each action, for tasks that charge by length; in cell sides on grids. An axis of length 1
+        successors: The state, in 0…states − 1, that outcome k of action a in state s leads to.
+        lengths: The length of each action, for tasks that charge by length; in cell sides on grids. An axis of length 1
             holds for all states or all actions.
+
+    Example:
+        >>> from sidestep.tabular.grid import Grid
+        >>> world = grid_graph(Grid.unknown(rows=1, columns=3))
+        >>> world.states, world.actions
+        (3, 4)
     """
 
     successors: Int[Array, "states actions outcomes"]
@@ -46,20 +52,32 @@ def graph(successors: Int[np.ndarray, "states actions outcomes"]) -> Graph:
     """Return a graph from a table of successors, in which every action has length 1.
 
     Args:
-        successors: the state that each outcome of each action leads to.
+        successors: The state that each outcome of each action leads to.
+
+    Returns:
+        The graph.
 
     Raises:
-        InputError: for an empty table or a successor that is not a state.
+        InputError: For an empty table or a successor that is not a state.
 
     Example:
         >>> graph(np.array([[[0], [1]], [[1], [0]]])).states
         2
     """
-    if successors.size == 0:
-        raise InputError("expected at least one state, action and outcome", field="successors")
-    if successors.min() < 0 or successors.max() >= len(successors):
-        raise InputError(f"expected states 0…{len(successors) - 1}", field="successors")
+    check(successors.size, "expected at least one state, action and outcome", field="successors")
+    check_states(successors, len(successors), "successors")
     return Graph(to_jax(successors, np.int32), to_jax(np.ones((1, 1))))
+
+
+def check_states(numbers: Int[np.ndarray, "..."], states: int, field: str) -> None:
+    """Raise `InputError` unless all numbers are states.
+
+    Args:
+        numbers: The states to check.
+        states: The number of states.
+        field: The argument, for the message.
+    """
+    check(numbers.min() >= 0 and numbers.max() < states, f"expected states 0…{states - 1}", field=field)
 
 
 def grid_graph(grid: Grid) -> Graph:
@@ -68,7 +86,10 @@ def grid_graph(grid: Grid) -> Graph:
     Moves off the map stay. A diagonal has length √2, other moves 1 (in cell sides).
 
     Args:
-        grid: the cells, which are the states, and the moves, which are the actions.
+        grid: The cells, which are the states, and the moves, which are the actions.
+
+    Returns:
+        The graph, with two outcomes for each move.
 
     Example:
         >>> grid_graph(Grid.unknown(rows=1, columns=2)).successors[0, 3].tolist()  # from the left cell to the right
@@ -78,14 +99,22 @@ def grid_graph(grid: Grid) -> Graph:
 
 
 def grid_successors(grid: Grid) -> Int[np.ndarray, "states actions 2"]:
-    """Return the successors of `grid_graph` as a NumPy array."""
+    """Return the successors of `grid_graph` as a NumPy array.
+
+    Args:
+        grid: The cells and the moves.
+    """
     entered = moves_into(grid)[:, :, 0]
     staying = np.broadcast_to(np.arange(grid.size)[:, None], entered.shape)
     return np.stack([np.where(entered == grid.size, staying, entered), staying], axis=-1)
 
 
 def straight_moves(grid: Grid) -> Int[np.ndarray, "cells 4"]:
-    """Return the cell that each straight move enters; moves off the map stay."""
+    """Return the cell that each straight move enters; moves off the map stay.
+
+    Args:
+        grid: The cells and the moves.
+    """
     return grid_successors(grid)[:, :4, 0]
 
 
@@ -94,6 +123,9 @@ def moves_into(grid: Grid) -> Int[np.ndarray, "states actions 3"]:
 
     A diagonal does not cut corners, so both cells beside it must be free. Where there is no such cell the entry is
     `grid.size`, one past the last state; off the map, the first entry is.
+
+    Args:
+        grid: The cells and the moves.
     """
     rows, columns = grid.shape
     row, column = np.divmod(np.arange(grid.size), columns)
@@ -119,6 +151,9 @@ def walkable_graph(truth: Grid) -> "scipy.sparse.csr_array":
 
     >>> walkable_graph(Grid(np.array([[0, 0, 1]]))).toarray()[0].tolist()
     [0.0, 1.0, 0.0]
+
+    Args:
+        truth: The map.
     """
     from scipy.sparse import csr_array
 
@@ -130,15 +165,28 @@ def walkable_graph(truth: Grid) -> "scipy.sparse.csr_array":
 
 
 def free_cells(truth: Grid) -> Bool[np.ndarray, " states"]:
-    """Return which cells a map knows to be free."""
+    """Return which cells a map knows to be free.
+
+    Args:
+        truth: The map.
+    """
     return truth.known.reshape(-1) == Cell.FREE
 
 
 def clear_moves(truth: Grid, needed: Int[np.ndarray, "states actions cells"]) -> Bool[np.ndarray, "states actions"]:
-    """Return whether each move stays on the map and all cells that it needs are free."""
+    """Return whether each move stays on the map and all cells that it needs are free.
+
+    Args:
+        truth: The map.
+        needed: The cells that each move needs, from `moves_into`.
+    """
     return clear_cells(truth)[needed].all(axis=-1) & (needed[..., 0] < truth.size)
 
 
 def clear_cells(truth: Grid) -> Bool[np.ndarray, " cells"]:
-    """Return which cells are free, and true one past the last: the entry of `moves_into` for "no such cell"."""
+    """Return which cells are free, and true one past the last: the entry of `moves_into` for "no such cell".
+
+    Args:
+        truth: The map.
+    """
     return np.append(free_cells(truth), True)

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 
-from sidestep.errors import InputError
+from sidestep.errors import InputError, check, check_positive
 
 Connectivity = Literal[4, 8]
 
@@ -39,13 +39,13 @@ class Grid:
     """The geometry of a map, what is known of its cells, and the moves on it.
 
     Attributes:
-        known: a `Cell` value for each cell, row 0 at the top.
-        resolution: the side of a cell, in metres.
+        known: A `Cell` value for each cell, row 0 at the top.
+        resolution: The side of a cell, in metres.
         origin: x, y (metres) and yaw (radians) of the lower-left corner.
         connectivity: 4 (up, down, left, right) or 8 (and diagonals).
 
     Raises:
-        InputError: for an empty grid, values that are not `Cell`s, a resolution that is not positive, an origin that
+        InputError: For an empty grid, values that are not `Cell`s, a resolution that is not positive, an origin that
             is not finite, or another connectivity.
 
     Example:
@@ -60,20 +60,24 @@ class Grid:
     connectivity: Connectivity = 4
 
     def __post_init__(self) -> None:
-        if self.known.size == 0 or not np.isin(self.known, list(Cell)).all():
-            raise InputError("expected at least one cell, each -1 (unknown), 0 (free) or 1 (occupied)", field="known")
-        if not (np.isfinite(self.resolution) and self.resolution > 0):
-            raise InputError(f"expected metres above 0, found {self.resolution}", field="resolution")
-        if len(self.origin) != 3 or not np.isfinite(self.origin).all():
-            raise InputError(f"expected three finite numbers x, y, yaw, found {self.origin}", field="origin")
-        if self.connectivity not in (4, 8):
-            raise InputError(f"expected 4 or 8, found {self.connectivity}", field="connectivity")
+        cells = self.known.size > 0 and np.isin(self.known, list(Cell)).all()
+        check(cells, "expected at least one cell, each -1 (unknown), 0 (free) or 1 (occupied)", field="known")
+        check_positive(self.resolution, "resolution")
+        finite = len(self.origin) == 3 and np.isfinite(self.origin).all()
+        check(finite, f"expected three finite numbers x, y, yaw, found {self.origin}", field="origin")
+        check(self.connectivity in (4, 8), f"expected 4 or 8, found {self.connectivity}", field="connectivity")
         # one byte for each cell: maps may have ten million
         object.__setattr__(self, "known", self.known.astype(np.int8))
 
     @classmethod
     def unknown(cls, rows: int, columns: int, connectivity: Connectivity = 4) -> "Grid":
-        """Return a grid of which nothing is known, with cells of one metre and its lower-left corner at (0, 0)."""
+        """Return a grid of which nothing is known, with cells of one metre and its lower-left corner at (0, 0).
+
+        Args:
+            rows: Their number, at least 1.
+            columns: Their number, at least 1.
+            connectivity: 4, or 8 with diagonals.
+        """
         return cls(np.full((rows, columns), Cell.UNKNOWN, dtype=np.int8), connectivity=connectivity)
 
     @property
@@ -105,7 +109,11 @@ class Grid:
         return replace(self, known=np.where(self.known == Cell.OCCUPIED, Cell.OCCUPIED, Cell.FREE))
 
     def contains(self, positions: Float[np.ndarray, "points 2"]) -> Bool[np.ndarray, " points"]:
-        """Return whether each position (metres) lies on the grid; a position that is not finite does not."""
+        """Return whether each position (metres) lies on the grid; a position that is not finite does not.
+
+        Args:
+            positions: x, y of each point in metres.
+        """
         rows, columns = self.shape
         with np.errstate(invalid="ignore"):
             column, row_up = self.to_cell_units(positions).T
@@ -113,39 +121,61 @@ class Grid:
             return (column >= -slack) & (column <= columns + slack) & (row_up >= -slack) & (row_up <= rows + slack)
 
     def states(self, positions: Float[np.ndarray, "points 2"]) -> Int[np.ndarray, " points"]:
-        """Return the state of the cell at each position (metres); raise `InputError` for one outside the grid."""
+        """Return the state of the cell at each position.
+
+        Args:
+            positions: x, y of each point in metres.
+
+        Raises:
+            InputError: For a position outside the grid.
+        """
         inside = self.contains(positions)
         if not inside.all():
             index = int(np.argmin(inside))
             raise InputError(f"position {tuple(positions[index].tolist())} lies outside the map", row=index + 1)
-        return self.states_of_cell_units(self.to_cell_units(positions))
+        rows, columns = self.shape
+        # a position on a border, but for rounding, belongs to the cell above or to the right of it; one on the outer
+        # edge to the cell inside it
+        column, row_up = np.floor(self.to_cell_units(positions) + 1e-9).astype(np.int64).T
+        return (rows - 1 - np.clip(row_up, 0, rows - 1)) * columns + np.clip(column, 0, columns - 1)
 
     def state(self, position: tuple[float, float]) -> int:
-        """Return the state of the cell at one position (metres); raise `InputError` outside the grid."""
+        """Return the state of the cell at one position.
+
+        Args:
+            position: x, y in metres.
+
+        Raises:
+            InputError: For a position outside the grid.
+        """
         return int(self.states(np.array([position], dtype=np.float64))[0])
 
     def centers(self, states: Integer[np.ndarray, " points"]) -> Float[np.ndarray, "points 2"]:
-        """Return the position (metres) of the center of each state's cell."""
+        """Return the position (metres) of the center of each state's cell.
+
+        Args:
+            states: The states, in 0…size − 1.
+        """
         rows, columns = self.shape
         row, column = np.divmod(np.asarray(states), columns)
         return self.to_metres(np.stack([column + 0.5, rows - row - 0.5], axis=-1))
 
     def to_cell_units(self, positions: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 2"]:
-        """Return positions in metres as (columns from the left, rows from the *bottom*), not rounded."""
+        """Return positions in metres as (columns from the left, rows from the *bottom*), not rounded.
+
+        Args:
+            positions: x, y of each point in metres.
+        """
         offset = np.asarray(positions, dtype=np.float64) - np.asarray(self.origin[:2])
         return offset @ _rotation(self.origin[2]) / self.resolution
 
     def to_metres(self, cell_units: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 2"]:
-        """Return positions in metres; the inverse of `to_cell_units`."""
-        return cell_units * self.resolution @ _rotation(self.origin[2]).T + np.asarray(self.origin[:2])
+        """Return positions in metres; the inverse of `to_cell_units`.
 
-    def states_of_cell_units(self, cell_units: Float[np.ndarray, "points 2"]) -> Int[np.ndarray, " points"]:
-        """Return the state of each point in cell units; points on the outer edge belong to the cell inside it."""
-        rows, columns = self.shape
-        # a position on a border, but for rounding, belongs to the cell above or to the right of it
-        column, row_up = np.floor(cell_units + 1e-9).astype(np.int64).T
-        row = rows - 1 - np.clip(row_up, 0, rows - 1)
-        return row * columns + np.clip(column, 0, columns - 1)
+        Args:
+            cell_units: Columns from the left and rows from the bottom of each point.
+        """
+        return cell_units * self.resolution @ _rotation(self.origin[2]).T + np.asarray(self.origin[:2])
 
 
 def _rotation(yaw: float) -> Float[np.ndarray, "2 2"]:

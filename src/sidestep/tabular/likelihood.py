@@ -14,7 +14,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.errors import InputError
+from sidestep.errors import check
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.demonstrations import Demonstrations, next_power_of_two, pad_to_power_of_two
@@ -61,17 +61,17 @@ def log_likelihood(
     """Return log L(θ) of demonstrations by agents that act as `behavior` describes and know `model`.
 
     Args:
-        model: the transition model; differentiable in its parameters θ.
-        demonstrations: moves and tasks. One compiled function serves demonstrations of many lengths.
-        behavior: the policy that values of actions lead to; after a fit, `fit.behavior.behavior_of(person)`.
-        terms: the terms that count, "actions", "transitions" or both.
-        options: how values are computed; by default `SolveOptions()`.
+        model: The transition model; differentiable in its parameters θ.
+        demonstrations: Moves and tasks. One compiled function serves demonstrations of many lengths.
+        behavior: The policy that values of actions lead to; after a fit, `fit.behavior.behavior_of(person)`.
+        terms: The terms that count, "actions", "transitions" or both.
+        options: How values are computed; by default `SolveOptions()`.
 
     Returns:
         Both terms. The actions' term is NaN if the values of a task did not converge.
 
     Raises:
-        InputError: for a `BehaviorModel`, which has a behavior of each person.
+        InputError: For a `BehaviorModel`, which has a behavior of each person.
 
     Example:
         >>> from sidestep.tabular.backups import BoltzmannAverage
@@ -88,10 +88,8 @@ def log_likelihood(
     References:
         Equations 1 and 6 of the behavior-aware modeling paper.
     """
-    if not isinstance(behavior, Behavior):
-        raise InputError(
-            "expected a Behavior; a BehaviorModel has one of each person: `behavior_of(person)`", field="behavior"
-        )
+    message = "expected a Behavior; a BehaviorModel has one of each person: `behavior_of(person)`"
+    check(isinstance(behavior, Behavior), message, field="behavior")
     return _log_likelihood(model, pad_to_power_of_two(demonstrations), behavior, terms, options or SolveOptions())
 
 
@@ -104,13 +102,11 @@ def _log_likelihood(
     options: SolveOptions,
 ) -> LogLikelihood:
     actions = transitions = jnp.zeros((), model.probabilities().dtype)
-    weights = demonstrations.weights
     if "actions" in terms:
         each = _log_policies(model, demonstrations, behavior, options)
-        actions = jnp.sum(each * weights.astype(each.dtype))
+        actions = jnp.sum(each * demonstrations.weights.astype(each.dtype))
     if "transitions" in terms:
-        states, next_states = demonstrations.states, demonstrations.next_states
-        transitions = arrival_log_likelihood(model, Arrivals(states, demonstrations.actions, next_states, weights))
+        transitions = arrival_log_likelihood(model, _arrivals(demonstrations))
     return LogLikelihood(actions, transitions)
 
 
@@ -120,10 +116,24 @@ def log_policies(
     """Return log π_θ(a | s) of every move; NaN if the values of a task did not converge.
 
     Args:
-        model: as for `log_likelihood`, like the other arguments.
-        demonstrations: moves and tasks.
-        behavior: the policy that values of actions lead to.
-        options: how values are computed; by default `SolveOptions()`.
+        model: As for `log_likelihood`, like the other arguments.
+        demonstrations: Moves and tasks.
+        behavior: The policy that values of actions lead to.
+        options: How values are computed; by default `SolveOptions()`.
+
+    Returns:
+        One number for each move, in nats.
+
+    Example:
+        >>> from sidestep.tabular.backups import HardMax
+        >>> from sidestep.tabular.demonstrations import Trajectory, gather
+        >>> from sidestep.tabular.grid import Grid
+        >>> from sidestep.tabular.models import true_model
+        >>> from sidestep.tabular.tasks import reach
+        >>> grid = Grid(np.zeros((1, 3), dtype=int))
+        >>> shown = gather([Trajectory(np.array([0, 1, 2]), np.array([3, 3]), task=0)], [reach(grid, 2)])
+        >>> log_policies(true_model(grid), shown, Behavior(HardMax(), 50.0)).shape
+        (2,)
     """
     padded = pad_to_power_of_two(demonstrations)
     return _first(_log_policies(model, padded, behavior, options or SolveOptions()), len(demonstrations))
@@ -137,16 +147,16 @@ def _log_policies(
     solution = solve(model, tasks, behavior, options=options)
     q = visited_action_values(model, tasks, solution.values, task, states)
     # a factor, so that the gradient is NaN too
-    return _log_policy(behavior, q, demonstrations.actions) * _nan_unless(solution.converged.all())
+    return _log_policy(behavior, q, demonstrations.actions) * jnp.where(solution.converged.all(), 1.0, jnp.nan)
 
 
 class Choices(NamedTuple):
     """The distinct actions taken in pursuit of a task, with a leading `tasks` axis for several tasks.
 
     Attributes:
-        states: the state in which each action was taken.
-        actions: the action.
-        counts: the sum of the weights of these moves; 0 for padding.
+        states: The state in which each action was taken.
+        actions: The action.
+        counts: The sum of the weights of these moves; 0 for padding.
     """
 
     states: Int[Array, "*tasks choices"]
@@ -169,13 +179,13 @@ def choice_log_likelihood(
     Over the tasks of `choices_of(demonstrations)` it adds up to the actions' term of `log_likelihood`.
 
     Args:
-        model: as for `solve`, like the arguments that are not explained here.
-        task: one task.
-        choices: of that task.
-        behavior: the policy that values of actions lead to.
-        start: the solve's start.
-        options: how values are computed.
-        region: the states that have to be solved.
+        model: As for `solve`, like the arguments that are not explained here.
+        task: One task.
+        choices: Of that task.
+        behavior: The policy that values of actions lead to.
+        start: The solve's start.
+        options: How values are computed.
+        region: The states that have to be solved.
 
     Returns:
         The log-likelihood, NaN if the values did not converge, and the solution.
@@ -183,14 +193,16 @@ def choice_log_likelihood(
     solution = solve(model, task, behavior, options=options, start=start, visited=choices.states, region=region)
     q = solution.action_values
     total = jnp.sum(choices.counts.astype(q.dtype) * _log_policy(behavior, q, choices.actions))
-    return total * _nan_unless(solution.converged), solution
+    return total * jnp.where(solution.converged, 1.0, jnp.nan), solution
 
 
 def choices_of(demonstrations: Demonstrations) -> Choices:
-    """Return the distinct choices of each task, with their counts."""
-    task, states, actions = (np.asarray(getattr(demonstrations, name)) for name in ("task", "states", "actions"))
-    distinct, which = np.unique(np.stack([task, states, actions]), axis=1, return_inverse=True)
-    counts = np.bincount(which.ravel(), np.asarray(demonstrations.weights))
+    """Return the distinct choices of each task, with their counts.
+
+    Args:
+        demonstrations: The moves and their tasks.
+    """
+    distinct, counts = _distinct_moves(demonstrations, "task", "states", "actions")
     sizes = np.bincount(distinct[0], minlength=len(demonstrations.tasks.terminal))
     filled = np.arange(next_power_of_two(max(int(sizes.max()), _MIN_LENGTH))) < sizes[:, None]
 
@@ -209,7 +221,7 @@ class Arrivals(NamedTuple):
         states: s.
         actions: a.
         next_states: s′.
-        counts: the sum of the weights of these moves; 0 for padding.
+        counts: The sum of the weights of these moves; 0 for padding.
     """
 
     states: Int[Array, " arrivals"]
@@ -219,18 +231,32 @@ class Arrivals(NamedTuple):
 
 
 def arrivals_of(demonstrations: Demonstrations) -> Arrivals:
-    """Return the distinct transitions of all tasks, with their counts; padded by the first one with counts of 0."""
-    moves = np.stack([np.asarray(getattr(demonstrations, name)) for name in ("states", "actions", "next_states")])
-    distinct, which = np.unique(moves, axis=1, return_inverse=True)
-    counts = np.bincount(which.ravel(), np.asarray(demonstrations.weights))
+    """Return the distinct transitions of all tasks, with their counts; padded by the first one with counts of 0.
+
+    Args:
+        demonstrations: The moves.
+    """
+    distinct, counts = _distinct_moves(demonstrations, "states", "actions", "next_states")
     missing = next_power_of_two(max(len(counts), _MIN_LENGTH)) - len(counts)
     padded = np.concatenate([distinct, np.repeat(distinct[:, :1], missing, axis=1)], axis=1)
     states, actions, next_states = (to_jax(part) for part in padded)
     return Arrivals(states, actions, next_states, to_jax(np.pad(counts, (0, missing))))
 
 
+def _distinct_moves(demonstrations: Demonstrations, *fields: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distinct values of some fields, one move a column, and the sum of the weights of each."""
+    moves = np.stack([np.asarray(getattr(demonstrations, field)) for field in fields])
+    distinct, which = np.unique(moves, axis=1, return_inverse=True)
+    return distinct, np.bincount(which.ravel(), np.asarray(demonstrations.weights))
+
+
 def arrival_log_likelihood(model: TransitionModel, arrivals: Arrivals) -> Float[Array, ""]:
-    """Return Σ ln T_θ(s, a, s′) over arrivals, each by its count; those that count 0 may be impossible."""
+    """Return Σ ln T_θ(s, a, s′) over arrivals, each by its count; those that count 0 may be impossible.
+
+    Args:
+        model: The transition model.
+        arrivals: Of its graph.
+    """
     each = jnp.log(jnp.where(arrivals.counts > 0, _transition_probabilities(model, arrivals), 1))
     return jnp.sum(each * arrivals.counts.astype(each.dtype))
 
@@ -242,20 +268,33 @@ def visited_action_values(
     task: Int[Array, " visits"],
     states: Int[Array, " visits"],
 ) -> Float[Array, "visits actions"]:
-    """Return Q(s, a) of visited states, from the values of all tasks."""
+    """Return Q(s, a) of visited states, from the values of all tasks.
+
+    Args:
+        model: The transition model.
+        tasks: All tasks.
+        values: V of each task.
+        task: The task of each visit.
+        states: The state of each visit.
+    """
     after = values[task[:, None, None], model.graph.successors[states]]
     reward = tasks.reward[task, states if tasks.reward.shape[1] > 1 else 0].astype(values.dtype)
     discount = tasks.discount[task, None].astype(values.dtype)
     return action_values(values[task, states], after, model.probabilities()[states], reward, discount)
 
 
-def transition_probabilities(model: TransitionModel, moves: Demonstrations | Arrivals) -> Float[Array, " moves"]:
-    """Return T_θ(s, a, s′) of every move."""
-    if isinstance(moves, Arrivals):
-        return _transition_probabilities(model, moves)
-    padded = pad_to_power_of_two(moves)
-    arrivals = Arrivals(padded.states, padded.actions, padded.next_states, padded.weights)
-    return _first(_transition_probabilities(model, arrivals), len(moves))
+def transition_probabilities(model: TransitionModel, moves: Demonstrations) -> Float[Array, " moves"]:
+    """Return T_θ(s, a, s′) of every move.
+
+    Args:
+        model: The transition model.
+        moves: Their states, actions and next states.
+    """
+    return _first(_transition_probabilities(model, _arrivals(pad_to_power_of_two(moves))), len(moves))
+
+
+def _arrivals(moves: Demonstrations) -> Arrivals:
+    return Arrivals(moves.states, moves.actions, moves.next_states, moves.weights)
 
 
 @eqx.filter_jit
@@ -269,10 +308,6 @@ def _log_policy(
     behavior: Behavior, q: Float[Array, "visits actions"], actions: Int[Array, " visits"]
 ) -> Float[Array, " visits"]:
     return jnp.take_along_axis(behavior.log_policy(q), actions[:, None], axis=-1)[:, 0]
-
-
-def _nan_unless(condition: Bool[Array, ""]) -> Float[Array, ""]:
-    return jnp.where(condition, 1.0, jnp.nan)
 
 
 def _first(each: Float[Array, " padded"], count: int) -> Float[Array, " moves"]:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sidestep._programs import keep_program
-from sidestep.errors import InputError, NotConverged
+from sidestep.errors import NotConverged, check
 from sidestep.tabular.backups import Behavior, HardMax
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import Solution, SolveOptions, check_proper, solve
@@ -25,11 +25,20 @@ class Plan(eqx.Module):
     """A policy for one task under a model; made by `plan`.
 
     Attributes:
-        policy: the probability of each action in every state; an optimal policy is uniform over ties.
-        intended: the state that the most probable action (the first of ties) is meant to reach: its most probable
+        policy: The probability of each action in every state; an optimal policy is uniform over ties.
+        intended: The state that the most probable action (the first of ties) is meant to reach: its most probable
             outcome other than the state itself, or the state itself if there is none.
-        terminal: where the task ends.
-        solution: values and convergence.
+        terminal: Where the task ends.
+        solution: Values and convergence.
+
+    Example:
+        >>> from sidestep.tabular.grid import Grid
+        >>> from sidestep.tabular.models import ObstacleGrid
+        >>> from sidestep.tabular.tasks import reach
+        >>> grid = Grid.unknown(rows=1, columns=4)
+        >>> made = plan(ObstacleGrid(grid), reach(grid, 3))
+        >>> made.intended.tolist()
+        [1, 2, 3, 3]
     """
 
     policy: Float[Array, "states actions"]
@@ -43,26 +52,39 @@ class Plan(eqx.Module):
         The path ends at a terminal state; if the plan never arrives, before the first state that would repeat.
 
         Args:
-            start: a state.
+            start: A state.
+
+        Returns:
+            The states of the path.
 
         Raises:
-            InputError: for a start that is not a state or, at discount 1, from which no terminal state can be reached.
+            InputError: For a start that is not a state or, at discount 1, from which no terminal state can be reached.
         """
-        if not isinstance(start, (int, np.integer)) or not 0 <= start < len(self.terminal):
-            raise InputError(f"expected a state in 0…{len(self.terminal) - 1}, found {start}", field="start")
-        if not bool(is_reachable(self.solution.values[start])):
-            raise InputError(f"the goal cannot be reached from state {start}", field="start")
+        is_state = isinstance(start, (int, np.integer)) and 0 <= start < len(self.terminal)
+        check(is_state, f"expected a state in 0…{len(self.terminal) - 1}, found {start}", field="start")
+        reaches = is_reachable(self.solution.values[start])
+        check(reaches, f"the goal cannot be reached from state {start}", field="start")
         return self.follow(np.array([start]))[0]
 
     def follow(self, starts: Int[np.ndarray, " starts"]) -> list[Int[np.ndarray, " _"]]:
-        """Return `path_from` of each start, without its checks."""
+        """Return `path_from` of each start, without its checks.
+
+        Args:
+            starts: The first state of each path.
+        """
         return followed(np.asarray(self.intended), np.asarray(self.terminal), starts)
 
 
 def followed(
     intended: Int[np.ndarray, " states"], terminal: Bool[np.ndarray, " states"], starts: Int[np.ndarray, " starts"]
 ) -> list[Int[np.ndarray, " _"]]:
-    """Return the states from each start on, `intended` after each, up to a terminal one or before one would repeat."""
+    """Return the states from each start on, `intended` after each, up to a terminal one or before one would repeat.
+
+    Args:
+        intended: The state after each state.
+        terminal: Where paths end.
+        starts: The first state of each path.
+    """
 
     def path(start: int) -> Int[np.ndarray, " steps"]:
         states, seen = [start], {start}
@@ -80,14 +102,17 @@ def plan(
     """Return the optimal plan for a task under a model, or with `behavior` the plan of an agent that behaves like that.
 
     Args:
-        model: the transition model.
-        task: one task.
-        behavior: the agent's, π ∝ exp βQ; None for the optimal policy.
-        options: how values are computed; by default `SolveOptions()`.
+        model: The transition model.
+        task: One task.
+        behavior: The agent's, π ∝ exp βQ; None for the optimal policy.
+        options: How values are computed; by default `SolveOptions()`.
+
+    Returns:
+        The plan.
 
     Raises:
-        ImproperTask: for a task that has no values.
-        NotConverged: if the values do not converge.
+        ImproperTask: For a task that has no values.
+        NotConverged: If the values do not converge.
 
     Example:
         >>> from sidestep.tabular.grid import Grid
@@ -127,9 +152,20 @@ class RollOuts(NamedTuple):
     """Trajectories of several agents that follow a policy; made by `roll_out`.
 
     Attributes:
-        states: the state before every move, and at the end.
-        actions: the action of every move; −1 after the agent has arrived.
-        arrived: whether the agent reached a terminal state.
+        states: The state before every move, and at the end.
+        actions: The action of every move; −1 after the agent has arrived.
+        arrived: Whether the agent reached a terminal state.
+
+    Example:
+        >>> from sidestep.tabular.grid import Grid
+        >>> from sidestep.tabular.models import true_model
+        >>> from sidestep.tabular.tasks import reach
+        >>> grid = Grid(np.zeros((1, 4), dtype=int))
+        >>> world = true_model(grid)
+        >>> made = plan(world, reach(grid, 3))
+        >>> rolled = roll_out(jax.random.key(0), world, made.policy, made.terminal, jnp.array([0, 2]), max_moves=5)
+        >>> rolled.moves.tolist()
+        [3, 1]
     """
 
     states: Int[Array, "agents moves+1"]
@@ -159,12 +195,26 @@ def roll_out(
     """Return trajectories of agents that follow a policy in a world.
 
     Args:
-        key: of the random choices; the trajectory of agent i does not depend on how many agents come after it.
-        world: the transition model that moves follow; the policy may have been made for another one.
-        policy: the probability of each action in every state.
-        terminal: where agents stop.
-        starts: the state that each agent starts in.
-        max_moves: the number of moves after which an agent stops anyway.
+        key: Of the random choices; the trajectory of agent i does not depend on how many agents come after it.
+        world: The transition model that moves follow; the policy may have been made for another one.
+        policy: The probability of each action in every state.
+        terminal: Where agents stop.
+        starts: The state that each agent starts in.
+        max_moves: The number of moves after which an agent stops anyway.
+
+    Returns:
+        The trajectories, one for each start.
+
+    Example:
+        >>> from sidestep.tabular.grid import Grid
+        >>> from sidestep.tabular.models import true_model
+        >>> from sidestep.tabular.tasks import reach
+        >>> grid = Grid(np.zeros((1, 4), dtype=int))
+        >>> world = true_model(grid)
+        >>> made = plan(world, reach(grid, 3))
+        >>> rolled = roll_out(jax.random.key(0), world, made.policy, made.terminal, jnp.array([0, 2]), max_moves=5)
+        >>> rolled.arrived.tolist()
+        [True, True]
     """
     log_policy, log_probabilities = jnp.log(policy), jnp.log(world.probabilities())
 

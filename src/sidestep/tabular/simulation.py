@@ -29,18 +29,21 @@ def simulate(
     """Return trajectories of agents that know a world and pursue tasks in it.
 
     Args:
-        key: of the random choices.
-        world: the transition model that the agents plan with and that their moves follow.
-        tasks: the tasks that are pursued.
-        starts: for each task the states that its agents start in, one agent an entry.
-        behavior: the agents'; None for the optimal policy, with ties broken at random.
-        max_moves: the number of moves after which an agent gives up; by default twice the number of states, and at
+        key: Of the random choices.
+        world: The transition model that the agents plan with and that their moves follow.
+        tasks: The tasks that are pursued.
+        starts: For each task the states that its agents start in, one agent an entry.
+        behavior: The agents'; None for the optimal policy, with ties broken at random.
+        max_moves: The number of moves after which an agent gives up; by default twice the number of states, and at
             least 1000.
 
+    Returns:
+        The trajectories, those of the first task first.
+
     Raises:
-        InputError: for an agent that has not arrived after `max_moves`.
-        ImproperTask: for a task that has no values.
-        NotConverged: if the values of a task do not converge.
+        InputError: For an agent that has not arrived after `max_moves`.
+        ImproperTask: For a task that has no values.
+        NotConverged: If the values of a task do not converge.
 
     Example:
         >>> from sidestep.tabular.grid import Grid

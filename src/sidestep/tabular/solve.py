@@ -13,6 +13,7 @@ values. This differs from the textbook method in two points:
 """
 
 from functools import partial
+from typing import cast
 
 import equinox as eqx
 import jax
@@ -20,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.errors import ImproperTask, InputError
+from sidestep.errors import ImproperTask, check, check_count
 from sidestep.tabular.backups import Backup, Behavior, Gradient, LogSumExp
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solvers import base
@@ -33,7 +34,12 @@ SMALL_PROBLEM = 400
 
 
 def default_solver(backup: Backup, states: int) -> base.Solver:
-    """Return `GaussSeidel` for larger problems on a CPU with a backup that has machine code, `Jacobi` otherwise."""
+    """Return `GaussSeidel` for larger problems on a CPU with a backup that has machine code, `Jacobi` otherwise.
+
+    Args:
+        backup: Of the behavior.
+        states: Their number.
+    """
     if jax.default_backend() == "cpu" and states >= SMALL_PROBLEM and type(backup) in KERNELS:
         return GaussSeidel()
     return Jacobi()
@@ -44,12 +50,12 @@ class SolveOptions(eqx.Module):
 
     Attributes:
         gradient: "exact", or "fixed_policy" for the derivative of the average under the policy held fixed (eqs. 9, 10).
-        horizon: the number of actions that agents look ahead, at least 1; None for the fixed point of the Bellman
+        horizon: The number of actions that agents look ahead, at least 1; None for the fixed point of the Bellman
             equation.
-        solver: computes the fixed point; None for the one that `default_solver` chooses.
+        solver: Computes the fixed point; None for the one that `default_solver` chooses.
 
     Raises:
-        InputError: for another gradient, or a horizon below 1.
+        InputError: For another gradient, or a horizon below 1.
 
     Example:
         >>> SolveOptions(gradient="fixed_policy").horizon is None
@@ -61,17 +67,20 @@ class SolveOptions(eqx.Module):
     solver: base.Solver | None = None
 
     def __check_init__(self) -> None:
-        if self.gradient not in ("exact", "fixed_policy"):
-            raise InputError(f"expected 'exact' or 'fixed_policy', found {self.gradient!r}", field="gradient")
-        if self.horizon is not None and self.horizon < 1:
-            raise InputError(f"expected at least one action, found {self.horizon}", field="horizon")
+        known = self.gradient in ("exact", "fixed_policy")
+        check(known, f"expected 'exact' or 'fixed_policy', found {self.gradient!r}", field="gradient")
+        if self.horizon is not None:
+            check_count(self.horizon, 1, "horizon")
 
     def solver_for(self, backup: Backup, states: int) -> base.Solver:
         """Return `solver`, or without one the default for a problem of that many states.
 
         Args:
-            backup: of the behavior.
-            states: their number.
+            backup: Of the behavior.
+            states: Their number.
+
+        Returns:
+            The solver.
         """
         return self.solver or default_solver(backup, states)
 
@@ -82,10 +91,19 @@ class Solution(eqx.Module):
     Attributes:
         values: V(s); at discount 1, near `solvers.base.neg_inf` (for −∞) where no terminal state can be reached.
         action_values: Q(s, a) of all states, or of the `visited` ones.
-        sweeps: the number of times that each state was solved, on average; the horizon where it is finite.
-        residual: the largest relative change in the last sweep; 0 for a finite horizon.
-        converged: whether the residual is within the solver's tolerance.
-        start: the start of a later solve of the same task under a similar model.
+        sweeps: The number of times that each state was solved, on average; the horizon where it is finite.
+        residual: The largest relative change in the last sweep; 0 for a finite horizon.
+        converged: Whether the residual is within the solver's tolerance.
+        start: The start of a later solve of the same task under a similar model.
+
+    Example:
+        >>> from sidestep.tabular.backups import HardMax
+        >>> from sidestep.tabular.grid import Grid
+        >>> from sidestep.tabular.models import true_model
+        >>> from sidestep.tabular.tasks import reach
+        >>> grid = Grid(np.zeros((1, 3), dtype=int))
+        >>> bool(solve(true_model(grid), reach(grid, 2), Behavior(HardMax())).converged)
+        True
     """
 
     values: Float[Array, "*tasks states"]
@@ -96,6 +114,8 @@ class Solution(eqx.Module):
     start: base.WarmStart
 
 
+# Compiled as a whole: otherwise every call would compile the loops of a solver again.
+@eqx.filter_jit
 def solve(
     model: TransitionModel,
     task: Task,
@@ -111,16 +131,16 @@ def solve(
     Usable under `jit`, `vmap` and `grad`. The numbers have the dtype of the model's probabilities.
 
     Args:
-        model: the transition model.
-        task: one task, or several by `stack_tasks`.
-        behavior: the backup that agents value states with, and their β.
-        options: how the values are computed; by default `SolveOptions()`.
-        start: the `start` of an earlier solution of the same task or tasks; by default a cold start. Within the
+        model: The transition model.
+        task: One task, or several by `stack_tasks`.
+        behavior: The backup that agents value states with, and their β.
+        options: How the values are computed; by default `SolveOptions()`.
+        start: The `start` of an earlier solution of the same task or tasks; by default a cold start. Within the
             region, the solution does not depend on it beyond the tolerance. The gradient with respect to
             `start.adjoint` is the new adjoint λ, which the next solve can start from.
-        visited: the states to compute action values of; by default all. Few of them save time and memory where they
+        visited: The states to compute action values of; by default all. Few of them save time and memory where they
             are differentiated.
-        region: the states that have to be solved; by default all. `start.region` has those with an adjoint other than
+        region: The states that have to be solved; by default all. `start.region` has those with an adjoint other than
             0 in the earlier solve. `GaussSeidel` updates the others only roughly, to save time. Derivatives are NaN
             where these others are seen to matter, but a state that did not matter before and does now is not noticed:
             use this only where the result is checked later, such as in a line search.
@@ -141,47 +161,29 @@ def solve(
         Equations 2-5 (values) and 7-10 (gradients) of the behavior-aware modeling paper. The adjoint method for fixed
         points: Christianson, "Reverse accumulation and attractive fixed points" (1994).
     """
-    return _solve(model, task, behavior, options or SolveOptions(), start, visited, region)
-
-
-# Compiled as a whole: otherwise every call would compile the loops of a solver again.
-@eqx.filter_jit
-def _solve(
-    model: TransitionModel,
-    task: Task,
-    behavior: Behavior,
-    options: SolveOptions,
-    start: base.WarmStart | None,
-    visited: Int[Array, "*tasks visited"] | None,
-    region: Bool[Array, "*tasks states"] | None,
-) -> Solution:
+    options = options or SolveOptions()
     solver = options.solver_for(behavior.backup, model.graph.states)
     probabilities = model.probabilities()
-    dtype = probabilities.dtype
-    behavior = eqx.tree_at(lambda agent: agent.beta, behavior, behavior.beta.astype(dtype))
-
-    begin = start or _cold_start(solver, model.graph.states, dtype, task.terminal.shape[:-1])
+    dtype, beta = probabilities.dtype, behavior.beta.astype(probabilities.dtype)
+    cold, tasks = solver.cold_start(model.graph.states, dtype), task.terminal.shape[:-1]
+    begin = start or jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*tasks, *leaf.shape)), cold)
     everywhere = jnp.ones(task.terminal.shape, dtype=bool) if region is None else region
 
     def one(task: Task, start: base.WarmStart, visited: Array | None, region: Array) -> Solution:
-        process = base.DecisionProcess(
-            model.graph.successors,
-            probabilities,
-            task.reward.astype(dtype),
-            task.terminal_reward.astype(dtype),
-            task.terminal,
-            task.discount.astype(dtype),
-        )
+        process = decision_process(model, probabilities, task)
         some = jnp.zeros(0, jnp.int32) if visited is None else visited
         if options.horizon is None:
-            equation = base.BellmanEquation(process, behavior.backup, behavior.beta)
-            result, rows = _solve_fixed_point(equation, options.gradient, solver, start, some, region)
+            equation = base.BellmanEquation(process, behavior.backup, beta)
+            inputs, fixed = equation.inputs, jax.lax.stop_gradient((equation.inputs, start))
+            result = solver.values(equation.at(fixed[0]), fixed[1], region)
+            constants = (process.successors, process.terminal, solver, result.order, region, some)
+            solved = _implicit(behavior.backup, options.gradient, constants, inputs, result.values, start.adjoint)
+            values, rows = cast(tuple[Array, Array], solved)
         else:
-            values = base.finite_horizon(process, behavior.backup, behavior.beta, options.horizon, options.gradient)
+            values = base.finite_horizon(process, behavior.backup, beta, options.horizon, options.gradient)
             sweeps, residual = jnp.asarray(options.horizon), jnp.asarray(0, values.dtype)
             result = base.SolveResult(values, start.order, sweeps, residual, jnp.isfinite(values).all())
             rows = probabilities[some]
-        values = result.values
         if visited is None:
             q = process.action_values(values)
         else:
@@ -191,13 +193,22 @@ def _solve(
         next_start = base.WarmStart(jax.lax.stop_gradient(values), start.adjoint, result.order)
         return Solution(values, q, result.sweeps, result.residual, result.converged, next_start)
 
-    arguments = task, begin, visited, everywhere
-    return jax.vmap(one)(*arguments) if task.terminal.ndim == 2 else one(*arguments)
+    return (jax.vmap(one) if task.terminal.ndim == 2 else one)(task, begin, visited, everywhere)
 
 
-def _cold_start(solver: base.Solver, states: int, dtype: jnp.dtype, tasks: tuple[int, ...]) -> base.WarmStart:
-    cold = solver.cold_start(states, dtype)
-    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*tasks, *leaf.shape)), cold)
+def decision_process(
+    model: TransitionModel, probabilities: Float[Array, "states actions outcomes"], task: Task
+) -> base.DecisionProcess:
+    """Return one task under a model with these probabilities, in numbers of their dtype.
+
+    Args:
+        model: The transition model.
+        probabilities: Its probabilities.
+        task: One task.
+    """
+    cast = (leaf.astype(probabilities.dtype) for leaf in (task.reward, task.terminal_reward, task.discount))
+    reward, terminal_reward, discount = cast
+    return base.DecisionProcess(model.graph.successors, probabilities, reward, terminal_reward, task.terminal, discount)
 
 
 def check_proper(task: Task, behavior: Behavior, actions: int, horizon: int | None = None) -> None:
@@ -208,13 +219,14 @@ def check_proper(task: Task, behavior: Behavior, actions: int, horizon: int | No
     agents otherwise gain by never arriving.
 
     Args:
-        task: one task or a stack.
-        behavior: of the agents.
-        actions: the number of actions.
-        horizon: as in `SolveOptions`.
+        task: One task or a stack.
+        behavior: Of the agents.
+        actions: The number of actions.
+        horizon: As in `SolveOptions`.
 
     Raises:
-        ImproperTask: where they are not.
+        InputError: For a task or behavior of another type.
+        ImproperTask: Where values are infinite or not unique.
 
     Example:
         >>> from sidestep.tabular.grid import Grid
@@ -222,6 +234,8 @@ def check_proper(task: Task, behavior: Behavior, actions: int, horizon: int | No
         >>> goal = reach(Grid.unknown(2, 2), 0, discount=1.0, step_cost=1.0)
         >>> check_proper(goal, Behavior(LogSumExp(), beta=10.0), actions=4)
     """
+    check(isinstance(task, Task), f"expected a Task, found {type(task).__name__}", field="task")
+    check(isinstance(behavior, Behavior), f"expected a Behavior, found {type(behavior).__name__}", field="behavior")
     endless = np.atleast_1d(np.asarray(task.discount)) == 1
     if horizon is not None or not endless.any():
         return
@@ -239,34 +253,14 @@ def check_proper(task: Task, behavior: Behavior, actions: int, horizon: int | No
     if isinstance(behavior.backup, LogSumExp) and (endless & (acting >= -bonus)).any():
         raise ImproperTask(
             f"at discount 1 a log-sum-exp agent with β = {float(behavior.beta):g} and {actions} actions gains "
-            f"log(actions)/β = {bonus:.4g} with every action and never wants to arrive: expected a step cost "
-            "above that, a larger β, a discount below 1 or another backup"
+            f"log(actions)/β = {bonus:.4g} with every action, so an endless path is worth more than one to the goal: "
+            "expected a step cost above that, a larger β, a discount below 1 or another backup"
         )
-
-
-def _solve_fixed_point(
-    equation: base.BellmanEquation,
-    gradient: Gradient,
-    solver: base.Solver,
-    start: base.WarmStart,
-    visited: Int[Array, " visited"],
-    region: base.Region,
-) -> tuple[base.SolveResult, Float[Array, "visited actions outcomes"]]:
-    inputs, process, backup = equation.inputs, equation.process, equation.backup
-    result = solver.values(equation.at(jax.lax.stop_gradient(inputs)), jax.lax.stop_gradient(start), region)
-    constants = (process.successors, process.terminal, solver, result.order, region, visited)
-    solved: tuple[Array, Array] = _implicit(backup, gradient, constants, inputs, result.values, start.adjoint)
-    return result._replace(values=solved[0]), solved[1]
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def _implicit(
-    backup: Backup,
-    gradient: Gradient,
-    constants: tuple,
-    inputs: base.Cotangents,
-    values: base.Values,
-    adjoint: base.Values,
+    backup: Backup, gradient: Gradient, constants: tuple, inputs: base.Cotangents, values: Array, adjoint: Array
 ) -> tuple[base.Values, Float[Array, "visited actions outcomes"]]:
     """Return the solution V of V = F(V, φ), φ = `inputs`, with its gradient by the adjoint equation.
 

@@ -20,7 +20,7 @@ class TransitionModel(eqx.Module):
     """Probabilities T_θ on a graph; a new family of models is a subclass with `probabilities`.
 
     Attributes:
-        graph: the states that each action can lead to.
+        graph: The states that each action can lead to.
         parameters: θ, a pytree of floating-point arrays, all of which are learned.
 
     Example:
@@ -42,5 +42,8 @@ class TransitionModel(eqx.Module):
 
         Args:
             parameters: θ, of the same structure.
+
+        Returns:
+            The model.
         """
         return eqx.tree_at(lambda model: model.parameters, self, parameters)

@@ -18,7 +18,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.errors import InputError
+from sidestep.errors import check
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.models.base import TransitionModel
@@ -28,7 +28,12 @@ FIXED, IMPOSSIBLE = -1, -2
 
 
 def logit_array(logits: Float[Array | np.ndarray, "..."] | float, shape: tuple[int, ...]) -> Float[Array, "..."]:
-    """Return logits of the given shape, from one number for all or one for each; arrays keep their precision."""
+    """Return logits of the given shape, from one number for all or one for each; arrays keep their precision.
+
+    Args:
+        logits: One number, or an array of that shape.
+        shape: Of the result.
+    """
     if isinstance(logits, jax.Array):
         return jnp.broadcast_to(logits, shape)
     array = np.asarray(logits)
@@ -37,13 +42,17 @@ def logit_array(logits: Float[Array | np.ndarray, "..."] | float, shape: tuple[i
     return to_jax(np.broadcast_to(array, shape))
 
 
+def _check_each_action_has_an_outcome(possible: Bool[np.ndarray, "states actions outcomes"], field: str) -> None:
+    check(possible.any(axis=-1).all(), "expected a possible outcome for every state and action", field=field)
+
+
 class TabularModel(TransitionModel):
     """A categorical model with a separate logit for every outcome of every state and action.
 
     Attributes:
-        graph: the states that each action can lead to.
-        parameters: logits; the probabilities are their softmax over outcomes.
-        possible: whether each outcome can happen; the others have probability 0.
+        graph: The states that each action can lead to.
+        parameters: Logits; the probabilities are their softmax over outcomes.
+        possible: Whether each outcome can happen; the others have probability 0.
 
     Example:
         >>> from sidestep.tabular.graph import graph
@@ -64,10 +73,10 @@ class TabularModel(TransitionModel):
         """Raise `InputError` for shapes that differ from the graph's or an action without a possible outcome."""
         self.graph, self.parameters = graph, logits
         self.possible = to_jax(np.ones(logits.shape, dtype=bool)) if possible is None else possible
-        if not logits.shape == self.possible.shape == graph.successors.shape:
-            raise InputError(f"expected the graph's shape {graph.successors.shape}", field="logits, possible")
-        if not isinstance(self.possible, Tracer) and not np.asarray(self.possible).any(axis=-1).all():
-            raise InputError("expected a possible outcome for every state and action", field="possible")
+        same_shapes = logits.shape == self.possible.shape == graph.successors.shape
+        check(same_shapes, f"expected the graph's shape {graph.successors.shape}", field="logits, possible")
+        if not isinstance(self.possible, Tracer):
+            _check_each_action_has_an_outcome(np.asarray(self.possible), "possible")
 
     def probabilities(self) -> Float[Array, "states actions outcomes"]:
         """Return the softmax of the logits over the possible outcomes."""
@@ -78,9 +87,9 @@ class TiedModel(TransitionModel):
     """A categorical model in which outcomes share logits.
 
     Attributes:
-        graph: the states that each action can lead to.
+        graph: The states that each action can lead to.
         parameters: θ, one logit for each index.
-        index: the index of each outcome's logit; `FIXED` for a logit of 0, `IMPOSSIBLE` for an impossible outcome.
+        index: The index of each outcome's logit; `FIXED` for a logit of 0, `IMPOSSIBLE` for an impossible outcome.
 
     Example:
         >>> from sidestep.tabular.graph import graph
@@ -102,18 +111,17 @@ class TiedModel(TransitionModel):
         """Make a model with logits: one number for all, or one for each index.
 
         Raises:
-            InputError: for an index of another shape than the graph's, below `IMPOSSIBLE` or beyond the logits, and
+            InputError: For an index of another shape than the graph's, below `IMPOSSIBLE` or beyond the logits, and
                 for an action without a possible outcome.
         """
-        if index.shape != graph.successors.shape:
-            raise InputError(f"expected the graph's shape {graph.successors.shape}, found {index.shape}", field="index")
+        same_shape = index.shape == graph.successors.shape
+        check(same_shape, f"expected the graph's shape {graph.successors.shape}, found {index.shape}", field="index")
         index = np.asarray(index)
         count = max(int(index.max(initial=FIXED)) + 1, 0)
         parameters = logit_array(logits, np.shape(logits) or (count,))
-        if index.min() < IMPOSSIBLE or count > len(parameters):
-            raise InputError(f"expected {IMPOSSIBLE}…{len(parameters) - 1}", field="index")
-        if (index == IMPOSSIBLE).all(axis=-1).any():
-            raise InputError("expected a possible outcome for every state and action", field="index")
+        in_range = index.min() >= IMPOSSIBLE and count <= len(parameters)
+        check(in_range, f"expected {IMPOSSIBLE}…{len(parameters) - 1}", field="index")
+        _check_each_action_has_an_outcome(index != IMPOSSIBLE, "index")
         self.graph, self.parameters, self.index = graph, parameters, to_jax(index, np.int32)
 
     def probabilities(self) -> Float[Array, "states actions outcomes"]:

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from sidestep._programs import keep_program
 from sidestep._typing import FloatTree
-from sidestep.errors import InputError
+from sidestep.errors import check
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph, grid_graph, grid_successors
 from sidestep.tabular.grid import STEPS, Cell, Grid
@@ -31,9 +31,9 @@ class ObstacleGrid(TransitionModel):
     """A grid with cells that may be blocked; moves into a blocked cell stay.
 
     Attributes:
-        graph: outcomes are the cell moved into, and staying.
-        parameters: the logit θ(s) of each cell, P(blocked) = σ(θ(s)); those of known cells have no effect.
-        known: the `Cell` value of each cell on the map; known cells have P(blocked) 0 or 1.
+        graph: Outcomes are the cell moved into, and staying.
+        parameters: The logit θ(s) of each cell, P(blocked) = σ(θ(s)); those of known cells have no effect.
+        known: The `Cell` value of each cell on the map; known cells have P(blocked) 0 or 1.
 
     Example:
         >>> ObstacleGrid(Grid.unknown(2, 3)).blocked.shape
@@ -73,11 +73,11 @@ class FeaturedGrid(TransitionModel):
     holds for all with the same features.
 
     Attributes:
-        graph: outcomes are the cell moved into, and staying.
+        graph: Outcomes are the cell moved into, and staying.
         parameters: w, the floating-point arrays of a network.
-        network: the rest of the network.
-        features: of each cell, in the order of states.
-        known: as in `ObstacleGrid`.
+        network: The rest of the network.
+        features: Of each cell, in the order of states.
+        known: As in `ObstacleGrid`.
 
     Example:
         >>> import equinox as eqx
@@ -101,19 +101,17 @@ class FeaturedGrid(TransitionModel):
         """Make a model from a network (an Equinox module) that maps the features of a cell to its logit.
 
         Raises:
-            InputError: for features that are not finite or not those of every cell, and for a network without
+            InputError: For features that are not finite or not those of every cell, and for a network without
                 parameters or with another output.
         """
         features = to_jax(features)
-        if features.shape[0] != grid.size or not np.isfinite(features).all():
-            raise InputError(f"expected {grid.size} rows of finite numbers, found {features.shape}", field="features")
+        complete = features.shape[0] == grid.size and np.isfinite(features).all()
+        check(complete, f"expected {grid.size} rows of finite numbers, found {features.shape}", field="features")
         self.graph, self.known, self.features = grid_graph(grid), to_jax(grid.known), features
         self.parameters, self.network = eqx.partition(network, eqx.is_inexact_array)
-        if not jax.tree.leaves(self.parameters):
-            raise InputError("expected parameters to learn, found none", field="network")
+        check(jax.tree.leaves(self.parameters), "expected parameters to learn, found none", field="network")
         shape = jax.eval_shape(network, features[0]).shape
-        if shape != ():
-            raise InputError(f"expected one number for each cell, found shape {shape}", field="network")
+        check(shape == (), f"expected one number for each cell, found shape {shape}", field="network")
 
     @property
     def logits(self) -> Float[Array, " cells"]:
@@ -134,7 +132,10 @@ def borders(grid: Grid) -> Int[np.ndarray, "borders 2"]:
     """Return the two cells beside every border inside a grid: borders between columns, then between rows.
 
     Args:
-        grid: the cells.
+        grid: The cells.
+
+    Returns:
+        The two states of each border, the left or upper one first.
 
     Example:
         >>> borders(Grid.unknown(1, 3)).tolist()
@@ -154,15 +155,17 @@ def walled_grid(grid: Grid, logits: Float[Array | np.ndarray, " borders"] | floa
         grid: 4-connected.
         logits: θ, one number for all, or one for each border in the order of `borders(grid)`.
 
+    Returns:
+        The model, with one logit for each border.
+
     Raises:
-        InputError: for 8-connected grids, because a diagonal crosses no border.
+        InputError: For 8-connected grids, because a diagonal crosses no border.
 
     Example:
         >>> walled_grid(Grid.unknown(1, 3)).parameters.shape
         (2,)
     """
-    if grid.connectivity != 4:
-        raise InputError("expected 4: a diagonal crosses no border", field="connectivity")
+    check(grid.connectivity == 4, "expected 4: a diagonal crosses no border", field="connectivity")
     graph, between = grid_graph(grid), borders(grid)
     number = {(int(a), int(b)): index for index, pair in enumerate(between) for a, b in (pair, pair[::-1])}
     index = np.full(graph.successors.shape, IMPOSSIBLE)
@@ -177,7 +180,12 @@ def walled_grid(grid: Grid, logits: Float[Array | np.ndarray, " borders"] | floa
 
 @keep_program
 def blocked_of(logits: Float[Array, " cells"], known: Int[Array, "rows columns"]) -> Float[Array, "rows columns"]:
-    """Return P(blocked), exactly 0 or 1 for known cells."""
+    """Return P(blocked), exactly 0 or 1 for known cells.
+
+    Args:
+        logits: θ of each cell.
+        known: The `Cell` value of each cell.
+    """
     learned = jax.nn.sigmoid(logits).reshape(known.shape)
     return jnp.where(known == Cell.UNKNOWN, learned, (known == Cell.OCCUPIED).astype(learned.dtype))
 
@@ -186,7 +194,13 @@ def blocked_of(logits: Float[Array, " cells"], known: Int[Array, "rows columns"]
 def chances_of_moves(
     logits: Float[Array, " cells"], known: Int[Array, "rows columns"], actions: int
 ) -> Float[Array, "states actions outcomes"]:
-    """Return the probabilities that each move succeeds, and that it fails, from the logits of the cells."""
+    """Return the probabilities that each move succeeds, and that it fails, from the logits of the cells.
+
+    Args:
+        logits: θ of each cell.
+        known: The `Cell` value of each cell.
+        actions: 4, or 8 with diagonals.
+    """
     certain = jnp.where(known == Cell.OCCUPIED, jnp.inf, -jnp.inf)
     logits = jnp.where(known == Cell.UNKNOWN, logits.reshape(known.shape), certain)
     # off the map nothing is blocked
@@ -194,18 +208,11 @@ def chances_of_moves(
     blocked = jnp.pad(jax.nn.sigmoid(logits), 1)
     # without a barrier the compiler computes these again for every move
     free, blocked = jax.lax.optimization_barrier((free, blocked))
-    outcomes = [
-        outcome for down, right in STEPS[:actions].tolist() for outcome in _outcomes(free, blocked, down, right)
-    ]
-    return jnp.stack(outcomes, axis=-1).reshape(-1, actions, 2)
+    outcomes = [_outcomes(free, blocked, down, right) for down, right in STEPS[:actions].tolist()]
+    return jnp.stack([chance for chances in outcomes for chance in chances], axis=-1).reshape(-1, actions, 2)
 
 
-def _outcomes(
-    free: Float[Array, "padded_rows padded_columns"],
-    blocked: Float[Array, "padded_rows padded_columns"],
-    down: int,
-    right: int,
-) -> tuple[Float[Array, "rows columns"], Float[Array, "rows columns"]]:
+def _outcomes(free: Array, blocked: Array, down: int, right: int) -> tuple[Array, Array]:
     """Return the probabilities that a move from each cell succeeds, and that it fails, from those of the padded map.
 
     Slices of the map rather than look-ups: their derivatives are slices too.
@@ -227,7 +234,10 @@ def true_model(grid: Grid) -> ObstacleGrid:
     """Return the deterministic model of a map; unknown cells count as blocked.
 
     Args:
-        grid: the map.
+        grid: The map.
+
+    Returns:
+        The model, with P(blocked) 0 or 1 everywhere.
 
     Example:
         >>> true_model(Grid(np.array([[0, 1]]))).blocked.tolist()

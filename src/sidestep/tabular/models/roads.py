@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sidestep.errors import InputError
+from sidestep.errors import check
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.models.categorical import FIXED, IMPOSSIBLE, TiedModel, logit_array
@@ -25,26 +25,26 @@ def road_network(
     """Return the model of a road network in which links or turns may be closed.
 
     Args:
-        turns: the link before and the link after each turn, each once.
-        lengths: of every link, above 0; a turn is as long as the link that it leads onto.
+        turns: The link before and the link after each turn, each once.
+        lengths: Of every link, above 0; a turn is as long as the link that it leads onto.
         logits: θ, one number for all, or one for each link (with `by_turn`, for each turn in the order of `turns`).
-        by_turn: whether turns may be closed rather than links.
+        by_turn: Whether turns may be closed rather than links.
 
     Returns:
         The model; action k of a link is the k-th of its turns, in the order of `turns`.
 
     Raises:
-        InputError: for turns that repeat or between links that do not exist, and for lengths out of range.
+        InputError: For turns that repeat or between links that do not exist, and for lengths out of range.
 
     Example:
         >>> road_network(np.array([[0, 1], [1, 0]]), np.ones(2)).graph.states
         2
     """
     links = len(lengths)
-    if not (np.isfinite(lengths).all() and (lengths > 0).all()):
-        raise InputError("expected finite numbers above 0", field="lengths")
-    if len(turns) == 0 or turns.min() < 0 or turns.max() >= links or len(np.unique(turns, axis=0)) < len(turns):
-        raise InputError(f"expected different turns between links 0…{links - 1}", field="turns")
+    check(np.isfinite(lengths).all() and (lengths > 0).all(), "expected finite numbers above 0", field="lengths")
+    between_links = len(turns) and turns.min() >= 0 and turns.max() < links
+    different = between_links and len(np.unique(turns, axis=0)) == len(turns)
+    check(different, f"expected different turns between links 0…{links - 1}", field="turns")
     order = np.argsort(turns[:, 0], kind="stable")
     begin, onto = turns[order].T
     first = np.searchsorted(begin, begin)
@@ -66,7 +66,10 @@ def closed(model: TiedModel) -> Float[Array, " logits"]:
     """Return P(closed) of every link, turn or border: σ(θ).
 
     Args:
-        model: made by `road_network` or `walled_grid`.
+        model: Made by `road_network` or `walled_grid`.
+
+    Returns:
+        One probability for each logit.
 
     Example:
         >>> closed(road_network(np.array([[0, 1], [1, 0]]), np.ones(2), logits=0.0)).tolist()

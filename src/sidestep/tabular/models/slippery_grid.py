@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sidestep.errors import InputError
+from sidestep.errors import check
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph, grid_successors
 from sidestep.tabular.grid import STEPS, Grid
@@ -30,10 +30,10 @@ class SlipperyGrid(TransitionModel):
     """A grid with cells that may be blocked, and on which moves slip sideways, by the terrain.
 
     Attributes:
-        graph: outcomes are going ahead, to one side, to the other side, and staying.
-        parameters: the logits θ of the cells, then the logits φ of the slips, one for each terrain.
-        terrain: of each cell, 0…n − 1; −1 where moves do not slip.
-        known: as in `ObstacleGrid`.
+        graph: Outcomes are going ahead, to one side, to the other side, and staying.
+        parameters: The logits θ of the cells, then the logits φ of the slips, one for each terrain.
+        terrain: Of each cell, 0…n − 1; −1 where moves do not slip.
+        known: As in `ObstacleGrid`.
 
     Example:
         >>> SlipperyGrid(Grid.unknown(2, 3), slip=0.0).slip.tolist()
@@ -57,14 +57,14 @@ class SlipperyGrid(TransitionModel):
         By default the terrain is the same everywhere.
 
         Raises:
-            InputError: for terrain of another shape than the grid, below −1, or with a gap in its numbers.
+            InputError: For terrain of another shape than the grid, below −1, or with a gap in its numbers.
         """
         terrain = np.zeros(grid.shape, dtype=np.int64) if terrain is None else terrain
-        if terrain.shape != grid.shape:
-            raise InputError(f"expected the grid's shape {grid.shape}, found {terrain.shape}", field="terrain")
+        same_shape = terrain.shape == grid.shape
+        check(same_shape, f"expected the grid's shape {grid.shape}, found {terrain.shape}", field="terrain")
         kinds = np.unique(terrain[terrain >= 0])
-        if terrain.min() < -1 or len(kinds) == 0 or kinds[-1] != len(kinds) - 1:
-            raise InputError("expected all the kinds 0…n−1, and −1 where moves do not slip", field="terrain")
+        numbered = terrain.min() >= -1 and len(kinds) and kinds[-1] == len(kinds) - 1
+        check(numbered, "expected all the kinds 0…n−1, and −1 where moves do not slip", field="terrain")
         entered, staying = np.split(grid_successors(grid), [1], axis=-1)
         successors = np.concatenate([entered[:, _DIRECTIONS[: grid.connectivity], 0], staying], axis=-1)
         self.graph = Graph(to_jax(successors, np.int32), to_jax(grid.lengths[None]))
