@@ -17,36 +17,36 @@ from sidestep.worlds.continuous_room import without_moves
 pytestmark = pytest.mark.usefixtures("unoptimised")
 QUICK = {
     "planner": Planner(horizon=3, batch_size=4, samples=2, critic_width=4),
-    "schedule": Schedule(iterations=2, policy_warmup=1, batch_size=4),
+    "schedule": Schedule(iterations=2, policy_warmup=0, batch_size=4),
     "agents_per_goal": 1,
     "width": 4,
 }
-ROOM = room.RoomConfig(**QUICK, lattice_points=21)
+ROOM = representations.RepresentationsConfig(**QUICK, lattice_points=21, grid_optimizer=LBFGS(max_iterations=1))
 PENDULUM = pendulum.PendulumConfig(**QUICK, moves=5, lattice_points=(24, 21))
-REPRESENTATIONS = representations.RepresentationsConfig(
-    **QUICK, lattice_points=21, grid_optimizer=LBFGS(max_iterations=1)
-)
+
+
+def check_run(module, config, keys, folder):
+    """Check the picture, the summary and the lines of progress of an experiment."""
+    lines, name = [], module.__name__.rpartition(".")[2]
+    summary = module.run(folder, 1, lines.append, config)
+    assert json.loads((folder / "summary.json").read_text()) == summary
+    assert summary["command"] == f"experiment {name}"
+    assert keys | {"seconds"} <= set(summary)
+    assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert any("iteration 1 of 2" in line for line in lines)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "run", "config", "keys"), [
-    ("room", room.run, ROOM, {"auc", "mean_inside", "mean_outside", "transitions_only", "converged", "message"}),
-    ("pendulum", pendulum.run, PENDULUM, {"gravity_true", "gravity_estimate", "converged", "message"}),
-    (
-        "representations",
-        representations.run,
-        REPRESENTATIONS,
-        {"auc", "mean_inside", "mean_outside", "representations"},
-    ),
-])  # fmt: skip
-def test_run_writes_picture_and_summary(name, run, config, keys, tmp_path):
-    reports = []
-    summary = run(tmp_path, 1, reports.append, config)
-    assert json.loads((tmp_path / "summary.json").read_text()) == summary
-    assert summary["command"] == f"experiment {name}"
-    assert keys | {"seconds"} <= set(summary)
-    assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-    assert reports
+def test_run_in_the_room_writes_pictures_and_summaries(tmp_path):
+    """Both experiments compile the same functions."""
+    scores = {"auc", "mean_inside", "mean_outside"}
+    check_run(room, ROOM, scores | {"transitions_only", "converged", "message"}, tmp_path)
+    check_run(representations, ROOM, scores | {"representations"}, tmp_path)
+
+
+@pytest.mark.slow
+def test_run_of_the_pendulum_writes_picture_and_summary(tmp_path):
+    check_run(pendulum, PENDULUM, {"gravity_true", "gravity_estimate", "converged", "message"}, tmp_path)
 
 
 def test_experiment_command_unknown_name_is_wrong_usage(capsys):

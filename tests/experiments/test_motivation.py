@@ -81,24 +81,23 @@ def test_run_trial_in_the_true_model_takes_the_fewest_moves():
 
 @pytest.mark.slow
 def test_run_shows_that_costs_fail_when_the_stakes_change(tmp_path):
-    """The transition model does not depend on the stakes."""
-    config = MotivationConfig(draws=1, stakes=(0.1, 1.0, 10.0), new_goals=MotivationConfig().new_goals[:2])
-    run(tmp_path, config=config)
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    """The transition model does not depend on the stakes; four goals of the agents suffice for that."""
+    usual = MotivationConfig()
+    goals, new_goals = tuple(usual.goals[index] for index in (0, 4, 6, 7)), usual.new_goals[:2]
+    summary = run(tmp_path, config=MotivationConfig(1, goals, 6, stakes=(0.1, 1.0, 10.0), new_goals=new_goals))
+    assert json.loads((tmp_path / "summary.json").read_text()) == json.loads(json.dumps(summary))
     assert summary["command"] == "experiment motivation"
     assert (tmp_path / "motivation.png").read_bytes().startswith(b"\x89PNG")
     goal, steps = summary["forms"]["goal"], summary["forms"]["steps"]
     for form in (goal, steps):
         assert form["truth"]["arrives"] == [1, 1, 1]
-        assert min(form["behavior"]["arrives"]) > 0.95
-        assert len(set(form["behavior"]["relative_length"])) == 1  # whatever the stakes
-        assert form["costs"]["bumps"][0] == 0
+        for values in form["behavior"]["arrives"], form["behavior"]["relative_length"]:
+            assert len(set(values)) == 1  # whatever the stakes
+        assert min(form["behavior"]["arrives"]) > max(0.7, form["costs"]["arrives"][2] + 0.1)
+        assert form["costs"]["bumps"][0] < 0.1
         assert form["costs"]["bumps"][2] > 0.3
         for method in form.values():
-            total = np.sum([method[outcome] for outcome in OUTCOMES], axis=0)
-            np.testing.assert_allclose(total, 1)
+            np.testing.assert_allclose(np.sum([method[outcome] for outcome in OUTCOMES], axis=0), 1)
     assert goal["costs"]["stays_put"][0] > 0.6
-    assert goal["costs"]["stays_put"][2] == 0
-    assert goal["costs"]["arrives"][1] > 0.8
     assert goal["costs"]["goal_in_mud"]["stays_put"][0] > 0.6
-    assert max(steps["costs"]["stays_put"]) == 0  # where agents had to arrive, costs are low
+    assert goal["costs"]["stays_put"][2] == steps["costs"]["stays_put"][2] == 0

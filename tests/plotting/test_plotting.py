@@ -201,12 +201,14 @@ def test_figure_learned_has_one_color_bar_and_rows_of_panels():
     assert third.x0 == pytest.approx(first.x0)
 
 
-def test_figure_fit_shows_walks_map_and_objective():
+def test_figure_fit_shows_walks_goals_map_and_objective():
     objective = np.array([-9.0, -4.0, -3.0])
-    figure = plotting.figure_fit(GRID.forget(), [np.array([0, 3])], BLOCKED, objective)
+    figure = plotting.figure_fit(GRID.forget(), [np.array([0, 3])], BLOCKED, objective, goals=np.array([3]))
     before, after, progress, bar = figure.axes
     np.testing.assert_array_equal(before.images[0].get_array(), np.full((2, 3), -1))
     assert len(segments(before, "walk")) == 1
+    for axes in (before, after):
+        np.testing.assert_allclose(points(axes, "goal"), [[10.25, -1.75]])
     np.testing.assert_array_equal(after.images[0].get_array(), BLOCKED)
     np.testing.assert_array_equal(np.asarray(progress.lines[0].get_xydata()), [[0, -9], [1, -4], [2, -3]])
     assert bar.get_ylabel() == "P(blocked)"

@@ -61,5 +61,6 @@ def save_learned(learned: "LearnedMap", folder: "Path", **entries: object) -> No
     objective = np.array([progress.objective for progress in learning.fit.history])
     seen = None if learning.sensor is None else seen_cells(learning.sensor, learned.grid)
     paths = learning.demonstrations.paths()
-    draw("figure_fit", folder / "learned.png", learned.grid, paths, learned.blocked, objective, seen)
+    goals = np.flatnonzero(np.asarray(learning.demonstrations.tasks.terminal).any(axis=0))
+    draw("figure_fit", folder / "learned.png", learned.grid, paths, learned.blocked, objective, seen, goals)
     learned.save(folder, **entries)

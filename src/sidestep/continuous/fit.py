@@ -196,14 +196,10 @@ def _result(problem: FitProblem, state: _State, history: list[FitProgress]) -> C
     possible = distance[middle:end].mean() - distance[begin:middle].mean()
     drift = float(jnp.abs(latter - former).max() / possible)
     gap = float(np.mean([progress.policy_gap for progress in history[begin:]]))
-    return ContinuousFit(
-        dynamics=problem.agent.dynamics.with_parameters(to_parameters((former + latter) / 2)),
-        planner_state=state.planner_state,
-        history=tuple(history),
-        drift=drift,
-        policy_gap=gap,
-        converged=drift <= schedule.drift_tolerance and abs(gap) <= schedule.policy_gap_tolerance,
-        message=f"over the last quarter parameters drifted by up to {drift:.2g} of what their steps allow (tolerance "
-        f"{schedule.drift_tolerance:g}), and the policy gap was {gap:.2g} (tolerance "
-        f"{schedule.policy_gap_tolerance:g})",
+    converged = drift <= schedule.drift_tolerance and abs(gap) <= schedule.policy_gap_tolerance
+    message = (
+        f"over the last quarter parameters drifted by up to {drift:.2g} of what their steps allow (tolerance "
+        f"{schedule.drift_tolerance:g}), and the policy gap was {gap:.2g} (tolerance {schedule.policy_gap_tolerance:g})"
     )
+    learned = problem.agent.dynamics.with_parameters(to_parameters((former + latter) / 2))
+    return ContinuousFit(learned, state.planner_state, tuple(history), drift, gap, converged, message)

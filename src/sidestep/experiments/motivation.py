@@ -35,14 +35,13 @@ from sidestep.worlds.rooms import rooms_in_a_row
 ROWS, COLUMNS, DOOR = 9, 13, 8
 BLANK = ss.Grid.unknown(ROWS, COLUMNS)
 MUD, MUD_FAILS = (slice(2, 5), slice(8, 11)), 0.8
-GOALS = ((0, 0), (7, 1), (3, 5), (0, 7), (0, 12), (3, 12), (6, 7), (8, 12), (4, 3))
-"""The goals of the agents: cells (row, column)."""
 METHODS = {"costs": maxent_irl, "behavior": behavior_aware}
 OUTCOMES = ("arrives", "stays_put", "bumps")
 TITLES = {
     "goal": "The goal pays 1 × stakes, discount .95: agents may stay away",
     "steps": "Steps cost 1 × stakes and the goal pays 40 × stakes, discount 1: agents must arrive",
 }
+Cells = tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True)
@@ -51,15 +50,17 @@ class MotivationConfig:
 
     Attributes:
         draws: The number of independent sets of walks.
+        goals: The goals of the agents as cells (row, column).
         walks_per_goal: The number of walks to each goal in a set.
         stakes: The factors k of the robot's reward.
         new_goals: The goals of the robot as cells (row, column); the first lies in the mud.
     """
 
     draws: int = 5
+    goals: Cells = ((0, 0), (7, 1), (3, 5), (0, 7), (0, 12), (3, 12), (6, 7), (8, 12), (4, 3))
     walks_per_goal: int = 10
     stakes: tuple[float, ...] = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
-    new_goals: tuple[tuple[int, int], ...] = ((3, 9), (2, 2), (5, 7), (7, 10), (1, 1))
+    new_goals: Cells = ((3, 9), (2, 2), (5, 7), (7, 10), (1, 1))
 
 
 class Form(NamedTuple):
@@ -153,7 +154,7 @@ def run(
 def simulate_walks(form: Form, config: MotivationConfig, seed: int) -> ss.Demonstrations:
     """Return walks of optimal agents that know the world, from states outside the mud."""
     world, random = true_world(), np.random.default_rng(seed)
-    goals, dry = [_state(goal) for goal in GOALS], np.flatnonzero(np.asarray(world.known) == ss.Cell.FREE)
+    goals, dry = [_state(goal) for goal in config.goals], np.flatnonzero(np.asarray(world.known) == ss.Cell.FREE)
     tasks = [form.config.reward.reach(BLANK, goal) for goal in goals]
     starts = [random.choice(np.setdiff1d(dry, [goal]), config.walks_per_goal) for goal in goals]
     return ss.gather(ss.simulate(jax.random.key(seed), world, tasks, starts), tasks)

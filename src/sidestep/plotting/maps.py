@@ -167,9 +167,14 @@ def figure_learned(panels: Sequence[Panel], columns: int | None = None, label: s
 
 
 def figure_fit(
-    grid: Grid, paths: Sequence[Places], blocked: Values, objective: Float[np.ndarray, " _"], seen: Values | None = None
+    grid: Grid,
+    paths: Sequence[Places],
+    blocked: Values,
+    objective: Float[np.ndarray, " _"],
+    seen: Values | None = None,
+    goals: Marks = (),
 ) -> Figure:
-    """Return a figure of a fit: the walks, the learned map, and the objective in every iteration.
+    """Return a figure of a fit: the walks and their goals, the learned map, and the objective in every iteration.
 
     Args:
         grid: the map before learning.
@@ -177,6 +182,7 @@ def figure_fit(
         blocked: the learned P(blocked) of each cell.
         objective: the log posterior (nats) before the first iteration and after each.
         seen: P(blocked) of each cell in the map of a sensor, NaN where it has none.
+        goals: The goals of the walks.
     """
     width, height = _size(grid, _FIT)
     height = max(height, 2.2)
@@ -188,6 +194,8 @@ def figure_fit(
     before.set_title(f"Known before, and {len(paths)} walks")
     image = draw_blocked(after, blocked, grid)
     after.set_title("Learned")
+    for axes in (before, after):
+        draw_places(axes, (), goals, grid)
     marker = "." if len(objective) < 30 else ""
     progress.plot(np.arange(len(objective)), objective, color=palette.BLUE, marker=marker)
     progress.set(title="Objective", xlabel="iteration", ylabel="log posterior (nats)")
