@@ -59,21 +59,55 @@ class Dynamics(eqx.Module):
 
     @abc.abstractmethod
     def sample(self, key: PRNGKeyArray, state: State, action: Action) -> State:
-        """Draw a next state s′ ~ T_θ(s, a, ·)."""
+        """Draw a next state s′ ~ T_θ(s, a, ·).
+
+        Args:
+            key: Draws everything random.
+            state: The state s.
+            action: The action a.
+
+        Returns:
+            A draw.
+        """
 
     @abc.abstractmethod
     def log_prob(self, state: State, action: Action, next_state: State) -> Real:
-        """Return ln T_θ(s, a, s′), in nats."""
+        """Return ln T_θ(s, a, s′), in nats.
+
+        Args:
+            state: The state s.
+            action: The action a.
+            next_state: The next state s′.
+
+        Returns:
+            A logarithm, in nats.
+        """
 
     def transition_control_variate(self, value: ValueFunction, state: State, action: Action, next_state: State) -> Real:
         """Return v(s′) − E[v(s′)] for a function v close to `value`; its mean over next states is 0.
 
         Rollouts subtract it to reduce their variance. It is 0 unless a family defines it.
+
+        Args:
+            value: A function of the state, in units of reward.
+            state: The state s.
+            action: The action a.
+            next_state: The next state s′.
+
+        Returns:
+            A number in units of reward.
         """
         return jnp.zeros((), jnp.result_type(float))
 
     def with_parameters(self: _Family, parameters: FloatTree) -> _Family:
-        """Return the same family at another θ."""
+        """Return the same family at another θ.
+
+        Args:
+            parameters: θ, shaped as the present parameters.
+
+        Returns:
+            The dynamics.
+        """
         return eqx.tree_at(lambda dynamics: dynamics.parameters, self, parameters)
 
 
@@ -81,8 +115,8 @@ class Outcomes(NamedTuple):
     """The outcomes of an action.
 
     Attributes:
-        log_probabilities: ln p_k of every outcome k.
-        means: the mean next state m_k of every outcome k.
+        log_probabilities: The logarithm ln p_k of every outcome k.
+        means: The mean next state m_k of every outcome k.
     """
 
     log_probabilities: Float[Array, " outcomes"]
@@ -90,7 +124,11 @@ class Outcomes(NamedTuple):
 
     @classmethod
     def single(cls, mean: Vector) -> "Outcomes":
-        """Return the outcomes of an action with a single one."""
+        """Return the outcomes of an action with a single one.
+
+        Args:
+            mean: The mean next state.
+        """
         return cls(jnp.zeros(1, mean.dtype), mean[None])
 
 
@@ -101,14 +139,22 @@ class GaussianDynamics(Dynamics):
     A subclass that replaces `sample` or `log_prob` must replace `transition_control_variate` too, to keep its mean 0.
 
     Attributes:
-        noise: the standard deviation of every component of the state, above 0; it is not learned.
+        noise: The standard deviation of every component of the state, above 0; it is not learned.
     """
 
     noise: eqx.AbstractVar[Vector]
 
     @abc.abstractmethod
     def outcomes(self, state: Vector, action: Float[Array, " inputs"]) -> Outcomes:
-        """Return the outcomes of an action."""
+        """Return the outcomes of an action.
+
+        Args:
+            state: The state s.
+            action: The action a.
+
+        Returns:
+            The outcomes.
+        """
 
     @property
     def reparameterized(self) -> bool:
@@ -121,20 +167,47 @@ class GaussianDynamics(Dynamics):
         return jnp.zeros_like(self.noise)
 
     def sample(self, key: PRNGKeyArray, state: State, action: Action) -> State:
-        """Draw an outcome by its probability, and the noise around it."""
+        """Draw an outcome by its probability, and the noise around it.
+
+        Args:
+            key: Draws everything random.
+            state: The state s.
+            action: The action a.
+
+        Returns:
+            A draw.
+        """
         outcome_key, noise_key = jax.random.split(key)
         log_probabilities, means = self.outcomes(state, action)
         outcome = 0 if len(means) == 1 else jax.random.categorical(outcome_key, log_probabilities)
         return means[outcome] + self.noise * jax.random.normal(noise_key, means.shape[1:], means.dtype)
 
     def log_prob(self, state: State, action: Action, next_state: State) -> Real:
-        """Return the logarithm of the mixture's density."""
+        """Return the logarithm of the mixture's density.
+
+        Args:
+            state: The state s.
+            action: The action a.
+            next_state: The next state s′.
+
+        Returns:
+            A logarithm, in nats.
+        """
         return jax.nn.logsumexp(self._joint_log_probs(self.outcomes(state, action), next_state))
 
     def transition_control_variate(self, value: ValueFunction, state: State, action: Action, next_state: State) -> Real:
         """Return Σ_k P(k | s′) v_k(s′) − Σ_k p_k v(m_k), with v_k(s′) = v(m_k) + ∇v(m_k)·(s′ − m_k).
 
         v_k is the value function made linear around outcome k; its mean is known.
+
+        Args:
+            value: A function of the state, in units of reward.
+            state: The state s.
+            action: The action a.
+            next_state: The next state s′.
+
+        Returns:
+            A number in units of reward.
         """
         outcomes = self.outcomes(state, action)
         values, slopes = jax.vmap(jax.value_and_grad(value))(outcomes.means)
@@ -153,13 +226,13 @@ class LinearGaussian(GaussianDynamics):
     Args:
         state: A, of shape (dimensions, dimensions).
         action: B, of shape (dimensions, inputs).
-        noise: the standard deviation of every component, above 0.
+        noise: The standard deviation of every component, above 0.
 
     Attributes:
         parameters: {"state": A, "action": B}, both learned.
 
     Raises:
-        InputError: numbers that are not finite, noise not above 0, or shapes that do not fit.
+        InputError: For numbers that are not finite, noise not above 0, or shapes that do not fit.
 
     Example:
         >>> dynamics = LinearGaussian(jnp.eye(2), jnp.ones((2, 1)), jnp.full(2, 0.1))
@@ -185,7 +258,15 @@ class LinearGaussian(GaussianDynamics):
         return jnp.zeros_like(self.parameters["action"][0])
 
     def outcomes(self, state: Vector, action: Float[Array, " inputs"]) -> Outcomes:
-        """Return A s + B a as the only outcome."""
+        """Return A s + B a as the only outcome.
+
+        Args:
+            state: The state s.
+            action: The action a.
+
+        Returns:
+            The outcomes.
+        """
         return Outcomes.single(self.parameters["state"] @ state + self.parameters["action"] @ action)
 
 
@@ -195,7 +276,7 @@ class TableDynamics(Dynamics):
     Estimators for densities can so be checked against exact answers.
 
     Attributes:
-        model: any `TransitionModel`; its parameters are those of the dynamics.
+        model: Any `TransitionModel`; its parameters are those of the dynamics.
     """
 
     model: TransitionModel
@@ -217,12 +298,30 @@ class TableDynamics(Dynamics):
         return self.model.probabilities()[state, action]
 
     def sample(self, key: PRNGKeyArray, state: State, action: Action) -> State:
-        """Draw an outcome by its probability."""
+        """Draw an outcome by its probability.
+
+        Args:
+            key: Draws everything random.
+            state: The state s.
+            action: The action a.
+
+        Returns:
+            A draw.
+        """
         outcome = jax.random.categorical(key, jnp.log(self._probabilities(state, action)))
         return self.model.graph.successors[state, action, outcome].astype(state.dtype)
 
     def log_prob(self, state: State, action: Action, next_state: State) -> Real:
-        """Return the logarithm of the total probability of all outcomes that are the next state."""
+        """Return the logarithm of the total probability of all outcomes that are the next state.
+
+        Args:
+            state: The state s.
+            action: The action a.
+            next_state: The next state s′.
+
+        Returns:
+            A logarithm, in nats.
+        """
         same = self.model.graph.successors[state, action] == next_state
         probability = jnp.sum(jnp.where(same, self._probabilities(state, action), 0.0))
         # the logarithm of 0 has no gradient, even where `where` discards it
@@ -230,13 +329,34 @@ class TableDynamics(Dynamics):
         return jnp.where(possible, jnp.log(jnp.where(possible, probability, 1.0)), -jnp.inf)
 
     def transition_control_variate(self, value: ValueFunction, state: State, action: Action, next_state: State) -> Real:
-        """Return v(s′) − E[v(s′)] of the value function itself."""
+        """Return v(s′) − E[v(s′)] of the value function itself.
+
+        Args:
+            value: A function of the state, in units of reward.
+            state: The state s.
+            action: The action a.
+            next_state: The next state s′.
+
+        Returns:
+            A number in units of reward.
+        """
         successors = self.model.graph.successors[state, action].astype(next_state.dtype)
         return value(next_state) - self._probabilities(state, action) @ jax.vmap(value)(successors)
 
 
 def checked_noise(noise: Float[Array, " _"] | np.ndarray, dimensions: int) -> Vector:
-    """Return standard deviations as floating-point numbers; refuse any that are not finite and above 0."""
+    """Return standard deviations as floating-point numbers; refuse any that are not finite and above 0.
+
+    Args:
+        noise: The standard deviations.
+        dimensions: How many there should be.
+
+    Returns:
+        The standard deviations.
+
+    Raises:
+        InputError: For another number of them, or any not finite and above 0.
+    """
     noise = jnp.asarray(noise, jnp.result_type(float))
     if noise.shape != (dimensions,):
         raise InputError(f"expected {dimensions} numbers, one a component of the state, found {noise}", field="noise")
@@ -246,13 +366,29 @@ def checked_noise(noise: Float[Array, " _"] | np.ndarray, dimensions: int) -> Ve
 
 
 def check_finite(arrays: ArrayTree, field: str = "parameters") -> None:
-    """Refuse arrays that are not finite; inside `jit` nothing is checked."""
+    """Refuse arrays that are not finite; inside `jit` nothing is checked.
+
+    Args:
+        arrays: Any pytree of arrays.
+        field: The name of the setting in the error.
+
+    Raises:
+        InputError: For numbers that are not finite.
+    """
     for leaf in jax.tree.leaves(arrays):
         if not isinstance(leaf, Tracer) and not np.isfinite(leaf).all():
             raise InputError("expected finite numbers", field=field)
 
 
 def check_corners(low: Vector, high: Vector) -> None:
-    """Refuse corners that are not finite, or a `high` that does not lie above `low`."""
+    """Refuse corners that are not finite, or a `high` that does not lie above `low`.
+
+    Args:
+        low: The lower corner.
+        high: The upper corner.
+
+    Raises:
+        InputError: For corners that are not finite or not in order.
+    """
     if not (np.isfinite(low).all() and np.isfinite(high).all() and (np.asarray(low) < np.asarray(high)).all()):
         raise InputError(f"expected corners in order, found {low} and {high}", field="low, high")

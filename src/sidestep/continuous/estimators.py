@@ -49,6 +49,9 @@ def with_control_variates(agent: Agent, rollouts: Rollout, critic: Critic) -> Ro
         agent: The agent of the rollouts.
         rollouts: One or, with leading axes, many.
         critic: V_w.
+
+    Returns:
+        The same rollouts with other `transition_control_variates`.
     """
     one_move = 1 / rollouts.acting.shape[-1]
 
@@ -107,6 +110,9 @@ def pathwise_surrogate(agent: Agent, rollouts: Rollout, critic: Critic | None = 
         agent: The agent of the rollouts.
         rollouts: One or, with leading axes, many.
         critic: V_w of the baseline; 0 by default.
+
+    Returns:
+        A number for each rollout, in units of reward.
     """
     q = q_estimates(rollouts)
     if agent.policy.reparameterized:
@@ -180,7 +186,16 @@ def value_gradient(
 
 
 def check_estimator(estimator: Estimator, dynamics: Dynamics, tasks: ContinuousTask) -> None:
-    """Refuse an estimator that does not exist, or is biased for these dynamics or tasks."""
+    """Refuse an estimator that does not exist, or is biased for these dynamics or tasks.
+
+    Args:
+        estimator: Its name.
+        dynamics: The dynamics T_θ.
+        tasks: The tasks as a batch.
+
+    Raises:
+        InputError: For another name, or an estimator that is biased here.
+    """
     check(estimator in ("score", "pathwise"), f"expected 'score' or 'pathwise', found {estimator!r}", field="estimator")
     if estimator == "pathwise" and not (dynamics.reparameterized and tasks.smooth):
         what = "these dynamics jump" if not dynamics.reparameterized else "the returns of these tasks jump"

@@ -41,14 +41,14 @@ class ContinuousFit(eqx.Module, Generic[Family, SomePolicy]):
     """The result of a fit.
 
     Attributes:
-        dynamics: the family at the mean of θ over the last quarter of the iterations.
-        planner_state: the agent's policy, its critic and their optimizers.
-        history: a `FitProgress` an iteration.
-        drift: the largest distance, over parameters, between the means of θ over the last eighth and over the eighth
+        dynamics: The family at the mean of θ over the last quarter of the iterations.
+        planner_state: The agent's policy, its critic and their optimizers.
+        history: A `FitProgress` an iteration.
+        drift: The largest distance, over parameters, between the means of θ over the last eighth and over the eighth
             before; as a fraction of the distance that steps of the full learning rate in one direction would give.
-        policy_gap: the policy's, on average over the last quarter.
-        converged: whether drift and policy gap are within the tolerances of the schedule.
-        message: the values of both.
+        policy_gap: The policy's, on average over the last quarter.
+        converged: Whether drift and policy gap are within the tolerances of the schedule.
+        message: The values of both.
     """
 
     dynamics: Family
@@ -91,23 +91,26 @@ def fit_dynamics(
     """Find the parameters of a family of dynamics that maximize the posterior of demonstrations.
 
     Args:
-        dynamics: the family at the initial parameters.
-        demonstrations: from `gather_trajectories`.
-        behavior: the agent's backup and β.
-        policy: the initial policy of the agent.
-        planner: settings of rollouts and of the policy's optimizers.
-        prior: over all parameters, `Normal()` by default.
+        dynamics: The family at the initial parameters.
+        demonstrations: From `gather_trajectories`.
+        behavior: The agent's backup and β.
+        policy: The initial policy of the agent.
+        planner: Settings of rollouts and of the policy's optimizers.
+        prior: Over all parameters, `Normal()` by default.
         terms: "actions", "transitions" or both.
         estimator: "score" (eq. 11), or "pathwise" for reparameterized dynamics and smooth rewards.
-        schedule: length and steps of the fit.
-        seed: draws everything random.
-        report: called with the figures and the present dynamics after every iteration.
-        checkpoint: a file that is kept up to date.
-        resume: whether to go on from the checkpoint; the result is that of an uninterrupted fit, bit for bit.
+        schedule: Length and steps of the fit.
+        seed: Draws everything random.
+        report: Called with the figures and the present dynamics after every iteration.
+        checkpoint: A file that is kept up to date.
+        resume: Whether to go on from the checkpoint; the result is that of an uninterrupted fit, bit for bit.
+
+    Returns:
+        The learned dynamics, the policy with its critic, and how the fit went.
 
     Raises:
-        InputError: data or settings that cannot be used.
-        NotConverged: figures that cease to be finite.
+        InputError: For data or settings that cannot be used.
+        NotConverged: For figures that cease to be finite.
 
     References:
         Eqs. 6, 11 and 12 of the paper.
@@ -137,7 +140,14 @@ def fit_dynamics(
 
 
 def problem_fingerprint(problem: Tree) -> str:
-    """Return a digest of a problem; functions count by name, because their addresses differ between processes."""
+    """Return a digest of a problem; functions count by name, because their addresses differ between processes.
+
+    Args:
+        problem: Any pytree.
+
+    Returns:
+        A hexadecimal digest.
+    """
     numbers, rest = eqx.partition(problem, eqx.is_array_like)
     text = f"{jax.tree.structure(problem)} {jax.tree.leaves(rest)}"
     return fingerprint((jax.tree.leaves(numbers), re.sub(r" at 0x[0-9a-f]+", "", text)))

@@ -28,14 +28,14 @@ class Lattice(eqx.Module):
     """Equally spaced points between two corners.
 
     Args:
-        low: the lower corner.
-        high: the upper corner, above `low` in every component.
-        counts: points along each side, two or more.
-        periodic: whether each side closes to a ring (angles). There the last point is one step before `high`, which
+        low: The lower corner.
+        high: The upper corner, above `low` in every component.
+        counts: The number of points along each side, two or more.
+        periodic: Whether each side closes to a ring (angles). There the last point is one step before `high`, which
             is `low`. No side does by default.
 
     Raises:
-        InputError: corners out of order, or fewer than two points along a side.
+        InputError: For corners out of order, or fewer than two points along a side.
 
     Example:
         >>> Lattice(jnp.zeros(1), jnp.ones(1), (3,)).points().tolist()
@@ -71,7 +71,14 @@ class Lattice(eqx.Module):
         return self.low + steps.reshape(-1, len(self.counts)) * self.spacing
 
     def interpolation_weights(self, place: Vector) -> tuple[Int[Array, " corners"], Float[Array, " corners"]]:
-        """Return the points around a place and their weights, which add up to one."""
+        """Return the points around a place and their weights, which add up to one.
+
+        Args:
+            place: The place, in the units of the state.
+
+        Returns:
+            The indices of 2^dimensions points, and their weights in [0, 1].
+        """
         position = (place - self.low) / self.spacing
         counts, rings = jnp.asarray(self.counts), jnp.asarray(self.periodic)
         position = jnp.where(rings, jnp.mod(position, counts), jnp.clip(position, 0, counts - 1))
@@ -84,7 +91,15 @@ class Lattice(eqx.Module):
         return ((first + corners) % counts) @ strides, weights
 
     def interpolate(self, values: Float[Array, " points"], place: Vector) -> Float[Array, ""]:
-        """Return values of points at any place; outside the corners, those at the border."""
+        """Return values of points at any place; outside the corners, those at the border.
+
+        Args:
+            values: The value of every point.
+            place: The place, in the units of the state.
+
+        Returns:
+            The value.
+        """
         points, weights = self.interpolation_weights(place)
         return values[points] @ weights
 
@@ -122,7 +137,14 @@ class LatticePlanner(eqx.Module):
         return TabularModel(Graph(successors, jnp.ones((1, 1))), logits, possible)
 
     def tabular_task(self, task: ContinuousTask) -> Task:
-        """Return a continuous task on the points of the lattice."""
+        """Return a continuous task on the points of the lattice.
+
+        Args:
+            task: The task.
+
+        Returns:
+            The task.
+        """
         points = self.lattice.points()
         reward = jax.vmap(jax.vmap(task.reward, (None, 0)), (0, None))(points, self.actions)
         return Task(reward, jax.vmap(task.terminal_reward)(points), jax.vmap(task.terminal)(points), task.discount)
@@ -135,7 +157,10 @@ class LatticePlanner(eqx.Module):
         Args:
             task: The task of the values.
             values: V of every point, in units of reward.
-            state: s, the place.
+            state: The place s.
+
+        Returns:
+            Q of every action, in units of reward.
         """
 
         def value(action: Array) -> Array:

@@ -39,15 +39,15 @@ class FitProgress(NamedTuple):
     """Figures of a fit, estimated from one batch of moves; the prior is exact.
 
     Attributes:
-        iteration: the step of the model.
+        iteration: The step of the model.
         objective: `actions` + `transitions` + `prior`, in nats.
-        actions: the log-likelihood of all actions, in nats.
-        transitions: the log-likelihood of all transitions, in nats.
-        prior: the log-density of the parameters.
-        gradient: the norm of the objective's gradient.
-        expected_return: of the policy, as `PlanProgress` has it; 0 without the actions' term, as the next two.
-        entropy: of the policy.
-        policy_gap: of the policy.
+        actions: The log-likelihood of all actions, in nats.
+        transitions: The log-likelihood of all transitions, in nats.
+        prior: The log-density of the parameters.
+        gradient: The norm of the objective's gradient.
+        expected_return: That of the policy, as `PlanProgress` has it; 0 without the actions' term, as the next two.
+        entropy: That of the policy.
+        policy_gap: That of the policy.
     """
 
     iteration: int
@@ -65,13 +65,13 @@ class Schedule(eqx.Module):
     """The length and the steps of a fit.
 
     Attributes:
-        iterations: steps of the model, 2 or more.
-        policy_warmup: steps of the policy alone, before the model's first.
-        batch_size: demonstrated moves of a step.
-        learning_rate: of Adam, in units of θ; it falls to a twentieth along a cosine.
-        policy_steps: steps of the policy for each of the model's, one of them with the model's own rollouts.
-        drift_tolerance: the largest drift of a converged fit.
-        policy_gap_tolerance: the largest policy gap of a converged fit, on either side of 0.
+        iterations: Steps of the model, 2 or more.
+        policy_warmup: Steps of the policy alone, before the model's first.
+        batch_size: Demonstrated moves of a step.
+        learning_rate: That of Adam, in units of θ; it falls to a twentieth along a cosine.
+        policy_steps: Steps of the policy for each of the model's, one of them with the model's own rollouts.
+        drift_tolerance: The largest drift of a converged fit.
+        policy_gap_tolerance: The largest policy gap of a converged fit, on either side of 0.
 
     Raises:
         InputError: For counts that are too small, and rates or tolerances not above 0.
@@ -145,6 +145,9 @@ class FitProblem(eqx.Module):
             parameters: θ.
             state: The policy, its critic and their optimizers.
             key: Draws everything random.
+
+        Returns:
+            The next state of policy and critic.
         """
         batch_key, rollout_key = jax.random.split(key)
         return self._action_terms(parameters, state, self._draw_moves(batch_key), rollout_key)[0]

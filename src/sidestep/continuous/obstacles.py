@@ -39,7 +39,11 @@ class Field(eqx.Module):
 
     @abc.abstractmethod
     def logit(self, place: Place) -> Float[Scalar, ""]:
-        """Return f_θ(x)."""
+        """Return f_θ(x).
+
+        Args:
+            place: The place, in the units of the state.
+        """
 
 
 class RadialField(Field):
@@ -47,8 +51,8 @@ class RadialField(Field):
 
     Attributes:
         parameters: θ_k, the logit around each center.
-        centers: c_k, in the units of places.
-        width: w, in the units of places.
+        centers: The centers c_k, in the units of places.
+        width: The width w, in the units of places.
     """
 
     parameters: Float[Array, " centers"]
@@ -56,7 +60,11 @@ class RadialField(Field):
     width: float = eqx.field(static=True)
 
     def logit(self, place: Place) -> Float[Scalar, ""]:
-        """Return the weighted mean of the logits around a place."""
+        """Return the weighted mean of the logits around a place.
+
+        Args:
+            place: The place, in the units of the state.
+        """
         distance = jnp.sum((place - jax.lax.stop_gradient(self.centers)) ** 2, axis=-1)
         return self.parameters @ jax.nn.softmax(-0.5 * distance / self.width**2)
 
@@ -65,13 +73,16 @@ def radial_field(low: Place, high: Place, counts: Sequence[int], logit: float = 
     """Return radial basis functions with centers on a lattice, 0.7 times as wide as the centers' distance.
 
     Args:
-        low: the lower corner of the room.
-        high: the upper corner, above `low` in every component.
-        counts: centers along each side, two or more.
-        logit: the logit everywhere at the beginning.
+        low: The lower corner of the room.
+        high: The upper corner, above `low` in every component.
+        counts: Centers along each side, two or more.
+        logit: The logit everywhere at the beginning.
+
+    Returns:
+        The field.
 
     Raises:
-        InputError: corners out of order, or fewer than two centers along a side.
+        InputError: For corners out of order, or fewer than two centers along a side.
 
     Example:
         >>> radial_field(jnp.zeros(2), jnp.ones(2), (2, 2)).centers.tolist()
@@ -91,11 +102,11 @@ class NetworkField(Field):
     """A small neural network over places.
 
     Attributes:
-        parameters: the weights and biases.
-        center: the middle of the room.
-        scale: a quarter of each side of the room.
-        offset: the logit that is added to the network's output.
-        structure: the rest of the network.
+        parameters: The weights and biases.
+        center: The middle of the room.
+        scale: A quarter of each side of the room.
+        offset: The logit that is added to the network's output.
+        structure: The rest of the network.
     """
 
     parameters: FloatTree
@@ -105,7 +116,11 @@ class NetworkField(Field):
     structure: Tree = eqx.field(static=True)
 
     def logit(self, place: Place) -> Float[Scalar, ""]:
-        """Return the network's output plus the offset."""
+        """Return the network's output plus the offset.
+
+        Args:
+            place: The place, in the units of the state.
+        """
         network = eqx.combine(self.parameters, self.structure)
         center, scale = jax.lax.stop_gradient((self.center, self.scale))
         return network((place - center) / scale) + self.offset
@@ -117,15 +132,18 @@ def network_field(
     """Return a network that begins near `logit` everywhere; its inputs are scaled to [−2, 2] along each side.
 
     Args:
-        key: draws the initial weights.
-        low: the lower corner of the room.
-        high: the upper corner, above `low` in every component.
-        width: units in each hidden layer.
-        depth: hidden layers.
-        logit: the offset of the output.
+        key: Draws the initial weights.
+        low: The lower corner of the room.
+        high: The upper corner, above `low` in every component.
+        width: Units in each hidden layer.
+        depth: Hidden layers.
+        logit: The offset of the output.
+
+    Returns:
+        The field.
 
     Raises:
-        InputError: corners out of order.
+        InputError: For corners out of order.
 
     Example:
         >>> network_field(jax.random.key(0), jnp.zeros(2), jnp.ones(2)).scale.tolist()
@@ -141,8 +159,8 @@ class Walls(Field):
     """Known walls: boxes that block; nothing is learned.
 
     Attributes:
-        low: one corner of each box.
-        high: the opposite corner of each box.
+        low: One corner of each box.
+        high: The opposite corner of each box.
     """
 
     low: Float[Array, "boxes dimensions"]
@@ -150,11 +168,22 @@ class Walls(Field):
     parameters: tuple[()] = ()
 
     def logit(self, place: Place) -> Float[Scalar, ""]:
-        """Return 12 inside a box and −12 outside: P = 6e-6 changes no choice, and keeps all values finite."""
+        """Return 12 inside a box and −12 outside: P = 6e-6 changes no choice, and keeps all values finite.
+
+        Args:
+            place: The place, in the units of the state.
+        """
         return jnp.where(self.inside(place), 12.0, -12.0).astype(place.dtype)
 
     def inside(self, place: Place) -> jax.Array:
-        """Return whether a place lies in a box."""
+        """Return whether a place lies in a box.
+
+        Args:
+            place: The place, in the units of the state.
+
+        Returns:
+            A truth value for each place.
+        """
         return ((place >= self.low) & (place <= self.high)).all(axis=-1).any()
 
 
@@ -162,14 +191,14 @@ class ObstacleMotion(GaussianDynamics):
     """Moves that a field of obstacles stops or slows.
 
     Args:
-        field: f_θ.
-        low: the lower corner of the room.
-        high: the upper corner; moves aim at most at the room's border.
-        noise: the standard deviation of each component of the end of a move, above 0.
-        stops: whether obstacles stop moves (True) or slow them (False).
+        field: The field f_θ.
+        low: The lower corner of the room.
+        high: The upper corner; moves aim at most at the room's border.
+        noise: The standard deviation of each component of the end of a move, above 0.
+        stops: Whether obstacles stop moves (True) or slow them (False).
 
     Raises:
-        InputError: corners out of order, noise not above 0, or parameters that are not finite.
+        InputError: For corners out of order, noise not above 0, or parameters that are not finite.
 
     Example:
         >>> field = radial_field(jnp.zeros(2), jnp.ones(2), (2, 2), logit=0.0)
@@ -195,11 +224,23 @@ class ObstacleMotion(GaussianDynamics):
         return self.field.parameters
 
     def blocked(self, place: Place) -> Float[Scalar, ""]:
-        """Return P(blocked) at a place."""
+        """Return P(blocked) at a place.
+
+        Args:
+            place: The place, in the units of the state.
+        """
         return jax.nn.sigmoid(self.field.logit(place))
 
     def outcomes(self, state: Place, action: Float[Array, " dimensions"]) -> Outcomes:
-        """Return the place that the move aims at and, where obstacles stop moves, the present place."""
+        """Return the place that the move aims at and, where obstacles stop moves, the present place.
+
+        Args:
+            state: The state s.
+            action: The action a.
+
+        Returns:
+            The outcomes.
+        """
         low, high = jax.lax.stop_gradient((self.low, self.high))
         target = jnp.clip(state + action, low, high)
         logit = self.field.logit(target)

@@ -28,19 +28,19 @@ class Pendulum(GaussianDynamics):
     """Gymnasium's `Pendulum-v1`; the state is (φ, ω) in radians and radians per second, the action (u,).
 
     Args:
-        gravity: g in m/s², above 0.
-        mass: m in kg, above 0.
+        gravity: The gravity g in m/s², above 0.
+        mass: The mass m in kg, above 0.
         length: ℓ in m, above 0.
-        unknown: the names of the constants to learn, from `PENDULUM_CONSTANTS`.
-        noise: the standard deviations of φ′ and ω′, above 0.
+        unknown: The names of the constants to learn, from `PENDULUM_CONSTANTS`.
+        noise: The standard deviations of φ′ and ω′, above 0.
         time_step: Δt in seconds, above 0.
 
     Attributes:
-        parameters: the logarithms of the unknown constants, by name.
-        known: the other constants.
+        parameters: The logarithms of the unknown constants, by name.
+        known: The other constants.
 
     Raises:
-        InputError: constants, noise or a time step not above 0, or an unknown name.
+        InputError: For constants, noise or a time step not above 0, or an unknown name.
 
     Example:
         >>> pendulum = Pendulum(gravity=10.0)
@@ -73,7 +73,11 @@ class Pendulum(GaussianDynamics):
         self.noise, self.time_step = checked_noise(jnp.asarray(noise), 2), time_step
 
     def constant(self, name: str) -> Float[Scalar, ""] | float:
-        """Return a constant in its own unit, whether known or learned."""
+        """Return a constant in its own unit, whether known or learned.
+
+        Args:
+            name: The name of the constant.
+        """
         return jnp.exp(self.parameters[name]) if name in self.parameters else self.known[name]
 
     def example_action(self) -> Float[Array, " 1"]:
@@ -81,7 +85,15 @@ class Pendulum(GaussianDynamics):
         return jnp.zeros(1, self.noise.dtype)
 
     def outcomes(self, state: Float[Array, " 2"], action: Float[Array, " 1"]) -> Outcomes:
-        """Return one step of the integrator."""
+        """Return one step of the integrator.
+
+        Args:
+            state: The state s.
+            action: The action a.
+
+        Returns:
+            The outcomes.
+        """
         gravity, mass, length = (self.constant(name) for name in PENDULUM_CONSTANTS)
         angle, speed = state
         torque = jnp.clip(action[0], -2, 2)
@@ -94,16 +106,16 @@ class PointMass(GaussianDynamics):
     """A point mass in a plane; the state is (x, y, v_x, v_y), the action an acceleration.
 
     Args:
-        friction: the deceleration per unit of speed, above 0.
-        wind: the acceleration by wind.
-        noise: the standard deviation of each component of the next state, above 0.
+        friction: The deceleration per unit of speed, above 0.
+        wind: The acceleration by wind.
+        noise: The standard deviation of each component of the next state, above 0.
         time_step: Δt, above 0.
 
     Attributes:
         parameters: {"friction": its logarithm, "wind": the acceleration by wind}.
 
     Raises:
-        InputError: friction, noise or a time step not above 0, or wind that is not finite.
+        InputError: For friction, noise or a time step not above 0, or wind that is not finite.
 
     Example:
         >>> [round(float(x), 3) for x in PointMass().outcomes(jnp.zeros(4), jnp.array([1.0, 0.0])).means[0]]
@@ -134,7 +146,15 @@ class PointMass(GaussianDynamics):
         return jnp.zeros(2, self.noise.dtype)
 
     def outcomes(self, state: Float[Array, " 4"], action: Float[Array, " 2"]) -> Outcomes:
-        """Return one step of the integrator."""
+        """Return one step of the integrator.
+
+        Args:
+            state: The state s.
+            action: The action a.
+
+        Returns:
+            The outcomes.
+        """
         place, speed = state[:2], state[2:]
         friction = jnp.exp(self.parameters["friction"])
         speed = speed + (action + self.parameters["wind"] - friction * speed) * self.time_step

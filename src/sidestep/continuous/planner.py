@@ -50,11 +50,11 @@ class PlanProgress(NamedTuple):
     """Figures of a policy, estimated from one batch of rollouts.
 
     Attributes:
-        iteration: the step.
-        expected_return: the mean of Σ γ^i R_i over the starts.
-        gradient: the norm of the policy's gradient, in units of reward.
-        entropy: the mean over the starts, in nats.
-        policy_gap: the gap between the policy and its own Q estimates (`policy_gap`). It is near 0 for
+        iteration: The step.
+        expected_return: The mean of Σ γ^i R_i over the starts.
+        gradient: The norm of the policy's gradient, in units of reward.
+        entropy: The mean over the starts, in nats.
+        policy_gap: The gap between the policy and its own Q estimates (`policy_gap`). It is near 0 for
             a converged policy; noise is subtracted, so it can be below 0.
     """
 
@@ -71,8 +71,8 @@ class PlannerState(eqx.Module, Generic[SomePolicy]):
     Attributes:
         policy: π_λ.
         critic: V_w.
-        policy_moments: the state of the policy's optimizer.
-        critic_moments: the state of the critic's optimizer.
+        policy_moments: The state of the policy's optimizer.
+        critic_moments: The state of the critic's optimizer.
     """
 
     policy: SomePolicy
@@ -86,13 +86,13 @@ class Planner(eqx.Module):
 
     Attributes:
         horizon: τ, the number of moves of a rollout, 1 or more.
-        batch_size: the starts of a step. (The iterations of a fit use `Schedule.batch_size` instead.)
-        samples: rollouts of each candidate action, 2 or more, because `policy_gap` compares halves of them.
-        candidates: candidate actions of each start where actions are vectors; of a finite set, all are tried.
-        learning_rate: of Adam, for the policy.
-        critic_rate: of Adam, for the critic.
-        critic_width: units in each hidden layer of the critic.
-        critic_steps: minibatches of a batch, each for one step of the critic.
+        batch_size: The starts of a step. (The iterations of a fit use `Schedule.batch_size` instead.)
+        samples: Rollouts of each candidate action, 2 or more, because `policy_gap` compares halves of them.
+        candidates: Candidate actions of each start where actions are vectors; of a finite set, all are tried.
+        learning_rate: That of Adam, for the policy.
+        critic_rate: That of Adam, for the critic.
+        critic_width: Units in each hidden layer of the critic.
+        critic_steps: Minibatches of a batch, each for one step of the critic.
 
     Raises:
         InputError: For counts below 1, fewer than 2 samples, and rates not above 0.
@@ -160,6 +160,9 @@ class Planner(eqx.Module):
             policy: π_λ.
             tasks: The task of each start.
             states: The starts.
+
+        Returns:
+            Choices of shape (starts, candidates, …) and probabilities of shape (starts, candidates).
         """
         features = task_features(tasks, states)
         if isinstance(policy, FinitePolicy):
@@ -176,10 +179,10 @@ class Planner(eqx.Module):
         """Make one step with the policy and several with its critic.
 
         Args:
-            state: policy, critic and their optimizers.
-            behavior: the agent's backup and β.
-            rollouts: with axes (starts, candidates, samples).
-            probabilities: of the candidates, from `candidate_actions`.
+            state: Policy, critic and their optimizers.
+            behavior: The agent's backup and β.
+            rollouts: With axes (starts, candidates, samples).
+            probabilities: Those of the candidates, from `candidate_actions`.
 
         Returns:
             The next state, and the figures of the policy before the step.
@@ -204,8 +207,8 @@ class PolicyPlan(eqx.Module, Generic[SomePolicy]):
     """The result of planning.
 
     Attributes:
-        planner_state: policy, critic and their optimizers, for a warm start.
-        history: one `PlanProgress` a step.
+        planner_state: Policy, critic and their optimizers, for a warm start.
+        history: One `PlanProgress` a step.
     """
 
     planner_state: PlannerState[SomePolicy]
@@ -217,7 +220,14 @@ class PolicyPlan(eqx.Module, Generic[SomePolicy]):
         return self.planner_state.policy
 
     def recent_progress(self, steps: int = 50) -> PlanProgress:
-        """Return the mean of the last steps' figures, which are noisy one by one."""
+        """Return the mean of the last steps' figures, which are noisy one by one.
+
+        Args:
+            steps: The number of steps, 1 or more.
+
+        Returns:
+            The figures, with the number of the last step.
+        """
         last = np.asarray(self.history[-steps:])
         return PlanProgress(int(last[-1, 0]), *last[:, 1:].mean(axis=0).tolist())
 
@@ -308,8 +318,11 @@ def policy_gradient(policy: Policy, critic: Critic, rollouts: Rollout, probabili
     Args:
         policy: π_λ.
         critic: V_w.
-        rollouts: with axes (starts, candidates, samples).
-        probabilities: of the candidates; a sum with them is a mean over the policy's first choices.
+        rollouts: With axes (starts, candidates, samples).
+        probabilities: Those of the candidates; a sum with them is a mean over the policy's first choices.
+
+    Returns:
+        The gradient, shaped as the policy.
 
     References:
         Eq. 12 of the paper, with the differences that the module's docstring lists.
@@ -335,6 +348,16 @@ def fit_critic(
 
     First moves are left out, because their choices were not drawn from the policy. With a horizon of 1 no moves are
     left, and the critic stays the same.
+
+    Args:
+        critic: V_w.
+        optimizer: The optimizer.
+        moments: Its state.
+        rollouts: One rollout or, with leading axes, many.
+        steps: The number of steps, 1 or more.
+
+    Returns:
+        The critic and the state of the optimizer.
     """
     if rollouts.acting.shape[-1] == 1:
         return critic, moments
@@ -365,6 +388,13 @@ def minibatches(
     """Deal all moves out to minibatches, so that each holds all move numbers and different starts.
 
     There are at most as many minibatches as entries; a remainder is left out.
+
+    Args:
+        leaf: An array with an entry a move.
+        count: The number of minibatches, 1 or more.
+
+    Returns:
+        The minibatches along the first axis.
     """
     flat = jnp.moveaxis(leaf, (3, 0), (0, 3)).reshape(-1, *leaf.shape[4:])
     count = min(count, len(flat))
@@ -379,6 +409,15 @@ def policy_gap(
 
     For soft agents it is the divergence of π_λ from exp βQ̂ in nats, for optimal ones the gain of the best action in
     units of reward. Two independent halves of the samples give the noise of Q̂, which is subtracted.
+
+    Args:
+        behavior: The agent's backup and β.
+        advantages: q_λ of every candidate, in nats.
+        q: Q̂_0 of every sample, in units of reward.
+        probabilities: Those of the candidates, which add up to 1 for each start.
+
+    Returns:
+        The gap, a single number.
     """
     half = q.shape[-1] // 2
     halves = q[..., :half].mean(axis=-1), q[..., -half:].mean(axis=-1)
@@ -397,7 +436,16 @@ def policy_gap(
 
 
 def check_starts(states: States, task: Int[Array, " starts"], tasks: ContinuousTask) -> None:
-    """Refuse no starts, starts that are not finite, and tasks that do not exist or have ended there."""
+    """Refuse no starts, starts that are not finite, and tasks that do not exist or have ended there.
+
+    Args:
+        states: The states.
+        task: The index of the task of each start.
+        tasks: The tasks as a batch.
+
+    Raises:
+        InputError: For any of these.
+    """
     count = len(tasks.discount)
     message = f"expected starts and a task for each, found {len(states)} and {len(task)}"
     check(0 < len(states) == len(task), message, field="states")

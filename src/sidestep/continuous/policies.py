@@ -44,7 +44,18 @@ class ScaledNetwork(eqx.Module):
 
 
 def scaled_network(key: PRNGKeyArray, examples: Examples, outputs: int, width: int, depth: int) -> ScaledNetwork:
-    """Return a network of `depth` hidden layers (0: linear), scaled by examples of its inputs, with outputs near 0."""
+    """Return a network of `depth` hidden layers (0: linear), scaled by examples of its inputs, with outputs near 0.
+
+    Args:
+        key: Draws everything random.
+        examples: Typical inputs.
+        outputs: The number of outputs.
+        width: The units in each hidden layer.
+        depth: The number of hidden layers.
+
+    Returns:
+        The network.
+    """
     network = eqx.nn.MLP(examples.shape[-1], outputs, width, depth, jnp.tanh, key=key)
     last = network.layers[-1]
     network = eqx.tree_at(lambda net: net.layers[-1], network, jax.tree.map(lambda leaf: 0.01 * leaf, last))
@@ -56,26 +67,50 @@ class Policy(eqx.Module):
     """A distribution π_λ(c | x); λ are all its floating-point arrays that gradients reach.
 
     Attributes:
-        reparameterized: whether `sample` is smooth in λ and x while the key is held fixed.
+        reparameterized: Whether `sample` is smooth in λ and x while the key is held fixed.
     """
 
     reparameterized: ClassVar[bool]
 
     @abc.abstractmethod
     def sample(self, key: PRNGKeyArray, x: Features) -> Choice:
-        """Draw a choice c ~ π_λ(· | x)."""
+        """Draw a choice c ~ π_λ(· | x).
+
+        Args:
+            key: Draws everything random.
+            x: The features of the state.
+
+        Returns:
+            A draw.
+        """
 
     @abc.abstractmethod
     def log_prob(self, x: Features, choice: Choice) -> Real:
-        """Return ln π_λ(c | x), in nats."""
+        """Return ln π_λ(c | x), in nats.
+
+        Args:
+            x: The features of the state.
+            choice: The choice c: an index or a vector.
+
+        Returns:
+            A logarithm, in nats.
+        """
 
     @abc.abstractmethod
     def entropy(self, x: Features) -> Real:
-        """Return H(π_λ(· | x)), in nats."""
+        """Return H(π_λ(· | x)), in nats.
+
+        Args:
+            x: The features of the state.
+        """
 
     @abc.abstractmethod
     def action(self, choice: Choice) -> Action:
-        """Return the action that a choice stands for."""
+        """Return the action that a choice stands for.
+
+        Args:
+            choice: The choice c: an index or a vector.
+        """
 
 
 SomePolicy = TypeVar("SomePolicy", bound=Policy)
@@ -124,7 +159,7 @@ class Starts(eqx.Module):
 
     Attributes:
         tasks: The task of each start (a leading axis of starts).
-        states: s_0 of each start.
+        states: The state s_0 of each start.
         choices: The first choices to try from each start.
     """
 
@@ -137,8 +172,8 @@ class FinitePolicy(Policy):
     """A softmax policy over a finite set of actions.
 
     Attributes:
-        network: from features to a logit of every action.
-        actions: the action of each choice.
+        network: From features to a logit of every action.
+        actions: The action of each choice.
     """
 
     network: ScaledNetwork
@@ -146,24 +181,52 @@ class FinitePolicy(Policy):
     reparameterized: ClassVar[bool] = False
 
     def log_probs(self, x: Features) -> Float[Array, " actions"]:
-        """Return ln π_λ of every action."""
+        """Return ln π_λ of every action.
+
+        Args:
+            x: The features of the state.
+        """
         return jax.nn.log_softmax(self.network(x))
 
     def sample(self, key: PRNGKeyArray, x: Features) -> Choice:
-        """Draw the index of an action."""
+        """Draw the index of an action.
+
+        Args:
+            key: Draws everything random.
+            x: The features of the state.
+
+        Returns:
+            A draw.
+        """
         return jax.random.categorical(key, self.network(x))
 
     def log_prob(self, x: Features, choice: Choice) -> Real:
-        """Return ln π_λ of the index of an action."""
+        """Return ln π_λ of the index of an action.
+
+        Args:
+            x: The features of the state.
+            choice: The choice c: an index or a vector.
+
+        Returns:
+            A logarithm, in nats.
+        """
         return self.log_probs(x)[choice]
 
     def entropy(self, x: Features) -> Real:
-        """Return the entropy in nats, from 0 to ln(actions)."""
+        """Return the entropy in nats, from 0 to ln(actions).
+
+        Args:
+            x: The features of the state.
+        """
         log_probs = self.log_probs(x)
         return -jnp.sum(jnp.exp(log_probs) * log_probs)
 
     def action(self, choice: Choice) -> Action:
-        """Return the action with this index."""
+        """Return the action with this index.
+
+        Args:
+            choice: The choice c: an index or a vector.
+        """
         return jax.lax.stop_gradient(self.actions)[choice]
 
 
@@ -171,8 +234,8 @@ class GaussianPolicy(Policy):
     """A Gaussian policy over vectors.
 
     Attributes:
-        network: from features to the mean.
-        log_spread: the logarithm of the standard deviation of each component, the same in all states.
+        network: From features to the mean.
+        log_spread: The logarithm of the standard deviation of each component, the same in all states.
     """
 
     network: ScaledNetwork
@@ -180,20 +243,44 @@ class GaussianPolicy(Policy):
     reparameterized: ClassVar[bool] = True
 
     def sample(self, key: PRNGKeyArray, x: Features) -> Choice:
-        """Draw the mean plus noise."""
+        """Draw the mean plus noise.
+
+        Args:
+            key: Draws everything random.
+            x: The features of the state.
+
+        Returns:
+            A draw.
+        """
         noise = jax.random.normal(key, self.log_spread.shape, self.log_spread.dtype)
         return self.network(x) + jnp.exp(self.log_spread) * noise
 
     def log_prob(self, x: Features, choice: Choice) -> Real:
-        """Return ln π_λ of an action."""
+        """Return ln π_λ of an action.
+
+        Args:
+            x: The features of the state.
+            choice: The choice c: an index or a vector.
+
+        Returns:
+            A logarithm, in nats.
+        """
         return norm.logpdf(choice, self.network(x), jnp.exp(self.log_spread)).sum()
 
     def entropy(self, x: Features) -> Real:
-        """Return the entropy in nats; below 0 for narrow policies."""
+        """Return the entropy in nats; below 0 for narrow policies.
+
+        Args:
+            x: The features of the state.
+        """
         return jnp.sum(self.log_spread + 0.5 * math.log(2 * math.pi * math.e))
 
     def action(self, choice: Choice) -> Action:
-        """Return the choice itself."""
+        """Return the choice itself.
+
+        Args:
+            choice: The choice c: an index or a vector.
+        """
         return choice
 
 
@@ -203,14 +290,17 @@ def finite_policy(
     """Return a network policy over a finite set of actions that begins uniform.
 
     Args:
-        key: draws the initial weights.
-        actions: two or more.
-        examples: typical features, which scale the network's inputs.
-        width: units in each hidden layer.
-        depth: hidden layers.
+        key: Draws the initial weights.
+        actions: Two or more.
+        examples: Typical features, which scale the network's inputs.
+        width: Units in each hidden layer.
+        depth: Hidden layers.
+
+    Returns:
+        The policy.
 
     Raises:
-        InputError: fewer than two actions, or actions or examples that are not finite.
+        InputError: For fewer than two actions, or actions or examples that are not finite.
 
     Example:
         >>> policy = finite_policy(jax.random.key(0), jnp.array([[-1.0], [1.0]]), jnp.eye(3))
@@ -229,15 +319,18 @@ def gaussian_policy(
     """Return a Gaussian policy over vectors with a mean that begins near 0.
 
     Args:
-        key: draws the initial weights.
-        inputs: components of an action.
-        examples: typical features, which scale the network's inputs.
-        spread: the initial standard deviation, above 0.
-        width: units in each hidden layer.
-        depth: hidden layers; with 0 the mean is linear in the features.
+        key: Draws the initial weights.
+        inputs: Components of an action.
+        examples: Typical features, which scale the network's inputs.
+        spread: The initial standard deviation, above 0.
+        width: Units in each hidden layer.
+        depth: Hidden layers; with 0 the mean is linear in the features.
+
+    Returns:
+        The policy.
 
     Raises:
-        InputError: a spread not above 0, or examples that are not finite.
+        InputError: For a spread not above 0, or examples that are not finite.
 
     Example:
         >>> gaussian_policy(jax.random.key(0), 2, jnp.eye(3)).log_spread.tolist()
@@ -255,12 +348,15 @@ def make_critic(
     """Return a critic that begins at the mean of observed returns-to-go.
 
     Args:
-        key: draws the initial weights.
-        examples: the features of states.
-        left: the fraction of the horizon that was left there, in [0, 1].
-        returns: the returns-to-go from there, in units of reward.
-        width: units in each hidden layer.
-        depth: hidden layers.
+        key: Draws the initial weights.
+        examples: The features of states.
+        left: The fraction of the horizon that was left there, in [0, 1].
+        returns: The returns-to-go from there, in units of reward.
+        width: Units in each hidden layer.
+        depth: Hidden layers.
+
+    Returns:
+        The critic.
 
     Example:
         >>> critic = make_critic(jax.random.key(0), jnp.eye(2), jnp.ones(2), jnp.array([1.0, 3.0]))

@@ -37,13 +37,13 @@ class Rollout(eqx.Module):
     """One rollout or, with leading axes, many.
 
     Attributes:
-        task: the task of every rollout.
-        states: s_0…s_τ; those after the end are sampled too, and count for nothing.
-        choices: c_0…c_{τ−1} of the policy; the caller may fix the first.
+        task: The task of every rollout.
+        states: The states s_0…s_τ; those after the end are sampled too, and count for nothing.
+        choices: The choices c_0…c_{τ−1} of the policy; the caller may fix the first.
         rewards: R_0…R_τ, 0 after the end.
-        bonuses: b_0…b_{τ−1}, 0 after the end.
-        transition_control_variates: z_0…z_{τ−1}, 0 until `estimators.with_control_variates` sets them.
-        acting: whether an action was taken in s_i.
+        bonuses: The bonuses b_0…b_{τ−1}, 0 after the end.
+        transition_control_variates: The control variates z_0…z_{τ−1}, 0 until they are set.
+        acting: Whether an action was taken in s_i.
     """
 
     task: ContinuousTask
@@ -87,23 +87,39 @@ class Rollout(eqx.Module):
         return self.at_every_move(lambda task, state: task.features(state))
 
     def policy_log_probs(self, policy: Policy) -> Float[Array, "*batch moves"]:
-        """Return ln π_λ(a_i | s_i) of every move."""
+        """Return ln π_λ(a_i | s_i) of every move.
+
+        Args:
+            policy: π_λ.
+        """
         return self.at_every_move(lambda task, s, choice: policy.log_prob(task.features(s), choice), self.choices)
 
     def policy_advantages(self, policy: Policy) -> Float[Array, "*batch moves"]:
-        """Return q_λ(s_i, a_i) = ln π_λ(a_i | s_i) + H(π_λ(· | s_i)) of every move."""
+        """Return q_λ(s_i, a_i) = ln π_λ(a_i | s_i) + H(π_λ(· | s_i)) of every move.
+
+        Args:
+            policy: π_λ.
+        """
         entropies = self.at_every_move(lambda task, state: policy.entropy(task.features(state)))
         return self.policy_log_probs(policy) + entropies
 
     def action_baselines(self, critic: Critic | None) -> Float[Array, "*batch moves"]:
-        """Return E_i = V_w(s_i) − b_i of every move; V_w is 0 without a critic."""
+        """Return E_i = V_w(s_i) − b_i of every move; V_w is 0 without a critic.
+
+        Args:
+            critic: V_w, or None for 0.
+        """
         if critic is None:
             return -self.bonuses
         values = self.at_every_move(lambda task, s, left: critic(task.features(s), left), self.fraction_left)
         return values - self.bonuses
 
     def discount_powers(self, count: int) -> Float[Array, "*batch count"]:
-        """Return γ^0…γ^{count−1} of every rollout."""
+        """Return γ^0…γ^{count−1} of every rollout.
+
+        Args:
+            count: The number of powers, 1 or more.
+        """
         return self.task.discount[..., None] ** jnp.arange(count)
 
 
@@ -118,7 +134,7 @@ def sample_rollout(
         agent: T_θ, π_λ and the backup.
         task: Rewards and ends.
         key: Draws everything random.
-        state: s_0.
+        state: The first state s_0.
         horizon: τ, the number of moves, 1 or more.
         choice: The first choice; drawn from the policy by default.
 
@@ -207,7 +223,14 @@ def sample_rollouts(agent: Agent, starts: Starts, key: PRNGKeyArray, horizon: in
 
 
 def returns_to_go(rollouts: Rollout) -> Float[Array, "*batch payments"]:
-    """Return W_0…W_τ."""
+    """Return W_0…W_τ.
+
+    Args:
+        rollouts: One rollout or, with leading axes, many.
+
+    Returns:
+        W_i in units of reward, one more than moves.
+    """
 
     def add(after: Array, gain: Array) -> tuple[Array, Array]:
         total = gain + rollouts.task.discount * after
@@ -220,11 +243,25 @@ def returns_to_go(rollouts: Rollout) -> Float[Array, "*batch payments"]:
 
 
 def q_estimates(rollouts: Rollout) -> Float[Array, "*batch moves"]:
-    """Return Q̂_i = R_i − z_i + γ W_{i+1} for every move."""
+    """Return Q̂_i = R_i − z_i + γ W_{i+1} for every move.
+
+    Args:
+        rollouts: One rollout or, with leading axes, many.
+
+    Returns:
+        Q̂_i in units of reward, one a move.
+    """
     after = returns_to_go(rollouts)[..., 1:]
     return rollouts.rewards[..., :-1] - rollouts.transition_control_variates + rollouts.task.discount[..., None] * after
 
 
 def discounted_returns(rollouts: Rollout) -> Float[Array, "*batch"]:
-    """Return Σ γ^i R_i, without bonuses."""
+    """Return Σ γ^i R_i, without bonuses.
+
+    Args:
+        rollouts: One rollout or, with leading axes, many.
+
+    Returns:
+        A return for each rollout, in units of reward.
+    """
     return jnp.sum(rollouts.discount_powers(rollouts.rewards.shape[-1]) * rollouts.rewards, axis=-1)

@@ -87,12 +87,15 @@ def gather_trajectories(trajectories: Sequence[Trajectory], tasks: Sequence[Cont
     """Return the demonstrations of trajectories in a continuous world.
 
     Args:
-        trajectories: states of shape (moves + 1, …), actions of shape (moves, …), and the index of a task.
-        tasks: all of one kind.
+        trajectories: States of shape (moves + 1, …), actions of shape (moves, …), and the index of a task.
+        tasks: All of one kind.
+
+    Returns:
+        A record with an entry for every move.
 
     Raises:
-        InputError: no or an empty trajectory, lengths or shapes that do not fit, numbers that are not finite, a task
-            that does not exist, or a trajectory that goes on after its task has ended.
+        InputError: For no or an empty trajectory, lengths or shapes that do not fit, numbers that are not finite, a
+            task that does not exist, or a trajectory that goes on after its task has ended.
 
     Example:
         >>> import sidestep.continuous as sc

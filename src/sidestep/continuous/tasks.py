@@ -29,7 +29,7 @@ class ContinuousTask(eqx.Module):
 
     Attributes:
         discount: γ in (0, 1].
-        smooth: whether returns are smooth in the states of a path, so that gradients may pass along it.
+        smooth: Whether returns are smooth in the states of a path, so that gradients may pass along it.
     """
 
     discount: eqx.AbstractVar[Float[Array, "*tasks"]]
@@ -37,18 +37,35 @@ class ContinuousTask(eqx.Module):
 
     @abc.abstractmethod
     def reward(self, state: State, action: Action) -> Real:
-        """Return R(s, a)."""
+        """Return R(s, a).
+
+        Args:
+            state: The state s.
+            action: The action a.
+        """
 
     @abc.abstractmethod
     def features(self, state: State) -> Float[Array, " features"]:
-        """Return the state and the goal as the input of a policy."""
+        """Return the state and the goal as the input of a policy.
+
+        Args:
+            state: The state s.
+        """
 
     def terminal_reward(self, state: State) -> Real:
-        """Return the reward of ending in a terminal state."""
+        """Return the reward of ending in a terminal state.
+
+        Args:
+            state: The state s.
+        """
         return jnp.zeros((), self.discount.dtype)
 
     def terminal(self, state: State) -> Bool[Array, ""]:
-        """Return whether the task ends in this state."""
+        """Return whether the task ends in this state.
+
+        Args:
+            state: The state s.
+        """
         return jnp.zeros((), bool)
 
 
@@ -56,10 +73,10 @@ class ReachTask(ContinuousTask):
     """The task of coming within a radius of a goal.
 
     Attributes:
-        goal: a place, compared with the first components of the state.
-        radius: in the units of places, above 0.
-        step_cost: the cost of an action.
-        goal_reward: the reward of arriving.
+        goal: A place, compared with the first components of the state.
+        radius: In the units of places, above 0.
+        step_cost: The cost of an action.
+        goal_reward: The reward of arriving.
         discount: γ in (0, 1].
     """
 
@@ -71,19 +88,36 @@ class ReachTask(ContinuousTask):
     smooth: ClassVar[bool] = False
 
     def reward(self, state: State, action: Action) -> Real:
-        """Return minus the cost of a step."""
+        """Return minus the cost of a step.
+
+        Args:
+            state: The state s.
+            action: The action a.
+        """
         return -self.step_cost
 
     def features(self, state: State) -> Float[Array, " features"]:
-        """Return the state, the goal, and the vector to the goal."""
+        """Return the state, the goal, and the vector to the goal.
+
+        Args:
+            state: The state s.
+        """
         return jnp.concatenate([state, self.goal, self.goal - state[: len(self.goal)]])
 
     def terminal_reward(self, state: State) -> Real:
-        """Return the goal's reward."""
+        """Return the goal's reward.
+
+        Args:
+            state: The state s.
+        """
         return self.goal_reward
 
     def terminal(self, state: State) -> Bool[Array, ""]:
-        """Return whether the goal is within the radius."""
+        """Return whether the goal is within the radius.
+
+        Args:
+            state: The state s.
+        """
         return jnp.sum((state[: len(self.goal)] - self.goal) ** 2) <= self.radius**2
 
 
@@ -93,13 +127,16 @@ def reach_region(
     """Return the task of coming within `radius` of a goal.
 
     Args:
-        goal: a place, compared with the first components of the state.
-        radius: in the units of places, above 0.
+        goal: A place, compared with the first components of the state.
+        radius: In the units of places, above 0.
         discount: γ in (0, 1]; below 1 without a step cost.
-        step_cost: the cost of an action, above 0. Without it the goal pays 1.
+        step_cost: The cost of an action, above 0. Without it the goal pays 1.
+
+    Returns:
+        The task.
 
     Raises:
-        InputError: a goal that is not finite, a radius or step cost not above 0, or a discount outside its range.
+        InputError: For a goal that is not finite, a radius or step cost not above 0, or a discount outside its range.
 
     Example:
         >>> task = reach_region((1.0, 2.0), radius=0.5)
@@ -123,7 +160,7 @@ class QuadraticTask(ContinuousTask):
     """The task of staying near a goal at a quadratic cost: R(s, a) = −(s − g)ᵀ C (s − g) − aᵀ D a; it never ends.
 
     Attributes:
-        goal: g.
+        goal: The goal g.
         state_cost: C.
         action_cost: D.
         discount: γ in (0, 1].
@@ -141,12 +178,21 @@ class QuadraticTask(ContinuousTask):
     smooth: ClassVar[bool] = True
 
     def reward(self, state: State, action: Action) -> Real:
-        """Return minus the quadratic costs."""
+        """Return minus the quadratic costs.
+
+        Args:
+            state: The state s.
+            action: The action a.
+        """
         error = state - self.goal
         return -error @ self.state_cost @ error - action @ self.action_cost @ action
 
     def features(self, state: State) -> Float[Array, " features"]:
-        """Return s − g."""
+        """Return s − g.
+
+        Args:
+            state: The state s.
+        """
         return state - self.goal
 
 
@@ -156,7 +202,7 @@ class PendulumTask(ContinuousTask):
     R = −(φ − g)² − 0.1 ω² − 0.001 u² with φ − g in [−π, π); `Pendulum-v1` itself has the goal g = 0, upright.
 
     Attributes:
-        goal: g, in radians from upright.
+        goal: The goal angle g, in radians from upright.
         discount: γ in (0, 1].
 
     Example:
@@ -170,12 +216,21 @@ class PendulumTask(ContinuousTask):
     smooth: ClassVar[bool] = True
 
     def reward(self, state: State, action: Action) -> Real:
-        """Return minus the costs of the angle, the speed and the torque."""
+        """Return minus the costs of the angle, the speed and the torque.
+
+        Args:
+            state: The state s.
+            action: The action a.
+        """
         error = jnp.mod(state[0] - self.goal + jnp.pi, 2 * jnp.pi) - jnp.pi
         return -(error**2) - 0.1 * state[1] ** 2 - 0.001 * action[0] ** 2
 
     def features(self, state: State) -> Float[Array, " features"]:
-        """Return cosine and sine of φ − g, the speed, and cosine and sine of g."""
+        """Return cosine and sine of φ − g, the speed, and cosine and sine of g.
+
+        Args:
+            state: The state s.
+        """
         error = state[0] - self.goal
         parts = [jnp.cos(error), jnp.sin(error), state[1], jnp.cos(self.goal), jnp.sin(self.goal)]
         return jnp.stack(jnp.broadcast_arrays(*parts))
@@ -185,8 +240,8 @@ class TableTask(ContinuousTask):
     """A tabular task as a continuous one, for `TableDynamics`; its features are a one-hot code of task and state.
 
     Attributes:
-        task: the tabular task, with rewards for every state and action.
-        index: a one-hot code of the task, so that a policy can tell tasks from one another.
+        task: The tabular task, with rewards for every state and action.
+        index: A one-hot code of the task, so that a policy can tell tasks from one another.
         discount: γ in (0, 1].
     """
 
@@ -196,19 +251,36 @@ class TableTask(ContinuousTask):
     smooth: ClassVar[bool] = False
 
     def reward(self, state: State, action: Action) -> Real:
-        """Return R(s, a), from the table."""
+        """Return R(s, a), from the table.
+
+        Args:
+            state: The state s.
+            action: The action a.
+        """
         return self.task.reward[state, action]
 
     def terminal_reward(self, state: State) -> Real:
-        """Return the reward of ending in a terminal state, from the table."""
+        """Return the reward of ending in a terminal state, from the table.
+
+        Args:
+            state: The state s.
+        """
         return self.task.terminal_reward[state]
 
     def terminal(self, state: State) -> Bool[Array, ""]:
-        """Return whether the task ends in this state, from the table."""
+        """Return whether the task ends in this state, from the table.
+
+        Args:
+            state: The state s.
+        """
         return self.task.terminal[state]
 
     def features(self, state: State) -> Float[Array, " features"]:
-        """Return a one-hot code of task and state."""
+        """Return a one-hot code of task and state.
+
+        Args:
+            state: The state s.
+        """
         states = jax.nn.one_hot(state, self.task.terminal.shape[-1], dtype=self.discount.dtype)
         return jnp.outer(self.index, states).ravel()
 
@@ -216,8 +288,14 @@ class TableTask(ContinuousTask):
 def batch_tasks(tasks: Sequence[_Task]) -> _Task:
     """Return several tasks of one kind as one object with a leading axis.
 
+    Args:
+        tasks: The tasks, all of one kind.
+
+    Returns:
+        The batch.
+
     Raises:
-        InputError: no task, or tasks of different kinds or shapes.
+        InputError: For no task, or tasks of different kinds or shapes.
 
     Example:
         >>> batch_tasks([reach_region((0.0,), 0.1), reach_region((1.0,), 0.1)]).goal.tolist()
@@ -229,22 +307,54 @@ def batch_tasks(tasks: Sequence[_Task]) -> _Task:
 
 
 def task_at(tasks: _Task, index: Array | int) -> _Task:
-    """Return one of a batch of tasks, or several for an array of indices."""
+    """Return one of a batch of tasks, or several for an array of indices.
+
+    Args:
+        tasks: The tasks as a batch.
+        index: The index of a task, or an array of them.
+
+    Returns:
+        The task or tasks.
+    """
     return jax.tree.map(lambda leaf: leaf[index], tasks)
 
 
 def task_features(tasks: ContinuousTask, states: States) -> Float[Array, "states features"]:
-    """Return the features of every state under its own task (`tasks` has an axis of states)."""
+    """Return the features of every state under its own task (`tasks` has an axis of states).
+
+    Args:
+        tasks: The task of each state.
+        states: The states, one a task or an index.
+
+    Returns:
+        Features of shape (states, features).
+    """
     return jax.vmap(lambda task, state: task.features(state))(tasks, states)
 
 
 def has_ended(tasks: ContinuousTask, task: Int[Array, " states"], states: States) -> Bool[np.ndarray, " states"]:
-    """Return whether every state is terminal in its task; `task` holds indices into a batch of tasks."""
+    """Return whether every state is terminal in its task; `task` holds indices into a batch of tasks.
+
+    Args:
+        tasks: The tasks as a batch.
+        task: The index of the task of each state.
+        states: The states, one a task or an index.
+
+    Returns:
+        A truth value for each state.
+    """
     return np.asarray(jax.vmap(lambda task, state: task.terminal(state))(task_at(tasks, task), states))
 
 
 def check_tasks(tasks: ContinuousTask) -> None:
-    """Refuse discounts outside (0, 1] and numbers that are not finite."""
+    """Refuse discounts outside (0, 1] and numbers that are not finite.
+
+    Args:
+        tasks: The tasks as a batch.
+
+    Raises:
+        InputError: For any of these.
+    """
     check_finite(tasks, field="tasks")
     for discount in np.ravel(tasks.discount):
         check_discount(float(discount))

@@ -152,7 +152,16 @@ def run(
 
 
 def simulate_walks(form: Form, config: MotivationConfig, seed: int) -> ss.Demonstrations:
-    """Return walks of optimal agents that know the world, from states outside the mud."""
+    """Return walks of optimal agents that know the world, from states outside the mud.
+
+    Args:
+        form: The form of the reward.
+        config: The size of the experiment.
+        seed: Draws everything random.
+
+    Returns:
+        The walks.
+    """
     world, random = true_world(), np.random.default_rng(seed)
     goals, dry = [_state(goal) for goal in config.goals], np.flatnonzero(np.asarray(world.known) == ss.Cell.FREE)
     tasks = [form.config.reward.reach(BLANK, goal) for goal in goals]
@@ -161,7 +170,14 @@ def simulate_walks(form: Form, config: MotivationConfig, seed: int) -> ss.Demons
 
 
 def true_result(form: Form) -> ModelResult:
-    """Return the true model as a result."""
+    """Return the true model as a result.
+
+    Args:
+        form: The form of the reward.
+
+    Returns:
+        The result.
+    """
     world, behavior = true_world(), behavior_of(form.config.behavior)
     ranking, robot = np.asarray(world.blocked), ss.risk_averse_robot(world, [])
     return ModelResult(world, form.config.reward, behavior, ranking, robot, converged=True)
@@ -171,6 +187,15 @@ def task_at_stakes(result: ModelResult, form: Form, goal: int, stakes: float) ->
     """Return the task of reaching a state with the goal's pay and the step costs multiplied by the stakes.
 
     The costs of cells stay as they were learned: a global cost function does not depend on the task.
+
+    Args:
+        result: What a method learned.
+        form: The form of the reward.
+        goal: The state to reach.
+        stakes: The factor k of the reward, above 0.
+
+    Returns:
+        The task.
     """
     learned, base = (reward.reach(BLANK, goal) for reward in (result.reward, form.config.reward))
     pay = jnp.full((1,), stakes * form.worth)
@@ -178,7 +203,17 @@ def task_at_stakes(result: ModelResult, form: Form, goal: int, stakes: float) ->
 
 
 def run_trial(result: ModelResult, form: Form, goal: int, stakes: float) -> Trial:
-    """Return what a robot does that plans optimally with a method's result."""
+    """Return what a robot does that plans optimally with a method's result.
+
+    Args:
+        result: What a method learned.
+        form: The form of the reward.
+        goal: The state to reach.
+        stakes: The factor k of the reward, above 0.
+
+    Returns:
+        The outcome at every start.
+    """
     robot = ss.plan(result.model, task_at_stakes(result, form, goal, stakes))
     fails = np.asarray(true_world().blocked).ravel()
     starts = np.setdiff1d(np.flatnonzero(fails < 1), [goal])

@@ -66,7 +66,14 @@ class PendulumConfig(ContinuousConfig):
         return [sc.PendulumTask(goal=jnp.asarray(goal), discount=jnp.asarray(self.discount)) for goal in self.goals]
 
     def trajectories(self, seed: int) -> list[ss.Trajectory]:
-        """Simulate the agents."""
+        """Simulate the agents.
+
+        Args:
+            seed: Draws everything random.
+
+        Returns:
+            The trajectories.
+        """
         random, spread = np.random.default_rng(seed), np.array(self.start_spread)
         shape = self.agents_per_goal, 2
         starts = [np.array([goal, 0.0]) + random.uniform(-spread, spread, shape) for goal in self.goals]

@@ -61,7 +61,11 @@ class FunctionSpacePrior(ss.Prior):
     each: ss.Normal
 
     def log_density(self, parameters: FloatTree) -> Float[Array, ""]:
-        """Return the log-density of the logits at the places."""
+        """Return the log-density of the logits at the places.
+
+        Args:
+            parameters: The parameters of the field.
+        """
         field = eqx.tree_at(lambda field: field.parameters, self.field, parameters)
         return self.each.log_density(jax.vmap(field.logit)(self.places))
 

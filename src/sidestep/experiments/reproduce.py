@@ -110,6 +110,9 @@ def simulate_walks(world: World, config: ReproduceConfig, seed: int) -> ss.Demon
         world: The map, the starts and the goals.
         config: The number of walks and the reward.
         seed: Draws the agents' choices among optimal actions.
+
+    Returns:
+        The walks.
     """
     tasks = [config.reward.reach(world.truth.forget(), goal) for goal in world.goals]
     starts = [

@@ -56,23 +56,54 @@ class RoomConfig(ContinuousConfig):
         return ss.Normal(self.prior_mean, self.prior_variance)
 
     def radial_field(self, world: Room) -> sc.RadialField:
-        """Return basis functions at the prior's mean."""
+        """Return basis functions at the prior's mean.
+
+        Args:
+            world: The room.
+
+        Returns:
+            The field.
+        """
         return sc.radial_field(world.dynamics.low, world.dynamics.high, (self.centers, self.centers), self.prior_mean)
 
     def demonstrations(self, world: Room, seed: int) -> tuple[ss.Demonstrations, int]:
-        """Return the moves to learn from, and the number of those that were removed."""
+        """Return the moves to learn from, and the number of those that were removed.
+
+        Args:
+            world: The room.
+            seed: Draws everything random.
+
+        Returns:
+            The moves, and the number removed.
+        """
         return walks_without_collisions(jax.random.key(seed), world, self.behavior, self.agents_per_goal, seed)
 
 
 def blocked_map(dynamics: sc.ObstacleMotion, world: Room) -> Float[np.ndarray, "rows columns"]:
-    """Return P(blocked) at the center of every small cell."""
+    """Return P(blocked) at the center of every small cell.
+
+    Args:
+        dynamics: The learned dynamics.
+        world: The room.
+
+    Returns:
+        P(blocked) in [0, 1], one number a cell.
+    """
     cells = world.cells
     places = jnp.asarray(cells.centers(np.arange(cells.size)))
     return np.asarray(jax.vmap(dynamics.blocked)(places)).reshape(cells.shape)
 
 
 def score_map(blocked: Float[np.ndarray, "rows columns"], world: Room) -> dict[str, float]:
-    """Return how P(blocked) separates the wall from the rest of the room, over small cells."""
+    """Return how P(blocked) separates the wall from the rest of the room, over small cells.
+
+    Args:
+        blocked: P(blocked) of each cell, in [0, 1].
+        world: The room.
+
+    Returns:
+        The area under the ROC curve and the mean P(blocked) inside and outside the wall.
+    """
     wall = world.cells.known == ss.Cell.OCCUPIED
     auc, _ = ranking_scores(blocked[wall], blocked[~wall])
     means = {"mean_inside": float(blocked[wall].mean()), "mean_outside": float(blocked[~wall].mean())}

@@ -11,7 +11,14 @@ from sidestep.plotting.maps import Panel, figure_learned
 
 
 def figure_comparison(comparison: Comparison) -> Figure:
-    """Draw the walks, and beside them what each method learned."""
+    """Draw the walks, and beside them what each method learned.
+
+    Args:
+        comparison: The walks and what each method learned from them.
+
+    Returns:
+        The figure.
+    """
     problem = comparison.problem
     paths = problem.demonstrations.paths()
     panels = [Panel(f"{len(paths)} walks", problem.truth, paths=paths)]

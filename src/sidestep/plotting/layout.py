@@ -33,7 +33,15 @@ class ColorBar(NamedTuple):
 
 
 def new_figure(count: int, columns: int) -> tuple[Figure, list[Axes]]:
-    """Return a figure and `count` axes, row by row; draw on them, then call `arrange`."""
+    """Return a figure and `count` axes, row by row; draw on them, then call `arrange`.
+
+    Args:
+        count: The number of axes, 1 or more.
+        columns: The number of axes in a row.
+
+    Returns:
+        The figure and its axes.
+    """
     figure = Figure(dpi=DOTS_PER_INCH)
     return figure, [figure.add_subplot(-(-count // columns), columns, index + 1) for index in range(count)]
 
@@ -42,10 +50,10 @@ def arrange(figure: Figure, widths: Sequence[float], height: float, bar: ColorBa
     """Place the axes of a figure in rows, add a color bar and a legend, and fit the size of the figure to them.
 
     Args:
-        figure: from `new_figure`, with everything drawn.
-        widths: the width of each column in inches.
-        height: the height of each row in inches.
-        bar: the color bar, which is 85 % as long as all rows together.
+        figure: From `new_figure`, with everything drawn.
+        widths: The width of each column in inches.
+        height: The height of each row in inches.
+        bar: The color bar, which is 85 % as long as all rows together.
     """
     renderer = FigureCanvasAgg(figure).get_renderer()
     axes, columns = list(figure.axes), len(widths)

@@ -43,13 +43,13 @@ class Panel:
     """One map of a figure with several.
 
     Attributes:
-        title: the text above the map.
-        grid: the map.
+        title: The text above the map.
+        grid: The map.
         blocked: P(blocked) of each cell; None draws `grid` as it is.
-        truth: the true map; its obstacles are outlined.
-        paths: the places along each path. A place is a state, or a position in metres.
-        starts: places that get a red square.
-        goals: places that get a green diamond.
+        truth: The true map; its obstacles are outlined.
+        paths: The places along each path. A place is a state, or a position in metres.
+        starts: Places that get a red square.
+        goals: Places that get a green diamond.
     """
 
     title: str
@@ -67,11 +67,14 @@ def draw_cells(
     """Draw one value per cell at the cells' places in the map's frame, with axes in metres; return the image.
 
     Args:
-        axes: where to draw.
-        values: of each cell, row 0 at the top.
-        grid: the geometry of the map.
-        colors: the color map.
-        limits: the values of the first and the last color.
+        axes: Where to draw.
+        values: Of each cell, row 0 at the top.
+        grid: The geometry of the map.
+        colors: The color map.
+        limits: The values of the first and the last color.
+
+    Returns:
+        The image.
     """
     rows, columns = grid.shape
     x, y, yaw = grid.origin
@@ -88,13 +91,31 @@ def draw_cells(
 
 
 def draw_map(axes: Axes, grid: Grid) -> AxesImage:
-    """Draw the known cells of a map: free white, occupied dark, unknown light gray; return the image."""
+    """Draw the known cells of a map: free white, occupied dark, unknown light gray; return the image.
+
+    Args:
+        axes: The axes to draw on.
+        grid: The map.
+
+    Returns:
+        The image.
+    """
     limits = float(Cell.UNKNOWN), float(Cell.OCCUPIED)
     return draw_cells(axes, grid.known, grid, ListedColormap(palette.KNOWN), limits)
 
 
 def draw_blocked(axes: Axes, blocked: Values, grid: Grid, truth: Grid | None = None) -> AxesImage:
-    """Draw P(blocked) in colors for 0 to 1, with the obstacles of `truth` outlined; return the image."""
+    """Draw P(blocked) in colors for 0 to 1, with the obstacles of `truth` outlined; return the image.
+
+    Args:
+        axes: The axes to draw on.
+        blocked: P(blocked) of each cell, in [0, 1].
+        grid: The map.
+        truth: The true map, or None.
+
+    Returns:
+        The image.
+    """
     image = draw_cells(axes, blocked, grid, palette.BLOCKED, (0.0, 1.0))
     if truth is not None:
         draw_outlines(axes, truth)
@@ -102,7 +123,12 @@ def draw_blocked(axes: Axes, blocked: Values, grid: Grid, truth: Grid | None = N
 
 
 def draw_outlines(axes: Axes, truth: Grid) -> None:
-    """Outline the obstacles of a true map."""
+    """Outline the obstacles of a true map.
+
+    Args:
+        axes: The axes to draw on.
+        truth: The true map, fully known.
+    """
     segments = _borders(truth.known == Cell.OCCUPIED, truth)
     width = _width(truth, 0.2, 1.6)
     outline = LineCollection(segments, colors=palette.OUTLINE, linewidths=width, zorder=2, label="true obstacle")
@@ -114,10 +140,10 @@ def draw_walks(axes: Axes, paths: Sequence[Places], grid: Grid, label: str = "wa
     """Draw walks as thin lines, each walk of states with a small shift of its own, so that bundles remain visible.
 
     Args:
-        axes: where to draw.
-        paths: the places along each walk.
-        grid: the map.
-        label: the name of the walks in the legend.
+        axes: Where to draw.
+        paths: The places along each walk.
+        grid: The map.
+        label: The name of the walks in the legend.
     """
     if not len(paths):
         return
@@ -130,7 +156,13 @@ def draw_walks(axes: Axes, paths: Sequence[Places], grid: Grid, label: str = "wa
 
 
 def draw_path(axes: Axes, states: Integer[np.ndarray, " steps"], grid: Grid) -> None:
-    """Draw one path (states) as a bold line from a square at its start to a star at its end."""
+    """Draw one path (states) as a bold line from a square at its start to a star at its end.
+
+    Args:
+        axes: The axes to draw on.
+        states: The states along the path.
+        grid: The map.
+    """
     x, y = grid.centers(states).T
     width = _width(grid, 1.6, 2.4)
     axes.plot(x, y, color=palette.PATH, linewidth=width, path_effects=_halo(width), zorder=4, label="path")
@@ -139,13 +171,27 @@ def draw_path(axes: Axes, states: Integer[np.ndarray, " steps"], grid: Grid) -> 
 
 
 def draw_places(axes: Axes, starts: Marks, goals: Marks, grid: Grid) -> None:
-    """Draw starts as red squares and goals as green diamonds."""
+    """Draw starts as red squares and goals as green diamonds.
+
+    Args:
+        axes: The axes to draw on.
+        starts: The starts: states, or positions in metres.
+        goals: The goals: states, or positions in metres.
+        grid: The map.
+    """
     _draw_markers(axes, starts, grid, "s", palette.START, "start")
     _draw_markers(axes, goals, grid, "D", palette.GOAL, "goal")
 
 
 def figure_environments(worlds: Sequence[World]) -> Figure:
-    """Return a figure of true maps with their starts and goals, side by side."""
+    """Return a figure of true maps with their starts and goals, side by side.
+
+    Args:
+        worlds: The worlds.
+
+    Returns:
+        The figure.
+    """
     return figure_learned([Panel(world.name, world.truth, starts=world.starts, goals=world.goals) for world in worlds])
 
 
@@ -153,9 +199,12 @@ def figure_learned(panels: Sequence[Panel], columns: int | None = None, label: s
     """Return a figure of several maps with one color bar.
 
     Args:
-        panels: the maps.
-        columns: how many maps a row has; by default all maps are in one row.
-        label: what the colors of learned maps mean.
+        panels: The maps.
+        columns: How many maps a row has; by default all maps are in one row.
+        label: What the colors of learned maps mean.
+
+    Returns:
+        The figure.
     """
     columns = min(columns or len(panels), len(panels))
     figure, axes = new_figure(len(panels), columns)
@@ -177,12 +226,15 @@ def figure_fit(
     """Return a figure of a fit: the walks and their goals, the learned map, and the objective in every iteration.
 
     Args:
-        grid: the map before learning.
-        paths: the states along each walk.
-        blocked: the learned P(blocked) of each cell.
-        objective: the log posterior (nats) before the first iteration and after each.
+        grid: The map before learning.
+        paths: The states along each walk.
+        blocked: The learned P(blocked) of each cell.
+        objective: The log posterior (nats) before the first iteration and after each.
         seen: P(blocked) of each cell in the map of a sensor, NaN where it has none.
         goals: The goals of the walks.
+
+    Returns:
+        The figure.
     """
     width, height = _size(grid, _FIT)
     height = max(height, 2.2)
@@ -210,7 +262,16 @@ def figure_fit(
 
 
 def figure_plan(grid: Grid, blocked: Values, path: Integer[np.ndarray, " steps"]) -> Figure:
-    """Return a figure of one path (states) planned in a learned map."""
+    """Return a figure of one path (states) planned in a learned map.
+
+    Args:
+        grid: The map.
+        blocked: The learned P(blocked) of each cell, in [0, 1].
+        path: The states along the path.
+
+    Returns:
+        The figure.
+    """
     width, height = _size(grid, _PLAN)
     figure, (axes,) = new_figure(1, 1)
     image = draw_blocked(axes, blocked, grid)
@@ -223,8 +284,12 @@ def figure_plan(grid: Grid, blocked: Values, path: Integer[np.ndarray, " steps"]
 def save(figure: Figure, path: str | Path) -> None:
     """Write a figure as a PNG atomically.
 
+    Args:
+        figure: The figure.
+        path: The file to write.
+
     Raises:
-        InputError: where the file system refuses.
+        InputError: For a path that the file system refuses.
     """
     # a file a quarter larger is written in half the time
     options = {"compress_level": 1}

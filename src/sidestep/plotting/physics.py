@@ -19,11 +19,14 @@ def figure_belief(
     """Return a figure of pendulums over time, and of the learned gravity in every iteration.
 
     Args:
-        angles: of each pendulum from upright, in radians, one per time step.
-        time_step: seconds.
-        estimates: the gravity (m/s²) after each iteration.
-        believed: the gravity that the agents believe in, a dashed line.
-        true: the gravity of the pendulums, a dotted line.
+        angles: Of each pendulum from upright, in radians, one per time step.
+        time_step: The time between two angles, in seconds.
+        estimates: The gravity (m/s²) after each iteration.
+        believed: The gravity that the agents believe in, a dashed line.
+        true: The gravity of the pendulums, a dotted line.
+
+    Returns:
+        The figure.
     """
     figure = Figure(figsize=(9.5, 3.6), layout="constrained")
     swings, learned = figure.subplots(1, 2)

@@ -22,15 +22,15 @@ class PolicyPanel:
     """A map and a policy of a robot on it.
 
     Attributes:
-        title: the text above the map.
-        values: of each cell, drawn as colors.
-        label: the name of the values.
-        most: the value of the last color; the first color is that of 0.
-        truth: the true map; its obstacles are outlined.
+        title: The text above the map.
+        values: Of each cell, drawn as colors.
+        label: The name of the values.
+        most: The value of the last color; the first color is that of 0.
+        truth: The true map; its obstacles are outlined.
         goal: The state that the robot has to reach, if there is one.
         policy: The states from which the policy is drawn, the state that the next move from each should reach, and
             whether the robot stays at each instead.
-        walks: the places along each demonstrated walk.
+        walks: The places along each demonstrated walk.
     """
 
     title: str
@@ -48,9 +48,9 @@ class Curves:
     """How often each outcome happens, over the stakes.
 
     Attributes:
-        title: the text above the curves.
-        stakes: what a success pays, in units of a failure's cost.
-        fractions: by method and outcome, one fraction of starts for each of the stakes.
+        title: The text above the curves.
+        stakes: What a success pays, in units of a failure's cost.
+        fractions: By method and outcome, one fraction of starts for each of the stakes.
     """
 
     title: str
@@ -59,7 +59,15 @@ class Curves:
 
 
 def figure_policies(panels: Sequence[PolicyPanel], curves: Sequence[Curves]) -> Figure:
-    """Return a figure of maps in a row, and below it a row of plots for each set of curves."""
+    """Return a figure of maps in a row, and below it a row of plots for each set of curves.
+
+    Args:
+        panels: The maps.
+        curves: The sets of curves.
+
+    Returns:
+        The figure.
+    """
     figure = Figure(figsize=(2.9 * len(panels), 2.7 + 2.5 * len(curves)), layout="constrained")
     rows = figure.add_gridspec(1 + len(curves), 1, height_ratios=[2.7, *[2.5] * len(curves)])
     parts = [figure.add_subfigure(row) for row in rows]

@@ -41,16 +41,37 @@ class Room(NamedTuple):
         return ss.Grid(np.where(inside, int(ss.Cell.OCCUPIED), int(ss.Cell.FREE)), RESOLUTION)
 
     def with_field(self, field: sc.Field) -> sc.ObstacleMotion:
-        """Return the dynamics of the room with a field in place of its wall."""
+        """Return the dynamics of the room with a field in place of its wall.
+
+        Args:
+            field: The logit of P(blocked) at each place.
+
+        Returns:
+            The dynamics.
+        """
         return sc.ObstacleMotion(field, self.dynamics.low, self.dynamics.high, self.dynamics.noise)
 
     def inside(self, places: Float[np.ndarray, "places 2"]) -> Bool[np.ndarray, " places"]:
-        """Return whether each place lies in the wall."""
+        """Return whether each place lies in the wall.
+
+        Args:
+            places: Positions in meters, of shape (places, 2).
+
+        Returns:
+            A truth value for each place.
+        """
         return np.all((places >= WALL_LOW) & (places <= WALL_HIGH), axis=1)
 
 
 def room(lattice_points: int = 41) -> Room:
-    """Return the room, and a lattice with `lattice_points` points along each side for the values of agents."""
+    """Return the room, and a lattice with `lattice_points` points along each side for the values of agents.
+
+    Args:
+        lattice_points: The number of points, 2 or more.
+
+    Returns:
+        The room.
+    """
     walls = sc.Walls(low=jnp.asarray([WALL_LOW]), high=jnp.asarray([WALL_HIGH]))
     low, high = jnp.zeros(2), jnp.full(2, SIDE)
     angles = np.arange(8) * np.pi / 4
@@ -61,7 +82,16 @@ def room(lattice_points: int = 41) -> Room:
 
 
 def random_starts(world: Room, count: int, random: np.random.Generator) -> list[Float[np.ndarray, "count 2"]]:
-    """Return `count` random starts for each task, outside the wall and not near the goal."""
+    """Return `count` random starts for each task, outside the wall and not near the goal.
+
+    Args:
+        world: The room.
+        count: The number of starts for each task.
+        random: The source of random numbers.
+
+    Returns:
+        For each task, starts of shape (count, 2).
+    """
     starts = []
     for goal in GOALS:
         places = random.uniform(0.5, SIDE - 0.5, size=(100 * count, 2))
@@ -76,11 +106,11 @@ def walks_without_collisions(
     """Simulate agents that know the room, and remove every move that aimed at the wall.
 
     Args:
-        key: draws the moves.
-        world: the room.
-        behavior: the agents' backup and β.
-        agents_per_goal: the number of agents with each of the goals.
-        seed: draws the starts.
+        key: Draws the moves.
+        world: The room.
+        behavior: The agents' backup and β.
+        agents_per_goal: The number of agents with each of the goals.
+        seed: Draws the starts.
 
     Returns:
         The moves that are left, and the number of those that were removed.
@@ -98,7 +128,15 @@ def walks_without_collisions(
 
 
 def without_moves(trajectory: ss.Trajectory, removed: Bool[np.ndarray, " moves"]) -> list[ss.Trajectory]:
-    """Return the pieces of a trajectory before, between and after the moves that are removed."""
+    """Return the pieces of a trajectory before, between and after the moves that are removed.
+
+    Args:
+        trajectory: The trajectory.
+        removed: Whether each move is removed.
+
+    Returns:
+        The pieces in order.
+    """
     pieces, begin = [], 0
     for end in (*np.flatnonzero(removed), len(removed)):
         if end > begin:

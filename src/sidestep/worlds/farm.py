@@ -25,7 +25,7 @@ class Farm(NamedTuple):
 
     Attributes:
         terrain: 0 for ground that every machine enters, 1…n for terrain.
-        machine: the machine that stands in each cell, 0…m−1, or −1 for none.
+        machine: The machine that stands in each cell, 0…m−1, or −1 for none.
     """
 
     terrain: Int[np.ndarray, "rows columns"]
@@ -39,8 +39,14 @@ class Farm(NamedTuple):
     def model(self, logits: Float[Array | np.ndarray, "terrains machines"] | float = 0.0) -> TiedModel:
         """Return the model in which terrain t stops machine m with probability σ(logits[t − 1, m]).
 
+        Args:
+            logits: A logit for each terrain and machine, or one for all.
+
+        Returns:
+            The model.
+
         Raises:
-            InputError: maps of different shapes, or without terrain or machines.
+            InputError: For maps of different shapes, or without terrain or machines.
         """
         count, terrains = self.machines, int(self.terrain.max())
         valid = self.terrain.shape == self.machine.shape and terrains >= 1 and count >= 1
@@ -57,9 +63,23 @@ class Farm(NamedTuple):
         return TiedModel(graph(np.stack([after, staying], axis=-1)), index, flat)
 
     def known_model(self, enters: Bool[np.ndarray, "terrains machines"]) -> TiedModel:
-        """Return the model of an agent that knows which machine enters which terrain."""
+        """Return the model of an agent that knows which machine enters which terrain.
+
+        Args:
+            enters: Whether each machine enters each terrain.
+
+        Returns:
+            The model.
+        """
         return self.model(np.where(enters, -_CERTAIN_LOGIT, _CERTAIN_LOGIT))
 
     def stop_probabilities(self, model: TiedModel) -> Float[Array, "terrains machines"]:
-        """Return the probability that each terrain stops each machine, under a model from `model`."""
+        """Return the probability that each terrain stops each machine, under a model from `model`.
+
+        Args:
+            model: A model from `model`.
+
+        Returns:
+            Probabilities of shape (terrains, machines).
+        """
         return jax.nn.sigmoid(model.parameters).reshape(-1, self.machines)

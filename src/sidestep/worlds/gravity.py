@@ -35,8 +35,14 @@ class Gravity(NamedTuple):
     def model(self, logits: Float[Array | np.ndarray, "colors 4"] | float = 0.0) -> TiedModel:
         """Return the model in which color c turns gravity to direction g with the softmax of `logits[c - 1]`.
 
+        Args:
+            logits: A logit for each color and direction, or one for all.
+
+        Returns:
+            The model.
+
         Raises:
-            InputError: a map without colors.
+            InputError: For a map without colors.
         """
         count = int(self.colors.max())
         check(self.colors.min() >= 0 and count > 0, "expected colors 0…n, and one above 0", field="colors")
@@ -52,10 +58,24 @@ class Gravity(NamedTuple):
         return TiedModel(graph(4 * target[..., None] + turned), index, flat)
 
     def known_model(self, rule: Int[np.ndarray, " colors"]) -> TiedModel:
-        """Return the model of an agent that knows that color c turns gravity to direction `rule[c - 1]`."""
+        """Return the model of an agent that knows that color c turns gravity to direction `rule[c - 1]`.
+
+        Args:
+            rule: The index of the direction of each color.
+
+        Returns:
+            The model.
+        """
         return self.model(_CERTAIN_LOGIT * np.eye(4)[np.asarray(rule)])
 
 
 def most_probable_rule(model: TiedModel) -> Int[np.ndarray, " colors"]:
-    """Return the most probable direction of each color, under a model from `Gravity.model`."""
+    """Return the most probable direction of each color, under a model from `Gravity.model`.
+
+    Args:
+        model: A model from `model`.
+
+    Returns:
+        The index of the direction of each color.
+    """
     return np.asarray(model.parameters).reshape(-1, 4).argmax(axis=1)

@@ -29,6 +29,9 @@ def office(rows: int, columns: int, seed: int, connectivity: Connectivity = 4) -
         seed: The seed; equal seeds give equal offices.
         connectivity: The number of moves, 4 or 8.
 
+    Returns:
+        The map.
+
     Raises:
         InputError: For too few rows or columns.
 
@@ -60,6 +63,9 @@ def places(grid: Grid, count: int, seed: int) -> Int[np.ndarray, " count"]:
         count: The number of cells, at least 1.
         seed: The seed.
 
+    Returns:
+        The cells (states) in the order of choice.
+
     Raises:
         InputError: For a count below 1 or above the size of the component.
     """
@@ -81,7 +87,14 @@ def places(grid: Grid, count: int, seed: int) -> Int[np.ndarray, " count"]:
 
 
 def connected_cells(grid: Grid) -> Int[np.ndarray, " cells"]:
-    """Return the free cells (states) of the largest connected component of a map."""
+    """Return the free cells (states) of the largest connected component of a map.
+
+    Args:
+        grid: The map.
+
+    Returns:
+        The states in ascending order.
+    """
     from scipy.sparse.csgraph import connected_components
 
     label = connected_components(walkable_graph(grid), directed=False)[1]
