@@ -45,6 +45,7 @@ def read(data):
 METHODS = ("behavior", "visits", "transitions")
 
 
+@pytest.mark.slow
 def test_learn_by_a_building_that_all_drive_around_is_found(data):
     config = changed(towns.DRIVES, ["beta=3"])
     results = {record["method"]: (record, result) for record, result, _ in people.learn_by(METHODS, read(data), config)}
@@ -77,6 +78,7 @@ def test_means_average_over_the_draws_of_a_town_then_over_towns():
     assert row == {"walks": 3, "method": "visits", "auc": pytest.approx(0.6), "auc_relevant": None}
 
 
+@pytest.mark.slow
 def test_main_buildings_writes_records_and_a_picture(data, tmp_path, capsys):
     file, picture = tmp_path / "records.json", tmp_path / "town.png"
     options = ["--what", "buildings", "--data", str(data / "magellan"), "--counts", "4", "8", "--seeds", "2"]
@@ -177,6 +179,7 @@ def test_both_ways_refuses_a_one_way_street_with_a_reverse(tmp_path):
         towns.read_town(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("times", "many"), [(1, 1_000_000), (100, 1)])
 def test_score_streets_that_drivers_avoid_are_found(city, times, many):
     """From few trips, and from above from many."""

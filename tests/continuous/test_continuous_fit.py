@@ -76,6 +76,7 @@ def fitted(seed=0):
 # Results
 
 
+@pytest.mark.slow
 def test_fit_dynamics_transitions_alone_give_least_squares():
     seen = np.column_stack([STATES, WAYS[CHOICES]])
     following = seen @ [0.7, 0.5] + 0.3 * np.random.default_rng(0).normal(size=MOVES)
@@ -93,6 +94,7 @@ def test_fit_dynamics_transitions_alone_give_least_squares():
     assert (result.converged, result.policy_gap) == (True, 0)
 
 
+@pytest.mark.slow
 def test_fit_dynamics_actions_alone_give_the_maximum_likelihood():
     """The tolerance allows for the noise of rollouts."""
 
@@ -108,6 +110,7 @@ def test_fit_dynamics_actions_alone_give_the_maximum_likelihood():
     assert result.history[0].prior == pytest.approx(-(0.5**2) / 100)
 
 
+@pytest.mark.slow
 def test_fit_dynamics_vector_actions_give_the_true_drift():
     """With R(s, a) = −s² − a² the policy is normal, by Riccati's equation."""
     beta, discount, count = 4.0, 0.6, 300
@@ -137,6 +140,7 @@ def test_fit_dynamics_vector_actions_give_the_true_drift():
     )
 
 
+@pytest.mark.slow
 def test_fit_dynamics_policy_warmup_plans_for_the_first_model():
     """Without the actions' term there is no policy to plan."""
     schedule = Schedule(iterations=2, policy_warmup=3, batch_size=30, learning_rate=0.1)
@@ -156,6 +160,7 @@ def test_fit_dynamics_objective_is_the_sum_of_its_terms():
     assert abs(float(result.dynamics.parameters[0]) - TRUTH) < 0.25
 
 
+@pytest.mark.slow
 def test_fit_dynamics_batches_of_a_laplace_family_give_the_median():
     """The batch log-likelihood is scaled up to all moves."""
     result = fit_dynamics(
@@ -197,6 +202,7 @@ def test_fit_dynamics_large_policy_gap_is_not_converged():
     )
 
 
+@pytest.mark.slow
 def test_fit_dynamics_noisy_policy_gap_is_not_converged():
     """At this β the noise of two rollouts exceeds the gap that it is subtracted from."""
     sharp = Behavior(BoltzmannAverage(), 40.0)
@@ -252,6 +258,7 @@ def leaves(result):
     return [np.asarray(leaf) for leaf in jax.tree.leaves((result.dynamics, result.planner_state)) if eqx.is_array(leaf)]
 
 
+@pytest.mark.slow
 def test_fit_dynamics_resumed_is_identical(checkpoint):
     whole = partial(BOTH, schedule=replace(SHORT, policy_warmup=2), checkpoint=checkpoint)
     expected = whole()
@@ -397,6 +404,7 @@ def test_fit_dynamics_no_moves_are_refused():
         fit_dynamics(INITIAL, nothing, BEHAVIOR, POLICY, PLANNER)
 
 
+@pytest.mark.slow
 def test_fit_dynamics_infinite_rewards_raise():
     tasks = batch_tasks([eqx.tree_at(lambda task: task.state_cost, NEAR, 1e308 * jnp.eye(1))])
     with pytest.raises(NotConverged, match="the figures ceased to be finite at iteration 0: dynamics or rewards"):

@@ -76,6 +76,7 @@ def plans(initial):
     return {"log-sum-exp": first} | others
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BEHAVIORS)
 def test_plan_policy_soft_agent_converges_to_its_own_exact_policy(name, plans, exact):
     pi = np.asarray(policy_table(plans[name].policy))
@@ -86,6 +87,7 @@ def test_plan_policy_soft_agent_converges_to_its_own_exact_policy(name, plans, e
             assert divergence(pi, policy).max() > 0.03
 
 
+@pytest.mark.slow
 def test_plan_policy_optimal_agent_chooses_the_best_actions(initial):
     best = np.asarray(exact_policy(WORLD, OPTIMAL)).argmax(axis=-1)[WHICH, PLACES]
     pi = np.asarray(policy_table(planned(OPTIMAL, warm_start=initial, steps=150).policy))[WHICH, PLACES]
@@ -93,6 +95,7 @@ def test_plan_policy_optimal_agent_chooses_the_best_actions(initial):
     assert pi.max(axis=-1).min() > 0.9
 
 
+@pytest.mark.slow
 def test_plan_policy_critic_approaches_exact_values(plans, exact, initial):
     bonus = entropies(exact["log-sum-exp"]) / BETA
     values, _ = exact_values(WORLD, WORLD.dynamics.parameters, exact["log-sum-exp"], PLANNER.horizon, bonus)
@@ -164,6 +167,7 @@ def exact_figures(pi, optimal):
     return earned[WHICH, PLACES].mean(), jnp.linalg.norm(slope), entropy, gap
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("behavior", [SOFT, OPTIMAL], ids=["log-sum-exp", "hard max"])
 @pytest.mark.parametrize("policy", [UNIFORM, WORLD.policy], ids=["uniform", "another"])
 def test_progress_figures_match_dynamic_programming(policy, behavior, initial):
@@ -179,6 +183,7 @@ def test_progress_figures_match_dynamic_programming(policy, behavior, initial):
     assert figures.policy_gap == pytest.approx(gap, rel=0.1)
 
 
+@pytest.mark.slow
 def test_policy_gap_exact_policy_is_near_0(initial, exact):
     at_first, at_last = (figures_of(SOFT, pi, initial) for pi in (policy_table(UNIFORM), exact["log-sum-exp"]))
     assert at_first.policy_gap > 0.1
@@ -186,6 +191,7 @@ def test_policy_gap_exact_policy_is_near_0(initial, exact):
     assert at_last.gradient < 0.15 * at_first.gradient
 
 
+@pytest.mark.slow
 def test_plan_policy_warm_start_continues_the_former_plan(plans):
     former = plans["log-sum-exp"]
     again = planned(SOFT, warm_start=former.planner_state, steps=2)
@@ -217,24 +223,14 @@ def test_initialize_critic_begins_at_the_mean_return(initial):
     assert np.abs(predictions - initial.critic.center).max() < 0.1 * initial.critic.spread
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "least"),
-    [
-        ("horizon", 0, 1),
-        ("batch_size", 0, 1),
-        ("samples", 1, 2),
-        ("candidates", 0, 1),
-        ("critic_width", 0, 1),
-        ("critic_steps", 0, 1),
-    ],
-)
-def test_planner_refuses_counts_that_are_too_small(name, value, least):
-    with pytest.raises(InputError, match=f"{name}.*at least {least}, found {value}"):
-        Planner(**{"horizon": 2, name: value})
+@pytest.mark.parametrize("name", ["horizon", "batch_size", "samples", "candidates", "critic_width", "critic_steps"])
+def test_planner_refuses_counts_that_are_too_small(name):
+    least = 2 if name == "samples" else 1
+    with pytest.raises(InputError, match=f"{name}.*at least {least}, found {least - 1}"):
+        Planner(**{"horizon": 2, name: least - 1})
 
 
-@pytest.mark.parametrize("name", ["learning_rate", "critic_rate"])
-@pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize(("name", "rate"), [("learning_rate", 0.0), ("critic_rate", float("nan"))])
 def test_planner_refuses_rates_not_above_0(name, rate):
     with pytest.raises(InputError, match=f"{name}.*finite number above 0"):
         Planner(horizon=2, **{name: rate})
@@ -271,6 +267,7 @@ def test_minibatches_hold_every_move_and_are_disjoint():
     assert minibatches(jnp.ones((1, 1, 2, 1)), count=8).shape == (2, 1)
 
 
+@pytest.mark.slow
 def test_fit_critic_with_horizon_1_keeps_the_critic():
     planner = Planner(horizon=1, batch_size=HERE, samples=2, critic_width=8)
     result = planned(SOFT, planner=planner, steps=3)

@@ -1,6 +1,6 @@
 """Rollouts: rewards, the end of tasks, and returns."""
 
-from typing import NamedTuple
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -44,20 +44,12 @@ def rolled() -> Rollout:
     return jax.tree.map(np.asarray, sample_all(jax.random.key(0)))
 
 
-class Plain(NamedTuple):
-    """A rollout in plain arrays."""
-
-    states: np.ndarray
-    choices: np.ndarray
-    rewards: np.ndarray
-    bonuses: np.ndarray
-    transition_control_variates: np.ndarray
-    acting: np.ndarray
-
-
-def one_by_one(rolled: Rollout) -> list[Plain]:
-    parts = (np.asarray(getattr(rolled, name)) for name in Plain._fields)
-    return [Plain(*each) for each in zip(*(part.reshape(-1, part.shape[-1]) for part in parts), strict=True)]
+def one_by_one(rolled: Rollout) -> list[SimpleNamespace]:
+    """Rollouts in plain arrays."""
+    names = "states", "choices", "rewards", "bonuses", "transition_control_variates", "acting"
+    parts = (np.asarray(getattr(rolled, name)) for name in names)
+    rows = zip(*(part.reshape(-1, part.shape[-1]) for part in parts), strict=True)
+    return [SimpleNamespace(**dict(zip(names, each, strict=True))) for each in rows]
 
 
 def test_sample_rollouts_starts_and_transitions_follow_the_model(rolled):

@@ -111,6 +111,7 @@ def test_simulate_trajectories_soft_choices_match_action_values():
     assert frequencies.min() < 0.1 < np.sort(frequencies)[1]
 
 
+@pytest.mark.slow
 def test_simulate_trajectories_wrong_gravity_changes_actions():
     """Agents that believe in less gravity push less, and hold it lower; it swings as the real one."""
     lattice = Lattice(jnp.asarray([-np.pi, -8.0]), jnp.asarray([np.pi, 8.0]), (20, 17), (True, False))
