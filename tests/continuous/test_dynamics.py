@@ -333,7 +333,9 @@ def test_noise_not_above_0_is_refused(noise):
     refused(lambda: PointMass(noise=(*noise.tolist(), 1.0, 1.0)), match=match)
 
 
-@pytest.mark.parametrize(("name", "wrong"), [("gravity", 0), ("mass", -1), ("length", np.nan), ("time_step", np.inf)])
+@pytest.mark.parametrize(
+    ("name", "wrong"), [("gravity", 0.0), ("mass", -1.0), ("length", np.nan), ("time_step", np.inf)]
+)
 def test_pendulum_constants_not_above_0_are_refused(name, wrong):
     refused(lambda: Pendulum(**{name: wrong}), match=f"field '{name}': expected a finite number above 0, found {wrong}")
 

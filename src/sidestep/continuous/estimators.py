@@ -86,7 +86,9 @@ def score_surrogate(agent: Agent, rollouts: Rollout, critic: Critic | None = Non
         >>> dynamics = sc.LinearGaussian(jnp.eye(1), jnp.eye(1), jnp.full(1, 0.1))
         >>> policy = sc.gaussian_policy(jax.random.key(0), 1, jnp.ones((1, 1)))
         >>> agent = sc.Agent(dynamics, policy, ss.Behavior(ss.HardMax()))
-        >>> score_surrogate(agent, sc.sample_rollout(agent, task, jax.random.key(1), jnp.zeros(1), horizon=2)).shape
+        >>> def surrogate(key):
+        ...     return score_surrogate(agent, sc.sample_rollout(agent, task, key, jnp.zeros(1), horizon=2))
+        >>> jax.eval_shape(surrogate, jax.random.key(1)).shape
         ()
 
     References:
@@ -161,9 +163,10 @@ def value_gradient(
         >>> dynamics = sc.LinearGaussian(jnp.eye(1), jnp.eye(1), jnp.full(1, 0.1))
         >>> policy = sc.gaussian_policy(jax.random.key(0), 1, jnp.ones((1, 1)))
         >>> starts = sc.Starts(sc.batch_tasks([task]), jnp.zeros((1, 1)), jnp.ones((1, 2, 1)))
-        >>> agent, key = sc.Agent(dynamics, policy, ss.Behavior(ss.HardMax())), jax.random.key(1)
-        >>> gradient, _ = value_gradient(agent, starts, key, jnp.ones_like, horizon=2, samples=2)
-        >>> {name: part.shape for name, part in gradient.items()}
+        >>> agent = sc.Agent(dynamics, policy, ss.Behavior(ss.HardMax()))
+        >>> def gradient(key):
+        ...     return value_gradient(agent, starts, key, jnp.ones_like, horizon=2, samples=2)[0]
+        >>> {name: part.shape for name, part in jax.eval_shape(gradient, jax.random.key(1)).items()}
         {'action': (1, 1), 'state': (1, 1)}
 
     References:
