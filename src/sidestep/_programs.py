@@ -15,6 +15,7 @@ import os
 import pickle
 from collections.abc import Callable
 from functools import cache, wraps
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -113,13 +114,15 @@ def _compile(path: Path, function: Callable[..., Any], leaves: list[Any], struct
 
 @cache
 def _package() -> str:
-    """Return what every entry belongs to: versions of libraries, settings of JAX, and the files of this package."""
-    from importlib import metadata
+    """Return what every entry belongs to: settings of JAX, the files of this package, and those of other libraries.
 
+    The first file of a library stands for its version, which takes longer to read.
+    """
     import jax
 
     files = sorted(Path(__file__).parent.rglob("*.py"))
+    specs = [find_spec(name) for name in _TRACED_LIBRARIES]
+    files += [Path(spec.origin) for spec in specs if spec is not None and spec.origin is not None]
     stats = [(str(file), stat.st_size, stat.st_mtime_ns) for file in files for stat in [file.stat()]]
     settings = jax.config.read("jax_enable_x64"), jax.default_backend(), jax.device_count(), os.environ.get("XLA_FLAGS")
-    versions = [metadata.version(name) for name in _TRACED_LIBRARIES]
-    return f"{versions} {settings} {hashlib.sha256(str(stats).encode()).hexdigest()}"
+    return f"{settings} {hashlib.sha256(str(stats).encode()).hexdigest()}"
