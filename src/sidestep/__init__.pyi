@@ -20,7 +20,12 @@ from .io.minari.demonstrations import (
 )
 from .io.maps import read_sensor_map as read_sensor_map, read_sensor_variance as read_sensor_variance
 from .io.walks import Walks as Walks, read_walks as read_walks, write_walks as write_walks
-from .tabular.demonstrations import Demonstrations as Demonstrations, Trajectory as Trajectory, gather as gather
+from .tabular.demonstrations import (
+    Demonstrations as Demonstrations,
+    Trajectory as Trajectory,
+    gather as gather,
+    split_by_person as split_by_person,
+)
 from .tabular.graph import Graph as Graph, graph as graph, grid_graph as grid_graph
 from .tabular.grid import Cell as Cell, Grid as Grid
 from .tabular.reward import Reward as Reward
@@ -29,6 +34,8 @@ from .tabular.tasks import Task as Task, reach as reach, stack_tasks as stack_ta
 
 # models: transition models of discrete worlds
 from .tabular.models import (
+    FIXED as FIXED,
+    IMPOSSIBLE as IMPOSSIBLE,
     FeaturedGrid as FeaturedGrid,
     ObstacleGrid as ObstacleGrid,
     SlipperyGrid as SlipperyGrid,
@@ -51,7 +58,11 @@ from .tabular.backups import (
     Mellowmax as Mellowmax,
 )
 from .tabular.behavior_model import BehaviorModel as BehaviorModel, behavior_model as behavior_model
-from .tabular.likelihood import LogLikelihood as LogLikelihood, log_likelihood as log_likelihood
+from .tabular.likelihood import (
+    LogLikelihood as LogLikelihood,
+    log_likelihood as log_likelihood,
+    log_policies as log_policies,
+)
 from .tabular.solve import (
     Solution as Solution,
     SolveOptions as SolveOptions,

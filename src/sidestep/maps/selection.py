@@ -235,16 +235,16 @@ def _reasons(
     against = (
         f"{other} has no values"
         if gains is None
-        else f"{other} makes held-out moves more probable by {gains.sum() / trial.moves:.2g} ± "
-        f"{_standard_error(gains) / trial.moves:.1g} nats each, and {_WORTH:g} would be worth it"
+        else f"with {other} the log-probability of a held-out move is higher by {gains.sum() / trial.moves:.2g} ± "
+        f"{_standard_error(gains) / trial.moves:.1g}; it would be selected from {_WORTH:g} on"
     )
     beta, tempering = selected.behavior.beta, selected.behavior.tempering
     reasons = [
         f"the reward is {kind}: {against}",
-        f"β = {beta:g}: held-out actions are worth {trial.ratio:.3g} times as many independent ones"
+        f"β = {beta:g}: 100 held-out actions say as much about it as {100 * trial.ratio:.3g} independent ones"
         if np.isfinite(trial.ratio)
         else f"β = {beta:g}: held-out walks do not vary",
     ]
     if tempering < 1:
-        reasons.append(f"actions count by {tempering:.2g}, because they are less independent than the model expects")
+        reasons.append(f"actions count by {tempering:.2g}, because those of one walk depend on each other")
     return reasons
