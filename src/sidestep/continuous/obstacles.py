@@ -22,10 +22,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, Scalar
 
 from sidestep._typing import FloatTree, Tree
-from sidestep.continuous.dynamics import GaussianDynamics, Outcomes, check_corners, check_finite, checked_noise
+from sidestep.continuous.dynamics import GaussianDynamics, Outcomes, Vector, check_corners, check_finite, checked_noise
 from sidestep.errors import InputError
-
-Place = Float[Array, " dimensions"]
 
 
 class Field(eqx.Module):
@@ -38,7 +36,7 @@ class Field(eqx.Module):
     parameters: eqx.AbstractVar[FloatTree]
 
     @abc.abstractmethod
-    def logit(self, place: Place) -> Float[Scalar, ""]:
+    def logit(self, place: Vector) -> Float[Scalar, ""]:
         """Return f_θ(x).
 
         Args:
@@ -59,7 +57,7 @@ class RadialField(Field):
     centers: Float[Array, "centers dimensions"]
     width: float = eqx.field(static=True)
 
-    def logit(self, place: Place) -> Float[Scalar, ""]:
+    def logit(self, place: Vector) -> Float[Scalar, ""]:
         """Return the weighted mean of the logits around a place.
 
         Args:
@@ -69,7 +67,7 @@ class RadialField(Field):
         return self.parameters @ jax.nn.softmax(-0.5 * distance / self.width**2)
 
 
-def radial_field(low: Place, high: Place, counts: Sequence[int], logit: float = -2.0) -> RadialField:
+def radial_field(low: Vector, high: Vector, counts: Sequence[int], logit: float = -2.0) -> RadialField:
     """Return radial basis functions with centers on a lattice, 0.7 times as wide as the centers' distance.
 
     Args:
@@ -110,12 +108,12 @@ class NetworkField(Field):
     """
 
     parameters: FloatTree
-    center: Place
-    scale: Place
+    center: Vector
+    scale: Vector
     offset: float = eqx.field(static=True)
     structure: Tree = eqx.field(static=True)
 
-    def logit(self, place: Place) -> Float[Scalar, ""]:
+    def logit(self, place: Vector) -> Float[Scalar, ""]:
         """Return the network's output plus the offset.
 
         Args:
@@ -127,7 +125,7 @@ class NetworkField(Field):
 
 
 def network_field(
-    key: PRNGKeyArray, low: Place, high: Place, width: int = 32, depth: int = 2, logit: float = -2.0
+    key: PRNGKeyArray, low: Vector, high: Vector, width: int = 32, depth: int = 2, logit: float = -2.0
 ) -> NetworkField:
     """Return a network that begins near `logit` everywhere; its inputs are scaled to [−2, 2] along each side.
 
@@ -167,7 +165,7 @@ class Walls(Field):
     high: Float[Array, "boxes dimensions"]
     parameters: tuple[()] = ()
 
-    def logit(self, place: Place) -> Float[Scalar, ""]:
+    def logit(self, place: Vector) -> Float[Scalar, ""]:
         """Return 12 inside a box and −12 outside: P = 6e-6 changes no choice, and keeps all values finite.
 
         Args:
@@ -175,7 +173,7 @@ class Walls(Field):
         """
         return jnp.where(self.inside(place), 12.0, -12.0).astype(place.dtype)
 
-    def inside(self, place: Place) -> jax.Array:
+    def inside(self, place: Vector) -> jax.Array:
         """Return whether a place lies in a box.
 
         Args:
@@ -207,12 +205,12 @@ class ObstacleMotion(GaussianDynamics):
     """
 
     field: Field
-    low: Place
-    high: Place
-    noise: Place
+    low: Vector
+    high: Vector
+    noise: Vector
     stops: bool = eqx.field(static=True)
 
-    def __init__(self, field: Field, low: Place, high: Place, noise: Place, *, stops: bool = True):
+    def __init__(self, field: Field, low: Vector, high: Vector, noise: Vector, *, stops: bool = True):
         check_corners(low, high)
         check_finite(field.parameters)
         self.field, self.stops = field, stops
@@ -223,7 +221,7 @@ class ObstacleMotion(GaussianDynamics):
         """The parameters θ of the field."""
         return self.field.parameters
 
-    def blocked(self, place: Place) -> Float[Scalar, ""]:
+    def blocked(self, place: Vector) -> Float[Scalar, ""]:
         """Return P(blocked) at a place.
 
         Args:
@@ -231,7 +229,7 @@ class ObstacleMotion(GaussianDynamics):
         """
         return jax.nn.sigmoid(self.field.logit(place))
 
-    def outcomes(self, state: Place, action: Float[Array, " dimensions"]) -> Outcomes:
+    def outcomes(self, state: Vector, action: Float[Array, " dimensions"]) -> Outcomes:
         """Return the place that the move aims at and, where obstacles stop moves, the present place.
 
         Args:

@@ -150,10 +150,8 @@ def reach_region(
     check_positive(radius, "radius")
     if step_cost is not None:
         check_positive(step_cost, "step_cost")
-    goal_reward = 1.0 if step_cost is None else 0.0
-    real = jnp.result_type(float)
-    numbers = (jnp.asarray(value, real) for value in (goal, radius, step_cost or 0.0, goal_reward, discount))
-    return ReachTask(*numbers)
+    numbers = goal, radius, step_cost or 0.0, 1.0 if step_cost is None else 0.0, discount
+    return ReachTask(*(jnp.asarray(value, jnp.result_type(float)) for value in numbers))
 
 
 class QuadraticTask(ContinuousTask):
