@@ -150,6 +150,7 @@ def test_fit_dynamics_policy_warmup_plans_for_the_first_model():
     assert by_transitions.planner_state.policy_moments[0].count == 0
 
 
+@pytest.mark.slow
 def test_fit_dynamics_objective_is_the_sum_of_its_terms():
     result, _ = fitted()
     for progress in result.history:
@@ -177,6 +178,7 @@ def test_fit_dynamics_batches_of_a_laplace_family_give_the_median():
 # Diagnostics
 
 
+@pytest.mark.slow
 def test_fit_dynamics_result_is_the_mean_of_the_last_quarter():
     result, reports = fitted()
     drifts = np.array([float(dynamics.parameters[0]) for _, dynamics in reports])
@@ -191,6 +193,7 @@ def test_fit_dynamics_result_is_the_mean_of_the_last_quarter():
     assert [progress.iteration for progress in result.history] == list(range(16))
 
 
+@pytest.mark.slow
 def test_fit_dynamics_large_policy_gap_is_not_converged():
     result, _ = fitted()
     assert 0 < result.drift < 1
@@ -228,6 +231,7 @@ def test_fit_dynamics_constant_slope_has_drift_1():
     assert not result.converged
 
 
+@pytest.mark.slow
 def test_fit_dynamics_repeats_by_seed():
     again, other = BOTH(), fitted(1)[0]
     assert again.history == fitted()[0].history
@@ -274,6 +278,7 @@ def test_fit_dynamics_resumed_is_identical(checkpoint):
     assert (result.drift, result.policy_gap, result.message) == (expected.drift, expected.policy_gap, expected.message)
 
 
+@pytest.mark.slow
 def test_fit_dynamics_without_resume_starts_again(checkpoint):
     iterations = []
     for _ in range(2):
@@ -283,6 +288,7 @@ def test_fit_dynamics_without_resume_starts_again(checkpoint):
     assert iterations[0] == 0
 
 
+@pytest.mark.slow
 def test_fit_dynamics_checkpoint_of_another_problem_is_refused(checkpoint):
     with pytest.raises(KeyboardInterrupt):
         BOTH(report=interrupted_at(2), checkpoint=checkpoint)

@@ -35,7 +35,7 @@ from sidestep.continuous.tasks import task_at
 from sidestep.errors import InputError
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
+pytestmark = [pytest.mark.usefixtures("unoptimised"), pytest.mark.slow]
 
 BETA, HORIZON = 2.0, 5
 TABLE, LINEAR = table(), linear()
@@ -124,14 +124,12 @@ def in_table(request):
     }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("critic", ["no", "an exact", "a wrong"])
 def test_value_gradient_score_in_table_is_unbiased_for_any_critic(in_table, critic):
     exact, samples = in_table
     assert_agrees(samples[critic], exact, precision=0.03)
 
 
-@pytest.mark.slow
 def test_value_gradient_exact_critic_halves_the_variance():
     pi = policy_table(TABLE.policy)
     for _ in range(4):  # nearly to π ∝ exp βQ^π
@@ -145,7 +143,6 @@ def test_value_gradient_exact_critic_halves_the_variance():
     assert with_critic.var(axis=0).sum() < 0.5 * without.var(axis=0).sum()
 
 
-@pytest.mark.slow
 def test_with_control_variates_exact_critic_removes_all_noise():
     pi = exact_policy(TABLE, SOFT)
     values, q = exact_values(TABLE, TABLE.dynamics.parameters, pi, 40, entropies(pi) / BETA)
@@ -168,7 +165,6 @@ def test_value_gradient_weights_are_independent_of_gradients():
     assert_agrees(sample, exact, precision=0.03)
 
 
-@pytest.mark.slow
 def test_value_gradient_score_error_falls_as_root_of_rollouts():
     one = Starts(task_at(TABLE.tasks, WHICH[:1]), PLACES[:1], jnp.ones((1, 1), int))
     _, exact = exact_table("log-sum-exp", TABLE, lambda q: q[0, 1])
@@ -269,7 +265,6 @@ def value_by_all_paths(policy):
     return value
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("critic", [None, wrong_critic()], ids=["no critic", "a wrong critic"])
 def test_value_gradient_pathwise_over_finite_actions_matches_exact_sum(critic):
     world = choosing(noise=1e-3)
@@ -278,7 +273,6 @@ def test_value_gradient_pathwise_over_finite_actions_matches_exact_sum(critic):
     assert_agrees(sample, exact, precision=0.03)
 
 
-@pytest.mark.slow
 def test_value_gradient_pathwise_and_score_agree_over_finite_actions():
     world = choosing(noise=0.3)
     along_paths, scores = (

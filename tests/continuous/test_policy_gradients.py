@@ -31,7 +31,7 @@ from sidestep.continuous.tasks import task_at
 from sidestep.errors import InputError, NotConverged
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax, LogSumExp, Mellowmax
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
+pytestmark = [pytest.mark.usefixtures("unoptimised"), pytest.mark.slow]
 
 WORLD, BETA = table(), 1.5
 SOFT, OPTIMAL = Behavior(LogSumExp(), BETA), Behavior(HardMax(), BETA)
@@ -76,7 +76,6 @@ def plans(initial):
     return {"log-sum-exp": first} | others
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", BEHAVIORS)
 def test_plan_policy_soft_agent_converges_to_its_own_exact_policy(name, plans, exact):
     pi = np.asarray(policy_table(plans[name].policy))
@@ -87,7 +86,6 @@ def test_plan_policy_soft_agent_converges_to_its_own_exact_policy(name, plans, e
             assert divergence(pi, policy).max() > 0.03
 
 
-@pytest.mark.slow
 def test_plan_policy_optimal_agent_chooses_the_best_actions(initial):
     best = np.asarray(exact_policy(WORLD, OPTIMAL)).argmax(axis=-1)[WHICH, PLACES]
     pi = np.asarray(policy_table(planned(OPTIMAL, warm_start=initial, steps=150).policy))[WHICH, PLACES]
@@ -95,7 +93,6 @@ def test_plan_policy_optimal_agent_chooses_the_best_actions(initial):
     assert pi.max(axis=-1).min() > 0.9
 
 
-@pytest.mark.slow
 def test_plan_policy_critic_approaches_exact_values(plans, exact, initial):
     bonus = entropies(exact["log-sum-exp"]) / BETA
     values, _ = exact_values(WORLD, WORLD.dynamics.parameters, exact["log-sum-exp"], PLANNER.horizon, bonus)
@@ -118,7 +115,6 @@ def optimal_control(task, dynamics):
     return gain, np.sqrt(np.diag(np.linalg.inv(curvature)) / (2 * BETA))
 
 
-@pytest.mark.slow
 def test_plan_policy_gaussian_policy_matches_maximum_entropy_control():
     dynamics, tasks, _ = linear(goals=((0.0, 0.0),))
     starts = jax.random.normal(jax.random.key(1), (256, 2))
@@ -167,7 +163,6 @@ def exact_figures(pi, optimal):
     return earned[WHICH, PLACES].mean(), jnp.linalg.norm(slope), entropy, gap
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("behavior", [SOFT, OPTIMAL], ids=["log-sum-exp", "hard max"])
 @pytest.mark.parametrize("policy", [UNIFORM, WORLD.policy], ids=["uniform", "another"])
 def test_progress_figures_match_dynamic_programming(policy, behavior, initial):
@@ -183,7 +178,6 @@ def test_progress_figures_match_dynamic_programming(policy, behavior, initial):
     assert figures.policy_gap == pytest.approx(gap, rel=0.1)
 
 
-@pytest.mark.slow
 def test_policy_gap_exact_policy_is_near_0(initial, exact):
     at_first, at_last = (figures_of(SOFT, pi, initial) for pi in (policy_table(UNIFORM), exact["log-sum-exp"]))
     assert at_first.policy_gap > 0.1
@@ -191,7 +185,6 @@ def test_policy_gap_exact_policy_is_near_0(initial, exact):
     assert at_last.gradient < 0.15 * at_first.gradient
 
 
-@pytest.mark.slow
 def test_plan_policy_warm_start_continues_the_former_plan(plans):
     former = plans["log-sum-exp"]
     again = planned(SOFT, warm_start=former.planner_state, steps=2)
@@ -267,7 +260,6 @@ def test_minibatches_hold_every_move_and_are_disjoint():
     assert minibatches(jnp.ones((1, 1, 2, 1)), count=8).shape == (2, 1)
 
 
-@pytest.mark.slow
 def test_fit_critic_with_horizon_1_keeps_the_critic():
     planner = Planner(horizon=1, batch_size=HERE, samples=2, critic_width=8)
     result = planned(SOFT, planner=planner, steps=3)

@@ -54,6 +54,7 @@ def test_experiment_command_unknown_name_is_wrong_usage(capsys):
     assert "kitchen" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_demonstrations_never_aim_at_the_wall():
     world = continuous_room.room()
     demonstrations, _ = ROOM.demonstrations(world, seed=3)

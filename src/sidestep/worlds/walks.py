@@ -3,17 +3,14 @@
 import jax
 import numpy as np
 
+import sidestep as ss
 from sidestep.errors import check
 from sidestep.maps.config import SimulationConfig
-from sidestep.tabular.backups import BACKUPS, Behavior
-from sidestep.tabular.demonstrations import Trajectory
-from sidestep.tabular.grid import Grid
-from sidestep.tabular.models import true_model
-from sidestep.tabular.simulation import simulate
+from sidestep.tabular.backups import BACKUPS
 from sidestep.worlds.offices import connected_cells, places
 
 
-def simulate_walks(grid: Grid, config: SimulationConfig) -> tuple[list[Trajectory], list[int]]:
+def simulate_walks(grid: ss.Grid, config: SimulationConfig) -> tuple[list[ss.Trajectory], list[int]]:
     """Simulate agents that walk from random cells to goals that lie well apart.
 
     Args:
@@ -34,6 +31,6 @@ def simulate_walks(grid: Grid, config: SimulationConfig) -> tuple[list[Trajector
     random = np.random.default_rng(config.seed)
     goal_of_walk = np.arange(config.walks) % len(goals)
     starts = [random.choice(candidates[candidates != goal], (goal_of_walk == i).sum()) for i, goal in enumerate(goals)]
-    behavior = None if config.beta is None else Behavior(BACKUPS[config.backup](), config.beta)
+    behavior = None if config.beta is None else ss.Behavior(BACKUPS[config.backup](), config.beta)
     tasks = [config.reward.reach(grid, goal) for goal in goals]
-    return simulate(jax.random.key(config.seed), true_model(grid), tasks, starts, behavior), goals
+    return ss.simulate(jax.random.key(config.seed), ss.true_model(grid), tasks, starts, behavior), goals
