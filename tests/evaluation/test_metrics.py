@@ -6,20 +6,14 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import dijkstra
 
+from helpers.drawn import grid_of
 from sidestep.errors import InputError
 from sidestep.evaluation.metrics import ranking_scores, score_map, score_paths, visit_ranking
 from sidestep.evaluation.relevance import relevant_obstacles
 from sidestep.tabular.graph import walkable_graph
-from sidestep.tabular.grid import Cell, Connectivity, Grid
+from sidestep.tabular.grid import Cell, Grid
 
 ROOT_TWO = 2**0.5
-
-
-def grid_of(*drawing, connectivity: Connectivity = 4):
-    """A grid drawn with # for occupied, . for free and ? for unknown cells, the top row first."""
-    cells = {"#": Cell.OCCUPIED, ".": Cell.FREE, "?": Cell.UNKNOWN}
-    known = np.array([[cells[sign] for sign in row] for row in drawing], dtype=np.int64)
-    return Grid(known, connectivity=connectivity)
 
 
 def array(*states):

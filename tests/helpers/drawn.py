@@ -22,10 +22,7 @@ def walk_along(*lines, goals=None, failed=None):
         "y": positions[:, 1],
     }
     if goals is not None:
-        columns |= {
-            "goal_x": np.repeat([x for x, _ in goals], lengths),
-            "goal_y": np.repeat([y for _, y in goals], lengths),
-        }
+        columns |= dict(zip(("goal_x", "goal_y"), np.repeat(goals, lengths, axis=0).T, strict=True))
     if failed:
         targets = np.full((len(positions), 2), NAN)
         for (walk, position), target in failed.items():
@@ -37,10 +34,16 @@ def walk_along(*lines, goals=None, failed=None):
 def grid_of(*drawing, connectivity: Connectivity = 4):
     """A grid drawn with # for occupied, . for free and ? for unknown cells, the top row first."""
     cells = {"#": Cell.OCCUPIED, ".": Cell.FREE, "?": Cell.UNKNOWN}
-    return Grid(
-        np.array([[cells[sign] for sign in row] for row in drawing], dtype=np.int64),
-        connectivity=connectivity,
-    )
+    known = np.array([[cells[sign] for sign in row] for row in drawing], dtype=np.int64)
+    return Grid(known, connectivity=connectivity)
+
+
+def assert_same_walks(one, other):
+    """All fields of two walks are equal but the names of their sources."""
+    assert one.labels == other.labels
+    for field in ("offsets", "goals", "positions", "failed_moves", "steps", "rows"):
+        np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
+    assert one.metadata.to_pydict() == other.metadata.to_pydict()
 
 
 position = st.floats(-1e9, 1e9, allow_nan=False)

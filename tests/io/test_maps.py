@@ -1,4 +1,4 @@
-"""ROS maps: what is read, what is refused, and that a learned map comes back as it was written."""
+"""ROS maps, of sensors too: what is read, what is refused, and that a learned map comes back as it was written."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from sidestep.errors import InputError
-from sidestep.io.maps import read_map, write_map
+from sidestep.io.maps import read_map, read_sensor_map, read_sensor_variance, write_map
 from sidestep.tabular.grid import Cell, Grid
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -34,7 +34,7 @@ def make_map(folder, pixels, **changes):
     return folder / "map.yaml"
 
 
-def grey(*values):
+def gray(*values):
     return np.array([values], dtype=np.uint8)
 
 
@@ -46,18 +46,18 @@ def test_read_map_reads_geometry_and_orientation(tmp_path):
 
 @pytest.mark.parametrize("mode", [None, "trinary", "scale"])
 def test_read_map_thresholds_are_strict(tmp_path, mode):
-    path = make_map(tmp_path, grey(203, 204, 205, 50, 51, 52), mode=mode, free_thresh=0.2, occupied_thresh=0.8)
+    path = make_map(tmp_path, gray(203, 204, 205, 50, 51, 52), mode=mode, free_thresh=0.2, occupied_thresh=0.8)
     assert read_map(path).known.tolist() == [[UNKNOWN, UNKNOWN, FREE, OCCUPIED, UNKNOWN, UNKNOWN]]
 
 
 @pytest.mark.parametrize("negate", [1, True])
 def test_read_map_negate_swaps_black_and_white(tmp_path, negate):
-    assert read_map(make_map(tmp_path, grey(0, 255, 128), negate=negate)).known.tolist() == [[FREE, OCCUPIED, UNKNOWN]]
+    assert read_map(make_map(tmp_path, gray(0, 255, 128), negate=negate)).known.tolist() == [[FREE, OCCUPIED, UNKNOWN]]
 
 
 @pytest.mark.parametrize("negate", [0, 1])
 def test_read_map_raw_mode_is_percent(tmp_path, negate):
-    path = make_map(tmp_path, grey(0, 19, 20, 65, 66, 100, 101, 255), mode="raw", negate=negate)
+    path = make_map(tmp_path, gray(0, 19, 20, 65, 66, 100, 101, 255), mode="raw", negate=negate)
     expected = [[FREE, FREE, UNKNOWN, UNKNOWN, OCCUPIED, OCCUPIED, UNKNOWN, UNKNOWN]]
     assert read_map(path).known.tolist() == expected
 
@@ -75,7 +75,7 @@ def test_read_map_transparent_pixels_are_unknown(tmp_path):
 
 
 def test_read_map_looks_up_a_palette(tmp_path):
-    image = Image.fromarray(grey(0, 1))
+    image = Image.fromarray(gray(0, 1))
     image.putpalette([255, 255, 255, 0, 0, 0])
     assert read_map(make_map(tmp_path, image, image="map.png")).known.tolist() == [[FREE, OCCUPIED]]
 
@@ -87,12 +87,12 @@ def test_read_map_scales_sixteen_bits(tmp_path, name):
 
 
 def test_read_map_reads_one_bit_images(tmp_path):
-    image = Image.fromarray(grey(0, 255)).convert("1")
+    image = Image.fromarray(gray(0, 255)).convert("1")
     assert read_map(make_map(tmp_path, image, image="map.png")).known.tolist() == [[OCCUPIED, FREE]]
 
 
 def test_read_map_reads_numbers_that_yaml_reads_as_text(tmp_path):
-    path = make_map(tmp_path, grey(0))
+    path = make_map(tmp_path, gray(0))
     path.write_text(path.read_text().replace("resolution: 0.05", "resolution: 5e-2"))
     assert read_map(path).resolution == 0.05
 
@@ -100,7 +100,7 @@ def test_read_map_reads_numbers_that_yaml_reads_as_text(tmp_path):
 @pytest.mark.parametrize("key", sorted(SETTINGS))
 def test_read_map_without_a_key_names_it(tmp_path, key):
     with pytest.raises(InputError, match=rf"map\.yaml, field '{key}': the key is missing"):
-        read_map(make_map(tmp_path, grey(0), **{key: None}))
+        read_map(make_map(tmp_path, gray(0), **{key: None}))
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_read_map_without_a_key_names_it(tmp_path, key):
 )
 def test_read_map_of_a_wrong_value_names_it(tmp_path, key, value, expected):
     with pytest.raises(InputError, match=rf"map\.yaml, field '{key}': expected {expected}"):
-        read_map(make_map(tmp_path, grey(0), **{key: value}))
+        read_map(make_map(tmp_path, gray(0), **{key: value}))
 
 
 @pytest.mark.parametrize(
@@ -160,10 +160,10 @@ def test_read_map_of_a_missing_file_raises(tmp_path):
 
 @pytest.mark.parametrize("image", ["../map.pgm", "below/../../map.pgm", "link.pgm", "{absolute}"])
 def test_read_map_of_an_image_outside_the_folder_raises(tmp_path, image):
-    Image.fromarray(grey(0)).save(tmp_path / "map.pgm")
+    Image.fromarray(gray(0)).save(tmp_path / "map.pgm")
     folder = tmp_path / "folder"
     folder.mkdir()
-    path = make_map(folder, grey(0))
+    path = make_map(folder, gray(0))
     (folder / "link.pgm").symlink_to(tmp_path / "map.pgm")
     settings = SETTINGS | {"image": image.format(absolute=folder / "map.pgm")}
     path.write_text(yaml.safe_dump(settings))
@@ -173,19 +173,19 @@ def test_read_map_of_an_image_outside_the_folder_raises(tmp_path, image):
 
 def test_read_map_of_an_image_in_a_subfolder(tmp_path):
     (tmp_path / "images").mkdir()
-    assert read_map(make_map(tmp_path, grey(0), image="images/map.pgm")).shape == (1, 1)
+    assert read_map(make_map(tmp_path, gray(0), image="images/map.pgm")).shape == (1, 1)
 
 
 @pytest.mark.parametrize("image", ["absent.pgm", ".", 3, "nul\0.pgm", ""])
 def test_read_map_without_an_image_raises(tmp_path, image):
-    path = make_map(tmp_path, grey(0))
+    path = make_map(tmp_path, gray(0))
     path.write_text(yaml.safe_dump(SETTINGS | {"image": image}))
     with pytest.raises(InputError, match=r"map\.yaml, field 'image'"):
         read_map(path)
 
 
 def test_read_map_of_a_circular_link_raises(tmp_path):
-    path = make_map(tmp_path, grey(0))
+    path = make_map(tmp_path, gray(0))
     (tmp_path / "map.pgm").unlink()
     (tmp_path / "map.pgm").symlink_to("map.pgm")
     with pytest.raises(InputError, match=r"map\.yaml, field 'image'"):
@@ -197,14 +197,14 @@ def test_read_map_of_a_circular_link_raises(tmp_path):
     [b"not an image", b"P5\n4 4\n255\nab", b"P2\n2 1\n255\nx y\n", b"\x89PNG\r\n\x1a\n", b"P5\n0 0\n255\n"],
 )
 def test_read_map_of_a_broken_image_raises(tmp_path, content):
-    path = make_map(tmp_path, grey(0))
+    path = make_map(tmp_path, gray(0))
     (tmp_path / "map.pgm").write_bytes(content)
     with pytest.raises(InputError, match=r"map\.pgm: expected"):
         read_map(path)
 
 
 def test_read_map_of_an_image_of_fractions_raises(tmp_path):
-    path = make_map(tmp_path, grey(0))
+    path = make_map(tmp_path, gray(0))
     (tmp_path / "map.pgm").write_bytes(b"Pf\n1 1\n-1.0\n" + np.float32(0.5).tobytes())
     with pytest.raises(InputError, match=r"map\.pgm: expected an image in PGM or PNG"):
         read_map(path)
@@ -212,7 +212,7 @@ def test_read_map_of_an_image_of_fractions_raises(tmp_path):
 
 @pytest.mark.parametrize("size", ["10001 10000", "30000 30000"])
 def test_read_map_of_a_huge_image_raises_before_decoding(tmp_path, size):
-    path = make_map(tmp_path, grey(0))
+    path = make_map(tmp_path, gray(0))
     (tmp_path / "map.pgm").write_bytes(f"P5\n{size}\n255\n".encode())
     with pytest.raises(InputError, match=r"map\.pgm: expected an image in PGM or PNG format: .*pixels"):
         read_map(path)
@@ -220,7 +220,7 @@ def test_read_map_of_a_huge_image_raises_before_decoding(tmp_path, size):
 
 def test_read_map_of_unknown_connectivity_raises(tmp_path):
     with pytest.raises(Exception, match="connectivity"):
-        read_map(make_map(tmp_path, grey(0)), connectivity=6)  # pyright: ignore[reportArgumentType]
+        read_map(make_map(tmp_path, gray(0)), connectivity=6)  # pyright: ignore[reportArgumentType]
 
 
 numbers = st.floats(-1e6, 1e6, allow_nan=False)
@@ -284,3 +284,77 @@ def test_read_map_reads_maps_of_nav2():
     assert (depot.shape, warehouse.shape) == ((307, 604), (1674, 1006))
     assert warehouse.origin == (-15.1, -25.0, 0.0)
     assert (warehouse.known == Cell.UNKNOWN).sum() == 230801
+
+
+GRAY = [[0, 51, 102], [153, 204, 255]]
+GRID = Grid(np.full((2, 3), -1), resolution=0.05, origin=(1.0, -2.5, 0.25))
+
+
+def sensor_map(folder, pixels, **changes):
+    return make_map(folder, np.asarray(pixels, dtype=np.uint8), **{"mode": "scale", "image": "map.png"} | changes)
+
+
+def test_read_sensor_map_ignores_thresholds(tmp_path):
+    expected = [[1, 0.8, 0.6], [0.4, 0.2, 0]]
+    np.testing.assert_allclose(read_sensor_map(sensor_map(tmp_path, GRAY), GRID), expected)
+    path = sensor_map(tmp_path, GRAY, negate=1, occupied_thresh=0.5, free_thresh=0.1)
+    np.testing.assert_allclose(read_sensor_map(path, GRID), 1 - np.array(expected))
+
+
+def test_read_sensor_map_transparent_pixels_are_nan(tmp_path):
+    pixels = np.stack([np.full((2, 3), 51)] * 3 + [[[255, 0, 255], [0, 255, 255]]], axis=-1)
+    found = read_sensor_map(sensor_map(tmp_path, pixels), GRID)
+    np.testing.assert_allclose(found, [[0.8, np.nan, 0.8], [np.nan, 0.8, 0.8]])
+
+
+def test_read_sensor_map_raw_mode_is_percent(tmp_path):
+    path = sensor_map(tmp_path, [[0, 35, 100], [101, 255, 50]], mode="raw")
+    np.testing.assert_allclose(read_sensor_map(path, GRID), [[0, 0.35, 1], [np.nan, np.nan, 0.5]])
+
+
+def test_read_sensor_map_reads_a_learned_map(tmp_path):
+    blocked = np.random.default_rng(0).random((2, 3))
+    write_map(tmp_path / "learned.yaml", blocked, GRID)
+    np.testing.assert_allclose(read_sensor_map(tmp_path / "learned.yaml", GRID), blocked, atol=0.5 / 255)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"mode": "trinary"}, r"map.yaml, field 'mode': expected scale or raw"),
+        ({"resolution": 0.1}, r"map.yaml, field 'resolution': expected the map's 0.05 metres a cell, found 0.1"),
+        ({"origin": [1.0, -2.55, 0.25]}, r"map.yaml, field 'origin': expected the map's \(1.0, -2.5, 0.25\).*-2.55"),
+        ({"origin": [1.0, -2.5, 0.0]}, r"map.yaml, field 'origin'"),
+    ],
+)
+def test_read_sensor_map_of_another_map_raises(tmp_path, changes, match):
+    with pytest.raises(InputError, match=match):
+        read_sensor_map(sensor_map(tmp_path, GRAY, **changes), GRID)
+
+
+def test_read_sensor_map_of_another_shape_raises(tmp_path):
+    with pytest.raises(InputError, match=r"map.yaml, field 'image': expected the map's 2 × 3 cells, found 3 × 2"):
+        read_sensor_map(sensor_map(tmp_path, np.transpose(GRAY)), GRID)
+
+
+def test_read_sensor_variance_reads_numbers(tmp_path):
+    given = np.array([[1.0, np.nan, 2.0], [np.inf, 0.5, 3.0]])
+    np.save(tmp_path / "variance.npy", given)
+    np.testing.assert_array_equal(read_sensor_variance(tmp_path / "variance.npy", GRID), given)
+    np.save(tmp_path / "whole.npy", np.full((2, 3), 4))
+    np.testing.assert_array_equal(read_sensor_variance(tmp_path / "whole.npy", GRID), np.full((2, 3), 4.0))
+
+
+@pytest.mark.parametrize(
+    ("array", "match"),
+    [
+        (np.ones((3, 2)), r"variance.npy, field 'sensor variance': expected the map's \(2, 3\) rows and columns"),
+        (np.array([[1, 1, 1], [1, 1, 0]]), r"variance.npy, row 2, field 'sensor variance'.*found 0 in column 3"),
+        (np.array([[1, -np.inf, 1], [1, 1, 1]]), r"variance.npy, row 1.*column 2"),
+        (np.full((2, 3), "much"), r"variance.npy: expected a NumPy array of numbers"),
+    ],
+)
+def test_read_sensor_variance_of_other_arrays_raises(tmp_path, array, match):
+    np.save(tmp_path / "variance.npy", array)
+    with pytest.raises(InputError, match=match):
+        read_sensor_variance(tmp_path / "variance.npy", GRID)

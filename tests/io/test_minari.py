@@ -37,7 +37,6 @@ pytestmark = pytest.mark.usefixtures("datasets", "unoptimised")
 DISCOUNT = 0.97
 SPACES = Discrete(6), Discrete(4)
 GRID = Grid.unknown(2, 3)
-DOCS = Path(__file__).parents[2] / "docs" / "files.md"
 
 
 def complete(states, actions):
@@ -196,12 +195,6 @@ def test_read_demonstrations_maps_separate_ends():
     cut = store((Discrete(500), Discrete(6)), buffer([state, state], [0], **flags))
     (path,) = read_demonstrations(cut, world.model.graph, task=world.task, ends=world.ends).paths()
     assert path.tolist() == [state, state]  # time was up there, and nothing ended
-
-
-def test_docs_minari_example_runs():
-    section, found = DOCS.read_text().split("## Minari")[1], {}
-    exec(section.split("```python\n")[1].split("```")[0], found)
-    assert found["again"].trajectories == found["demos"].trajectories
 
 
 # What others wrote

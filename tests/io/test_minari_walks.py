@@ -11,7 +11,7 @@ import pytest
 from gymnasium.spaces import Box, Dict, Discrete
 from hypothesis import given
 
-from helpers.drawn import walk_along, walk_tables
+from helpers.drawn import assert_same_walks, walk_along, walk_tables
 from helpers.stored import buffer, fresh, store
 from sidestep.errors import InputError
 from sidestep.io.walks import read_walks, walks_from_table, write_walks
@@ -28,11 +28,7 @@ LINE = np.array([[0.5, 0.5], [1.5, 0.5], [1.5, 1.5]])
 def test_write_walks_to_minari_is_read_back(table):
     walks, dataset = walks_from_table(table), "minari:" + fresh("ours/walks")
     write_walks(dataset, walks)
-    read = read_walks(dataset)
-    assert read.labels == walks.labels
-    for field in ("offsets", "goals", "positions", "failed_moves", "steps", "rows"):
-        np.testing.assert_array_equal(getattr(read, field), getattr(walks, field))
-    assert read.metadata.to_pydict() == walks.metadata.to_pydict()
+    assert_same_walks(read_walks(dataset), walks)
 
 
 @pytest.mark.parametrize("labels", [["b", "b", "a", "a"], [7, 7, -2, -2], [0.5, 0.5, 0.25, 0.25]])
@@ -47,9 +43,8 @@ def test_write_walks_to_minari_keeps_labels_steps_and_metadata(labels):
     walks, dataset = walks_from_table(table), "minari:" + fresh("ours/walks")
     write_walks(dataset, walks)
     read = read_walks(dataset)
-    assert read.labels == walks.labels
+    assert_same_walks(read, walks)
     assert read.steps.tolist() == [0, 3, 4, 9]
-    assert read.metadata.to_pydict() == walks.metadata.to_pydict()
 
 
 def test_write_walks_to_minari_is_a_point_maze():

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from helpers.drawn import walk_tables
+from helpers.drawn import assert_same_walks, walk_tables
 from sidestep.errors import InputError
 from sidestep.io.walks import read_walks, walks_from_table, write_walks
 
@@ -144,16 +143,14 @@ def changed(line, column, value):
     return "\n".join(",".join(row) for row in lines)
 
 
-@pytest.mark.parametrize("column", ["x", "y", "step", "t", "goal_x"])
-@pytest.mark.parametrize(
-    ("value", "found"), [("abc", "'abc'"), ("1;5", "'1;5'"), ("inf", "infinity"), ("-inf", "infinity")]
-)
+@pytest.mark.parametrize("column", ["x", "step", "t", "goal_x"])
+@pytest.mark.parametrize(("value", "found"), [("abc", "'abc'"), ("-inf", "infinity")])
 def test_read_walks_names_a_cell_that_is_no_number(tmp_path, column, value, found):
     with pytest.raises(InputError, match=rf"walks\.csv, row 3, field '{column}': expected a .*found {found}"):
         read_text(tmp_path, changed(3, column, value))
 
 
-@pytest.mark.parametrize("column", ["x", "y", "step", "t"])
+@pytest.mark.parametrize("column", ["y", "step", "t"])
 @pytest.mark.parametrize(("value", "found"), [("", "an empty cell"), ("nan", "NaN")])
 def test_read_walks_names_a_missing_number(tmp_path, column, value, found):
     with pytest.raises(
@@ -210,18 +207,11 @@ def test_read_walks_names_bad_tables(tmp_path, text, message):
 
 
 def test_read_walks_of_a_bad_parquet_file_raises(tmp_path):
-    for content in (b"not parquet at all", b"PAR1 broken PAR1"):
+    write_walks(tmp_path / "whole.parquet", read_text(tmp_path, GOOD))
+    whole = (tmp_path / "whole.parquet").read_bytes()
+    for content in (b"not parquet at all", b"PAR1 broken PAR1", whole[: len(whole) // 2]):
         with pytest.raises(InputError, match=r"walks\.parquet: expected a table in Parquet"):
             read_text(tmp_path, content, "walks.parquet")
-
-
-def test_read_walks_of_a_truncated_parquet_file_raises(tmp_path):
-    table = pa.table({"walk": [0, 0], "step": [0, 1], "x": [0.0, 1.0], "y": [0.0, 0.0]})
-    pyarrow.parquet.write_table(table, tmp_path / "walks.parquet")
-    whole = (tmp_path / "walks.parquet").read_bytes()
-    (tmp_path / "walks.parquet").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match=r"walks\.parquet: expected a table in Parquet"):
-        read_walks(tmp_path / "walks.parquet")
 
 
 @pytest.mark.parametrize("name", ["walks.txt", "walks", "walks.csv.gz"])
@@ -265,8 +255,4 @@ def test_write_walks_of_lists_to_csv_raises_and_leaves_nothing(tmp_path):
 def test_write_walks_is_read_back(tmp_path_factory, table, ending):
     walks, path = walks_from_table(table), tmp_path_factory.mktemp("walks") / f"walks.{ending}"
     write_walks(path, walks)
-    read = read_walks(path)
-    assert read.labels == walks.labels
-    for field in ("offsets", "goals", "positions", "failed_moves", "steps", "rows"):
-        np.testing.assert_array_equal(getattr(read, field), getattr(walks, field))
-    assert read.metadata.to_pydict() == walks.metadata.to_pydict()
+    assert_same_walks(read_walks(path), walks)

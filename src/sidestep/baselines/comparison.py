@@ -15,11 +15,12 @@ from sidestep.evaluation.study import Problem, Record, run_method
 from sidestep.inference.goals import goal_posterior
 from sidestep.io.gridding import Moves, grid_walks
 from sidestep.io.walks import Walks
-from sidestep.maps.annotations import NO_ANNOTATIONS, WalkAnnotations
+from sidestep.maps.annotations import NO_ANNOTATIONS, WalkAnnotations, persons_of
 from sidestep.maps.config import MapConfig
 from sidestep.maps.fit import behavior_of, demonstrations_of
 from sidestep.maps.learn import learn_map, sample_walks
 from sidestep.maps.learned_map import LearnedMap
+from sidestep.maps.learning import Learning
 from sidestep.maps.selection import Selection
 from sidestep.maps.sensors import SensorMap
 from sidestep.tabular.demonstrations import Demonstrations
@@ -110,7 +111,7 @@ def compare_methods(
     """
     walks, config = sample_walks(walks, config), replace(config, max_walks=None)
     train, test = _split(walks, hold_out, config.seed)
-    notify("behavior learns")
+    notify("map: behavior learns")
     options: dict[str, Any] = {"notify": notify, "checkpoint": checkpoint, "resume": resume}
     learned, failure = None, None
     try:
@@ -128,8 +129,13 @@ def compare_methods(
         heldout = demonstrations_of(_with_probable_goals(heldout_moves, learned), grid, config)
     problem = Problem("map", grid, truth, demonstrations, heldout)
     if learned and learning:
+        notify("map: behavior is evaluated")
         result = _result_of(learned, demonstrations)
-        own = run_method(problem, "behavior", lambda *_: result, seed=config.seed, notify=notify)
+        own = run_method(problem, "behavior", lambda *_: result, seed=config.seed)
+        if heldout and own.heldout_log_likelihood is not None and annotations.person_column:
+            persons, person = persons_of(test, grid_walks(test, grid), annotations.person_column)
+            mean = _by_person(result, learning, heldout, [str(persons[each]) for each in person])
+            own = replace(own, heldout_log_likelihood=mean)
         records = [replace(own, seconds=learning.seconds)]
     else:
         records = [Record(problem.name, "behavior", failure=failure)]
@@ -163,6 +169,17 @@ def _result_of(learned: LearnedMap, demonstrations: Demonstrations) -> ModelResu
     return result._replace(
         behavior=agents.behavior_of(), reward=reward, converged=learning.fit.converged, planner=learned.robot()
     )
+
+
+def _by_person(result: ModelResult, learning: Learning, heldout: Demonstrations, names: list[str]) -> float:
+    """Return the mean log π of held-out moves by the behavior of each trajectory's person; new persons are typical."""
+    learned, of_moves = list(learning.persons), np.array(names)[np.asarray(heldout.trajectory)]
+    log_policies = np.zeros(len(heldout))
+    for name in sorted(set(names)):
+        behavior = learning.fit.behavior.behavior_of(learned.index(name) if name in learned else None)
+        own = of_moves == name
+        log_policies[own] = result._replace(behavior=behavior).log_policies(heldout)[own]
+    return float(log_policies.mean())
 
 
 def _with_probable_goals(moves: Moves, learned: LearnedMap | None) -> Moves:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option
 
 from sidestep.cli.options import BUMP_COST, BumpCost, LearnedFolder, Seed, TrueMap
 
@@ -11,10 +11,7 @@ from sidestep.cli.options import BUMP_COST, BumpCost, LearnedFolder, Seed, TrueM
 def evaluate(
     folder: LearnedFolder,
     true_map: TrueMap,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", help="Where to write summary.json (added to DIR's own by default).", metavar="DIR"),
-    ] = None,
+    out: Annotated[Path | None, Option("--out", help="The folder to write to (DIR itself).", metavar="DIR")] = None,
     seed: Seed = 0,
     bump_cost: BumpCost = BUMP_COST,
 ) -> None:

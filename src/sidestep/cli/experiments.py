@@ -56,8 +56,7 @@ def experiment(
     with working("starting") as notify:
         summary = import_module(f"sidestep.experiments.{name}").run(out, seed, notify)
     for key, value in summary.items():
-        if isinstance(value, float):
-            print_lines(f"{key.replace('_', ' ')}: {value:.4g}")
-        elif isinstance(value, int | str) and key != "command":
-            print_lines(f"{key.replace('_', ' ')}: {value}")
+        if isinstance(value, float | int | str) and key != "command":
+            text = f"{value:.4g}" if isinstance(value, float) else value
+            print_lines(f"{key.replace('_', ' ')}: {text}")
     print_lines(f"picture and numbers in {out}")

@@ -4,7 +4,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from sidestep.cli.options import Backup, ConnectivityOption, Discount, Seed, StepCost, connectivity_of
 from sidestep.maps.config import SimulationConfig
@@ -12,13 +12,11 @@ from sidestep.tabular.reward import Reward
 
 
 def simulate(
-    map_file: Annotated[Path, typer.Argument(help="The map that the agents know.", metavar="MAP.yaml")],
-    out: Annotated[Path, typer.Option("--out", help="CSV or Parquet.", metavar="WALKS.csv")],
-    walks: Annotated[int, typer.Option(help="The number of walks.")] = SimulationConfig.walks,
-    goals: Annotated[int, typer.Option(help="The number of different goals.")] = SimulationConfig.goals,
-    beta: Annotated[
-        float | None, typer.Option(help="The inverse temperature β; without it, optimal with ties at random.")
-    ] = SimulationConfig.beta,
+    map_file: Annotated[Path, Argument(help="The map that the agents know.", metavar="MAP.yaml")],
+    out: Annotated[Path, Option("--out", help="CSV or Parquet.", metavar="WALKS.csv")],
+    walks: Annotated[int, Option(help="The number of walks.")] = SimulationConfig.walks,
+    goals: Annotated[int, Option(help="The number of different goals.")] = SimulationConfig.goals,
+    beta: Annotated[float | None, Option(help="β; without it, optimal with ties at random.")] = SimulationConfig.beta,
     backup: Backup = SimulationConfig.backup,
     discount: Discount = Reward.discount,
     step_cost: StepCost = Reward.step_cost,

@@ -6,8 +6,9 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Int
 
-from sidestep.errors import InputError, check
+from sidestep.errors import check
 from sidestep.io.gridding import Moves, grid_walks
+from sidestep.io.tables import check_rows
 from sidestep.io.walks import Walks, position_columns, walks_from_table
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.graph import walkable_graph
@@ -54,10 +55,9 @@ def demonstrations_from_moves(
         InputError: If no move is left, or for a goal that known obstacles wall off.
     """
     region = connected_regions(grid)
-    walled_off = region[moves.states] != region[moves.goals[moves.walk]]
-    if walled_off.any():
-        message = "the goal cannot be reached from here: known obstacles wall it off"
-        raise InputError(message, source=moves.source, row=int(moves.rows[np.argmax(walled_off)]))
+    connected = region[moves.states] == region[moves.goals[moves.walk]]
+    message = "the goal cannot be reached from here: known obstacles wall it off"
+    check_rows(connected, message, moves.source, "goal_x", moves.rows)
     moves = moves.before_goal()
     check(len(moves), "every walk starts at its goal: expected moves towards one", source=moves.source)
     goals, task = np.unique(moves.goals[np.unique(moves.walk)], return_inverse=True)

@@ -210,5 +210,5 @@ def _check_inside(positions: Points, rows: Int[np.ndarray, " points"], prefix: s
     inside, column = grid.contains(positions), grid.to_cell_units(positions)[:, 0]
     first = np.argmin(np.where(inside, np.inf, rows))
     field = prefix + ("y" if 0 <= column[first] <= grid.shape[1] else "x")
-    message = "expected a position on the map, found ({}, {})"
+    message = "expected a position on the map, by its `resolution` and `origin`, found ({}, {})"
     check_rows(inside, message, walks.source, field, rows, positions)

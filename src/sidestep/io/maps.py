@@ -109,12 +109,12 @@ def check_geometry(
     Raises:
         InputError: Naming the file and the field that differs.
     """
-    expected, actual = (" × ".join(map(str, each)) for each in (grid.shape, shape))
-    check(shape == grid.shape, f"expected the map's {expected} cells, found {actual}", source=path, field="image")
     message = f"expected the map's {grid.resolution} metres a cell, found {resolution}"
     check(np.isclose(resolution, grid.resolution), message, source=path, field="resolution")
     same = np.allclose(origin, grid.origin, atol=_ORIGIN_TOLERANCE * grid.resolution)
     check(same, f"expected the map's {grid.origin}, found {origin}", source=path, field="origin")
+    expected, actual = (" × ".join(map(str, each)) for each in (grid.shape, shape))
+    check(shape == grid.shape, f"expected the map's {expected} cells, found {actual}", source=path, field="image")
 
 
 def read_raster(path: str | Path) -> Raster:

@@ -20,7 +20,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Int
 
-from sidestep.errors import InputError
+from sidestep.errors import check
 from sidestep.robots.planners import ModelPlanner
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.grid import Cell
@@ -77,8 +77,8 @@ def risk_averse_task(model: ObstacleGrid, goal: int, bump_cost: float = BUMP_COS
     Raises:
         InputError: For a cost out of range or a goal that is not a state.
     """
-    if not (np.isfinite(bump_cost) and bump_cost >= 0):
-        raise InputError(f"expected a number of at least 0, found {bump_cost}", field="bump_cost")
+    valid = np.isfinite(bump_cost) and bump_cost >= 0
+    check(valid, f"expected a number of at least 0, found {bump_cost}", field="bump_cost")
     task = reach(model.blank, goal, discount=1.0, step_cost=1.0)
     probabilities, successors = np.asarray(model.probabilities()), np.asarray(model.graph.successors)
     fails = np.where(successors == np.arange(len(successors))[:, None, None], probabilities, 0).sum(axis=-1)
