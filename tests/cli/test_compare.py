@@ -141,7 +141,7 @@ def test_compare_methods_with_persons_scores_held_out_walks_by_their_own_beta(da
     grid, truth, walks = data
     names = np.array(["ann", "bob"])[np.arange(80) % 2]
     column = pa.array(np.repeat(names, np.diff(walks.offsets)))
-    walks = replace(walks, metadata=walks.metadata.append_column("person", column))
+    walks = replace(walks, metadata=pa.table({"person": column}))
     comparison = compare_methods(grid, truth, walks, MapConfig(), baselines={}, annotations=WalkAnnotations("person"))
     assert comparison.learned is not None
     assert comparison.learned.learning is not None

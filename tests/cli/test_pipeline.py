@@ -149,6 +149,7 @@ def test_plan_from_a_cell_to_itself_has_no_moves(learned, tmp_path):
     assert summary(tmp_path)["moves"] == 0
 
 
+@pytest.mark.slow
 def test_commands_with_eight_directions_parquet_and_fixed_policy_gradient(office, tmp_path):
     walks, out = tmp_path / "walks.parquet", tmp_path / "learned"
     simulate = ("simulate", office / "true.yaml", "--out", walks, "--walks", 40, "--connectivity", 8, "--beta", 40)

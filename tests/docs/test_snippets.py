@@ -18,6 +18,7 @@ from sidestep.cli.app import main
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SLOW = re.compile("sidestep (demo|reproduce|experiment|compare)|--(person-column|goal-candidates|sensor-map|select)")
 BLOCK = re.compile(r"(<!-- not run: [^>]+ -->\n+)?^```(python|sh)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
@@ -40,7 +41,8 @@ def commands():
     for snippet in snippets("sh"):
         for line in snippet.text.replace("\\\n", " ").splitlines():
             if line.startswith("sidestep "):
-                yield pytest.param(line, id=f"{snippet.page.name}: {line}")
+                marks = [pytest.mark.slow] if SLOW.search(line) else []
+                yield pytest.param(line, id=f"{snippet.page.name}: {line}", marks=marks)
 
 
 def programs():

@@ -18,9 +18,8 @@ from sidestep.io.walks import Walks
 from sidestep.maps.annotations import NO_ANNOTATIONS, WalkAnnotations, persons_of
 from sidestep.maps.config import MapConfig
 from sidestep.maps.fit import behavior_of, demonstrations_of
-from sidestep.maps.learn import learn_map, sample_walks
+from sidestep.maps.learn import Learning, learn_map, sample_walks
 from sidestep.maps.learned_map import LearnedMap
-from sidestep.maps.learning import Learning
 from sidestep.maps.selection import Selection
 from sidestep.maps.sensors import SensorMap
 from sidestep.tabular.demonstrations import Demonstrations
