@@ -96,7 +96,7 @@ def _compile(path: Path, function: Callable[..., Any], leaves: list[Any], struct
         return tuple(outputs)
 
     # an executable that comes from JAX's own cache cannot be stored again; so JAX must not keep this one
-    written_after = jax.config.jax_persistent_cache_min_compile_time_secs
+    written_after = jax.config.jax_persistent_cache_min_compile_time_secs  # pyright: ignore[reportAttributeAccessIssue]
     jax.config.update("jax_persistent_cache_min_compile_time_secs", float("inf"))
     try:
         program = jax.jit(program_of_sidestep).lower(*leaves).compile()

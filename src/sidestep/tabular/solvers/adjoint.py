@@ -6,10 +6,10 @@ the values were solved turn out to matter, there is no gradient (see `base`).
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from sidestep.tabular.solvers import adjoint_kernels, native
-from sidestep.tabular.solvers.base import neg_inf
+from sidestep.tabular.solvers.base import Cotangents, SolveResult, WarmStart, neg_inf
 
 _COARSEST = 1e-3
 """The first threshold, as a part of the residuals' sum; so that small residuals add up first."""
@@ -23,46 +23,42 @@ def vjp_of_process(
     exact: bool,
     max_sweeps: int,
     max_region_sweeps: int,
-    into: tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]],
+    into: tuple[Cotangents, SolveResult],
     process: list[np.ndarray],
     beta: Float[np.ndarray, ""],
-    values: Float[np.ndarray, " states"],
+    start: WarmStart,
     cotangent: Float[np.ndarray, " states"],
-    start: Float[np.ndarray, " states"],
-    order: Int[np.ndarray, " states"],
     region: Bool[np.ndarray, " states"],
     tolerance: Float[np.ndarray, ""],
 ) -> None:
-    """Write the gradient and the adjoint into the arrays of `HostCotangents` and of `HostResult`.
+    """Write the gradient and the adjoint into the arrays of records.
 
     Args:
         kind, tie, beta: The backup (see `NativeBackup`).
         exact: Whether the gradient is the backup's own, or that of the policy held fixed.
         max_sweeps, max_region_sweeps: When to stop (see `GaussSeidel`).
-        into: The arrays of `HostCotangents`, and those of `HostResult`.
+        into: The gradient, and the adjoint as a result.
         process: The arrays of `HostProcess`.
-        values: The solution.
+        start: The solution with its order, and an adjoint to start from.
         cotangent: The gradient of a scalar by the values.
-        start: An adjoint to start from.
-        order: As in `WarmStart`.
         region: The states that were solved.
         tolerance: The part of the cotangent's sum that may remain.
     """
+    (values, first, order), (by, result) = start, into
     number = values.dtype.type
-    by, result = adjoint_kernels.HostCotangents(*into[0]), native.HostResult(*into[1])
     position = native.inverse_permutation(order)
     total = np.abs(cotangent).sum()
     if position is None or total == 0 or not np.isfinite(total):
         # nothing to solve, or nothing that it could be solved for
         residual = 0.0 if total == 0 else np.nan
         _fill(residual, result.values, *by)
-        result.write(order, native.SolveInfo(0, residual, bool(total == 0)))
+        native.write_info(result, order, native.SolveInfo(0, residual, bool(total == 0)))
         return
     host_process = native.HostProcess.from_arrays(process)
     reachable_above = number(-((-neg_inf(values.dtype)) ** 0.5))
     backup = native.NativeBackup(kind, number(beta), number(tie))
     problem = adjoint_kernels.AdjointProblem(backup, exact, values, reachable_above, order, position)
-    known = np.where(np.isfinite(start), start, number(0))
+    known = np.where(np.isfinite(first), first, number(0))
     actions, outcomes, width = host_process.kernel_sizes()
     work = _empty_state(host_process, width, known[order], cotangent[order])
     kernels, is_whole = adjoint_kernels.kernels_for(actions, outcomes, width), region.all()
@@ -73,15 +69,15 @@ def vjp_of_process(
         info = info._replace(residual=cost, converged=bool(cost <= tolerance))
     if not info.converged:
         _fill(np.nan, result.values, *by)
-        result.write(order, info)
+        native.write_info(result, order, info)
         return
     solution = work.adjoint, work.row, work.weights, work.beta
     del work  # the gradient takes the memory that it held
     _fill(0.0, *by[1:])
 
-    def pull_back_range(begin: int, end: int) -> adjoint_kernels.HostCotangents:
+    def pull_back_range(begin: int, end: int) -> Cotangents:
         sums = [np.zeros_like(part) if len(np.atleast_1d(part)) == 1 else part for part in by[1:]]
-        own = adjoint_kernels.HostCotangents(by.probabilities, *sums)
+        own = Cotangents(by.probabilities, *sums)
         kernels.vjp_of_process(begin, end, host_process, problem, *solution, result.values, own)
         return own
 
@@ -89,7 +85,7 @@ def vjp_of_process(
         for part, added in zip(by[1:], own[1:], strict=True):
             if added is not part:
                 np.add(part, added, out=part)
-    result.write(order, info)
+    native.write_info(result, order, info)
 
 
 def _fill(number: float, *arrays: np.ndarray) -> None:

@@ -86,16 +86,6 @@ class WeightScratch(NamedTuple):
     policy: np.ndarray
 
 
-class HostCotangents(NamedTuple):
-    """The arrays that the gradient is written into; fields as in `Cotangents`."""
-
-    probabilities: np.ndarray
-    reward: np.ndarray
-    terminal_reward: np.ndarray
-    discount: np.ndarray
-    beta: np.ndarray
-
-
 class AdjointKernels(NamedTuple):
     """The native code for one number of actions, of outcomes, and of outcomes that leave a state."""
 

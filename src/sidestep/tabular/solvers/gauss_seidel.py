@@ -76,11 +76,11 @@ class GaussSeidel(base.Solver):
         # another solver may have left an order of no states
         order = start.order if start.order.shape == start.values.shape else _no_order(len(start.values))
         tolerance = self.tolerance_for(start.values.dtype)
-        process = equation.process
-        values, bound, beta = start.values, base.lower_bound(process), equation.beta
-        arguments = (jax.tree.leaves(process), bound, beta, values, order, region, tolerance)
+        process, start = equation.process, start._replace(order=order)
+        bound = base.lower_bound(process)
+        arguments = (jax.tree.leaves(process), bound, equation.beta, start, region, tolerance)
         solve = partial(_solve_values, kind, tie, self.max_sweeps)
-        return base.SolveResult(*native.call_host(solve, arguments, _result_shapes(start.values, order)))
+        return native.call_host(solve, arguments, _result_shapes(start.values, order))
 
     def vjp(
         self,
@@ -93,15 +93,10 @@ class GaussSeidel(base.Solver):
         """Return the gradient by all that the values depend on; it takes a fraction of the time that they took."""
         kind, tie = _native_backup(equation.backup, start.values.dtype)
         tolerance = self.tolerance_for(start.values.dtype)
-        values, adjoint, order = start
-        process = jax.tree.leaves(equation.process)
-        arguments = (process, equation.beta, values, cotangent, adjoint, order, region, tolerance)
-        shapes = (native.shapes_of(tuple(equation.inputs)), _result_shapes(adjoint, order))
+        arguments = (jax.tree.leaves(equation.process), equation.beta, start, cotangent, region, tolerance)
+        shapes = (native.shapes_of(equation.inputs), _result_shapes(start.adjoint, start.order))
         limits = self.max_sweeps, self.max_region_sweeps
-        cotangents, result = native.call_host(
-            partial(_pull_back, kind, tie, gradient == "exact", *limits), arguments, shapes
-        )
-        return base.Cotangents(*cotangents), base.SolveResult(*result)
+        return native.call_host(partial(_pull_back, kind, tie, gradient == "exact", *limits), arguments, shapes)
 
     def gather_rows(
         self, probabilities: Float[Array, "states actions outcomes"], visited: Int[Array, " visited"]
@@ -144,8 +139,9 @@ def _no_order(states: int) -> Array:
     return jnp.full(states, -1, jnp.int32)
 
 
-def _result_shapes(values: Array, order: Array) -> tuple[jax.ShapeDtypeStruct, ...]:
-    """Return the shapes of the fields of `SolveResult`."""
+def _result_shapes(values: Array, order: Array) -> Any:
+    """Return a `SolveResult` of shapes."""
     count = jax.ShapeDtypeStruct((), jax.dtypes.canonicalize_dtype(int))
     residual = jax.ShapeDtypeStruct((), values.dtype)
-    return (*native.shapes_of((values, order)), count, residual, jax.ShapeDtypeStruct((), jnp.dtype(bool)))
+    converged = jax.ShapeDtypeStruct((), jnp.dtype(bool))
+    return base.SolveResult(*native.shapes_of((values, order)), count, residual, converged)

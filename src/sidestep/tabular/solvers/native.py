@@ -4,7 +4,8 @@
   cores where there is one task only.
 - `compiled` and `inlined` mark functions for numba. numba is imported when one is first called, and the machine code is
   kept in `cache_folder()`.
-- `HostProcess`, `HostResult` and `NativeBackup` are a decision process, a result and a backup as the host sees them.
+- `HostProcess` and `NativeBackup` are a decision process and a backup as the host sees them. Records of `base` with
+  NumPy arrays stand for results and gradients: the host writes into these.
 """
 
 import ctypes
@@ -30,6 +31,7 @@ from jax.experimental.buffer_callback import buffer_callback
 from jaxtyping import Bool, Float, Int
 
 from sidestep._cache import cache_folder, keep_entry, kept_entry
+from sidestep.tabular.solvers.base import SolveResult
 
 _Result = TypeVar("_Result")
 
@@ -90,19 +92,10 @@ class SolveInfo(NamedTuple):
     converged: bool
 
 
-class HostResult(NamedTuple):
-    """The arrays that a solve writes its result into; fields as in `SolveResult`."""
-
-    values: Float[np.ndarray, " states"]
-    order: Int[np.ndarray, " states"]
-    sweeps: Int[np.ndarray, ""]
-    residual: Float[np.ndarray, ""]
-    converged: Bool[np.ndarray, ""]
-
-    def write(self, order: Int[np.ndarray, " states"], info: SolveInfo) -> None:
-        """Write all but the values."""
-        self.order[:] = order
-        self.sweeps[...], self.residual[...], self.converged[...] = info
+def write_info(result: SolveResult, order: Int[np.ndarray, " states"], info: SolveInfo) -> None:
+    """Write all but the values into the arrays of a result."""
+    for into, part in zip(result[1:], (order, *info), strict=True):
+        into[...] = part
 
 
 def inverse_permutation(order: Int[np.ndarray, " states"]) -> Int[np.ndarray, " states"] | None:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sidestep.tabular.solvers import native
-from sidestep.tabular.solvers.base import neg_inf
+from sidestep.tabular.solvers.base import SolveResult, WarmStart, neg_inf
 from sidestep.tabular.solvers.ordering import NumberedProcess, number_process, order_by_distance
 from sidestep.tabular.solvers.sweep_loop import SweepLoop
 from sidestep.tabular.solvers.value_kernels import first_values_kernel
@@ -46,49 +46,48 @@ def solve_values(
     kind: int,
     tie: float,
     max_sweeps: int,
-    into: tuple[np.ndarray, ...],
+    into: SolveResult,
     process: list[np.ndarray],
     bound: Float[np.ndarray, ""],
     beta: Float[np.ndarray, ""],
-    start: Float[np.ndarray, " states"],
-    order: Int[np.ndarray, " states"],
+    start: WarmStart,
     region: Bool[np.ndarray, " states"],
     tolerance: Float[np.ndarray, ""],
 ) -> None:
-    """Solve for the values and write them into the arrays of `HostResult`.
+    """Solve for the values and write them into the arrays of a result.
 
     Args:
         kind, tie, beta: The backup (see `NativeBackup`).
         max_sweeps: When to stop (see `GaussSeidel`).
-        into: The arrays of `HostResult`.
+        into: The result.
         process: The arrays of `HostProcess`.
         bound: A lower bound of the values.
-        start, order: As in `WarmStart`.
+        start: Values and an order.
         region: The states that have to be solved.
         tolerance: The relative change at which to stop.
     """
-    number = start.dtype.type
+    values, _, order = start
+    number = values.dtype.type
     backup = native.NativeBackup(kind, number(beta), number(tie))
     problem = _Problem(native.HostProcess.from_arrays(process), backup, number(bound), number(tolerance))
-    result = native.HostResult(*into)
     if problem.has_nan():
-        result.values[:] = np.nan
-        result.write(order, native.SolveInfo(0, np.nan, False))
+        into.values[:] = np.nan
+        native.write_info(into, order, native.SolveInfo(0, np.nan, False))
         return
-    unknown = number(neg_inf(start.dtype))
+    unknown = number(neg_inf(values.dtype))
     info = native.SolveInfo(0, np.inf, False)
     region = region if region.any() else np.ones_like(region)
-    if (start > unknown).any():
-        digits = -np.log10(max(problem.tolerance, np.finfo(start.dtype).eps))
+    if (values > unknown).any():
+        digits = -np.log10(max(problem.tolerance, np.finfo(values.dtype).eps))
         trusted = min(int(np.ceil(_TRUST * max(1.0, digits))), max_sweeps)
-        info = _solve_from(start, order, region, problem, trusted, _TRUSTED_ROUNDS * trusted, result)
+        info = _solve_from(values, order, region, problem, trusted, _TRUSTED_ROUNDS * trusted, into)
     if not info.converged and info.sweeps < max_sweeps:
         # where the start's values did not serve, its order is no better
-        cold, known_order = np.full_like(start, unknown), np.full_like(order, -1) if info.sweeps else order
+        cold, known_order = np.full_like(values, unknown), np.full_like(order, -1) if info.sweeps else order
         left = max_sweeps - info.sweeps
-        again = _solve_from(cold, known_order, np.ones_like(region), problem, left, left, result)
+        again = _solve_from(cold, known_order, np.ones_like(region), problem, left, left, into)
         info = again._replace(sweeps=info.sweeps + again.sweeps)
-    result.write(result.order, info)
+    native.write_info(into, into.order, info)
 
 
 def _solve_from(
@@ -98,7 +97,7 @@ def _solve_from(
     problem: _Problem,
     max_sweeps: int,
     max_rounds: int,
-    result: native.HostResult,
+    result: SolveResult,
 ) -> native.SolveInfo:
     """Solve from values and an order, or a new one if that does not serve; write the values and the order."""
     position = native.inverse_permutation(order)
