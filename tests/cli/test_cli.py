@@ -110,11 +110,7 @@ def test_learn_with_invalid_walks_names_row_and_field(here, capsys, name):
     refused(here, capsys, "learn walks.csv --map map.yaml --out out", "walks.csv", *expected)
 
 
-KEYS = {
-    "image": (None, "missing"),
-    "origin": ([0, 0], "three numbers"),
-    "mode": ("rainbow", "trinary"),
-}
+KEYS = {"image": (None, "missing"), "origin": ([0, 0], "three numbers"), "mode": ("rainbow", "trinary")}
 
 
 @pytest.mark.parametrize("key", KEYS)

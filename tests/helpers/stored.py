@@ -30,11 +30,7 @@ def store(spaces: tuple[Space, Space], *episodes: EpisodeBuffer, metadata=(), da
     with warnings.catch_warnings():  # Minari warns of every author and environment that is missing.
         warnings.simplefilter("ignore", UserWarning)
         made = minari.create_dataset_from_buffers(
-            dataset,
-            list(episodes),
-            observation_space=spaces[0],
-            action_space=spaces[1],
-            data_format=data_format,
+            dataset, list(episodes), observation_space=spaces[0], action_space=spaces[1], data_format=data_format
         )
     made.storage.update_episode_metadata(metadata, range(len(metadata)))
     return dataset

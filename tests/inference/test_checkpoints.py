@@ -14,15 +14,20 @@ LIKE = (np.zeros(3), jnp.zeros(4, int), jnp.zeros((), jnp.float32))
 HISTORY = [[0, -1.1, 0.1], [1, -1 / 3, 2e-9]]
 
 
-def test_saver_load_returns_what_was_saved(tmp_path):
-    path = tmp_path / "fit.checkpoint"
-    Saver(path, "key").save(STATE, HISTORY)
+@pytest.fixture
+def path(tmp_path):
+    """A saved checkpoint."""
+    Saver(tmp_path / "fit.checkpoint", "key").save(STATE, HISTORY)
+    return tmp_path / "fit.checkpoint"
+
+
+def test_saver_load_returns_what_was_saved(path):
     state, history, _ = Saver(path, "key").load(LIKE)
     assert history == HISTORY
     for loaded, expected in zip(state, STATE, strict=True):
         assert loaded.dtype == expected.dtype
         np.testing.assert_array_equal(loaded, expected)
-    assert [file.name for file in tmp_path.iterdir()] == ["fit.checkpoint"]
+    assert list(path.parent.iterdir()) == [path]
 
 
 GARBAGE = {
@@ -39,25 +44,20 @@ GARBAGE = {
 
 
 @pytest.mark.parametrize("name", GARBAGE)
-def test_saver_load_of_another_file_raises(tmp_path, name):
-    path = tmp_path / "fit.checkpoint"
+def test_saver_load_of_another_file_raises(path, name):
     path.write_bytes(GARBAGE[name])
     with pytest.raises(InputError, match=r"fit\.checkpoint: (not a checkpoint|the file is empty)"):
         Saver(path, "key").load(LIKE)
 
 
 @pytest.mark.parametrize("missing", [1, 100])
-def test_saver_load_of_a_truncated_file_raises(tmp_path, missing):
-    path = tmp_path / "fit.checkpoint"
-    Saver(path, "key").save(STATE, HISTORY)
+def test_saver_load_of_a_truncated_file_raises(path, missing):
     path.write_bytes(path.read_bytes()[:-missing])
     with pytest.raises(InputError, match=r"fit\.checkpoint: not a checkpoint"):
         Saver(path, "key").load(LIKE)
 
 
-def test_saver_load_of_another_fit_raises(tmp_path):
-    path = tmp_path / "fit.checkpoint"
-    Saver(path, "key").save(STATE, HISTORY)
+def test_saver_load_of_another_fit_raises(path):
     with pytest.raises(InputError, match=r"fit\.checkpoint: belongs to a fit of other data"):
         Saver(path, "another key").load(LIKE)
 
@@ -84,8 +84,7 @@ def test_fingerprint_differs_between_problems(other, same):
     assert (fingerprint(PROBLEM) == fingerprint(other)) == same
 
 
-def test_saver_load_with_other_shapes_keeps_the_optional_arrays(tmp_path):
-    path = tmp_path / "fit.checkpoint"
+def test_saver_load_with_other_shapes_keeps_the_optional_arrays(path):
     Saver(path, "key").save(STATE, HISTORY, [np.arange(6.0)])
     np.testing.assert_array_equal(Saver(path, "key").load(LIKE, [np.zeros(6)])[2][0], np.arange(6.0))
     for optional in ([], [np.zeros(3)], [np.zeros(6, np.float32)], [np.zeros(6)] * 2):

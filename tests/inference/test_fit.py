@@ -76,7 +76,6 @@ def test_fit_with_lbfgs_increases_the_objective_at_every_iteration(name):
     objective = np.array([progress.objective for progress in fitted(name).history])
     # the values of hundreds of moves are each known to the solver's tolerance, and no better is their sum
     assert (np.diff(objective) > -1e-7).all()
-    assert objective[-1] > objective[0]
 
 
 @pytest.mark.parametrize("name", SMOOTH)

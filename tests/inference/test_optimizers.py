@@ -52,17 +52,20 @@ def run(optimizer, function, start, steps):
     return way
 
 
+def step(optimizer, loss, x, state=None):
+    """A step that finds a better point, the first one without a state."""
+    after = optimizer.step(loss, x, *loss(x), optimizer.init(x) if state is None else state)
+    assert after is not None
+    return after
+
+
 def test_rprop_keeps_the_dtype_of_the_start():
     def in_32_bit(x):
         return quadratic(x)[0], quadratic(x)[1].astype(np.float32)
 
-    x = np.full(3, 4.0, dtype=np.float32)
-    state = Rprop().init(x)
+    x, state = np.full(3, 4.0, dtype=np.float32), None
     for _ in range(3):
-        value, slope = in_32_bit(x)
-        after = Rprop().step(exactly(in_32_bit), x, value, slope, state)
-        assert after is not None
-        x, state = after
+        x, state = step(Rprop(), exactly(in_32_bit), x, state)
         assert (x.dtype, state.dtype) == (np.float32, np.float32)
 
 
@@ -93,9 +96,7 @@ def test_lbfgs_keeps_the_dtype_of_the_start():
         calls.append(x.dtype)
         return float(np.sum((100 * x) ** 4)), (400 * (100 * x) ** 3).astype(np.float32)
 
-    x = np.array([0.05, 0.03], dtype=np.float32)
-    after = LBFGS().step(exactly(ravine), x, *ravine(x), LBFGS().init(x))
-    assert after is not None
+    after = step(LBFGS(), exactly(ravine), np.array([0.05, 0.03], dtype=np.float32))
     assert after[0].dtype == np.float32
     assert set(calls) == {np.dtype(np.float32)}
     assert len(calls) > 3
@@ -139,10 +140,9 @@ def test_rprop_stops_at_the_edge_of_cliffs():
     for _ in range(100):
         if optimizer.terminate(cliffs(x)[1], state):
             break
-        after = optimizer.step(exactly(evaluate), x, *cliffs(x), state)
-        assert after is not None
-        assert cliffs(after[0])[0] < cliffs(x)[0]
-        x, state = after
+        before = cliffs(x)[0]
+        x, state = step(optimizer, exactly(evaluate), x, state)
+        assert cliffs(x)[0] < before
         # none that was taken has fallen deep below an edge
         assert (x > HEIGHTS - 0.01).all()
     assert optimizer.terminate(cliffs(x)[1], state)
@@ -152,39 +152,31 @@ def test_rprop_stops_at_the_edge_of_cliffs():
 
 def test_rprop_after_a_failed_trial_keeps_its_step_size():
     """Where there are no values the trial is shorter, but the next step is as long as before."""
-    optimizer = Rprop(initial_step=1.0)
-    x = np.array([-40.0])
-    after = optimizer.step(exactly(lambda x: cliff(x + 40.5)), x, *cliff(x + 40.5), optimizer.init(x))
-    assert after is not None
+    after = step(Rprop(initial_step=1.0), exactly(lambda x: cliff(x + 40.5)), np.array([-40.0]))
     np.testing.assert_allclose(after, ([-39.75], [1.4]))
 
 
 def test_rprop_holds_back_only_parameters_that_overshoot():
     """A second parameter's cliff does not hold up the first one."""
-    optimizer = Rprop(initial_step=1.0)
-    x = np.array([5.0, 2.2])
 
     def evaluate(x):
         return float(x @ x / 8 + 1e3 * max(2.0 - x[1], 0)), np.array([x[0] / 4, x[1] / 4 - 1e3 * (x[1] < 2.0)])
 
-    after = optimizer.step(exactly(evaluate), x, *evaluate(x), optimizer.init(x))
-    assert after is not None
+    after = step(Rprop(initial_step=1.0), exactly(evaluate), np.array([5.0, 2.2]))
     np.testing.assert_array_equal(after[0], [4.0, 2.2])
     np.testing.assert_allclose(after[1], [1.4, 0.25])
 
 
 def test_rprop_confirms_approximate_losses():
     """Approximate losses omit the second parameter's cliff, and each acceptable one is confirmed."""
-    optimizer = Rprop(initial_step=1.0)
-    x, calls = np.array([5.0, 2.2, 2.2]), []
+    calls = []
 
     def evaluate(x, *, approximate=False):
         calls.append(approximate)
         below = np.array([0.0, not approximate and x[1] < 2.0 and x[2] >= 2.0, x[2] < 2.0])
         return float(x @ x / 8 + 1e3 * below @ np.maximum(2.0 - x, 0)), x / 4 - 1e3 * below
 
-    after = optimizer.step(evaluate, x, *evaluate(x), optimizer.init(x))
-    assert after is not None
+    after = step(Rprop(initial_step=1.0), evaluate, np.array([5.0, 2.2, 2.2]))
     np.testing.assert_array_equal(after[0], [4.0, 2.2, 2.2])
     # the start; all three, which meets the third one's cliff; without it, twice; without the second one, twice
     assert calls == [False, False, True, False, True, False]
@@ -192,29 +184,24 @@ def test_rprop_confirms_approximate_losses():
 
 def test_rprop_shorter_trial_is_not_approximate():
     """Beyond .5 is a plateau. Its gradient does not show it, so approximate losses would not show that it is left."""
-    optimizer, beyond = Rprop(initial_step=1.0), [False]
-    x = np.array([0.0])
+    beyond = [False]
 
     def evaluate(x, *, approximate=False):
         if not approximate:
             beyond[0] = bool(x[0] > 0.5)
         return float(1e3 * beyond[0] - x[0]), np.array([-1.0])
 
-    after = optimizer.step(evaluate, x, *evaluate(x), optimizer.init(x))
-    assert after is not None
+    after = step(Rprop(initial_step=1.0), evaluate, np.array([0.0]))
     np.testing.assert_array_equal(after[0], [0.25])
 
 
 def test_rprop_on_a_steeper_slope_grows_by_four():
     """Where a slope becomes steeper on the way, the next step is four times as long."""
-    optimizer = Rprop(initial_step=0.01)
-    x = np.array([0.0])
 
     def evaluate(x):
         return float(-np.exp(x[0])), -np.exp(x)
 
-    after = optimizer.step(exactly(evaluate), x, *evaluate(x), optimizer.init(x))
-    assert after is not None
+    after = step(Rprop(initial_step=0.01), exactly(evaluate), np.array([0.0]))
     np.testing.assert_allclose(after, ([0.01], [0.04]))
 
 

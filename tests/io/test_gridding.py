@@ -151,12 +151,7 @@ def test_grid_walks_on_the_edge_of_the_map_is_inside():
 def test_grid_walks_uses_resolution_origin_and_yaw():
     turned = Grid(np.full((2, 3), -1), resolution=0.1, origin=(5.0, -3.0, np.pi / 2))
     # The map's columns run along y, its rows (from the bottom) along −x.
-    assert cells_along(turned, (4.95, -2.95), (4.95, -2.75), (4.85, -2.75)) == [
-        (0, 0),
-        (1, 0),
-        (2, 0),
-        (2, 1),
-    ]
+    assert cells_along(turned, (4.95, -2.95), (4.95, -2.75), (4.85, -2.75)) == [(0, 0), (1, 0), (2, 0), (2, 1)]
 
 
 @pytest.mark.parametrize("grid", [blank, blank8])
@@ -190,20 +185,13 @@ def test_grid_walks_keeps_a_clipped_cell_of_a_failed_move():
 @pytest.mark.parametrize("target", [(0.6, 0.5), (2.5, 0.5), (1.5, 1.5), (-1.5, 0.5)])
 def test_grid_walks_failed_move_to_no_adjacent_cell_raises(target):
     walks = walk_along([(0.5, 0.5), (1.5, 0.5), (0.5, 0.5)], failed={(0, 2): target})
-    with pytest.raises(
-        InputError, match=r"walks\.csv, row 3, field 'failed_x': expected a failed move to one of the 4"
-    ):
+    with pytest.raises(InputError, match=r"walks\.csv, row 3, field 'failed_x': expected a failed move to one of"):
         grid_walks(walks, blank)
 
 
 def test_grid_walks_goal_on_a_border_is_where_the_walk_ends():
     walks = walk_along([(0.5, 0.5), (1.5, 0.5), (2.0, 0.5)], [(3.5, 0.5), (2.5, 0.5), (2.0, 0.5)])
     assert grid_walks(walks, blank).goals.tolist() == [43, 44]
-
-
-def test_grid_walks_reads_explicit_goals():
-    walks = walk_along([(0.5, 0.5), (1.5, 0.5)], goals=[(6.5, 6.5)])
-    assert grid_walks(walks, blank).goals.tolist() == [6]
 
 
 @pytest.mark.parametrize(
@@ -245,19 +233,6 @@ def test_grid_walks_without_walks_raises():
     walks = walk_along([(0.5, 0.5), (1.5, 0.5)]).select(np.array([False]))
     with pytest.raises(InputError, match=r"walks\.csv: expected at least one walk"):
         grid_walks(walks, blank)
-
-
-def test_grid_walks_of_interleaved_walks_names_rows_of_the_file():
-    table = pa.table(
-        {
-            "walk": ["a", "b", "a", "b"],
-            "step": [0, 0, 1, 1],
-            "x": [0.5, 0.5, 1.5, 1.5],
-            "y": [0.5, 0.5, 0.5, 9.0],
-        }
-    )
-    with pytest.raises(InputError, match="row 4, field 'y'"):
-        grid_walks(walks_from_table(table), blank)
 
 
 def interleaved(**columns):

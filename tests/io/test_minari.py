@@ -28,7 +28,7 @@ from sidestep.io.minari.demonstrations import read_demonstrations, write_demonst
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.graph import Graph
-from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.grid import Grid
 from sidestep.tabular.planning import plan
 from sidestep.tabular.tasks import Task, reach, stack_tasks
 
@@ -263,26 +263,13 @@ def test_read_demonstrations_of_bad_metadata_raises(told, message):
     refused(dataset, f", episode 1{separator}{message}")
 
 
-def test_read_demonstrations_of_goals_in_obstacles_raises():
-    known = np.full((2, 3), Cell.UNKNOWN)
-    known[0, 2] = Cell.OCCUPIED
-    dataset = store(SPACES, WALK, metadata=[{"goal": 2, "discount": 0.9}])
-    refused(dataset, r", episode 0, field 'goal': the goal \(state 2\) lies in a known obstacle", Grid(known))
-
-
 @pytest.mark.parametrize(
     ("walk", "message"),
     [
         (buffer([0, 1], [3, 3]), "field 'observations': expected 3 observations around 2 moves, found 2"),
         (buffer([0, 1, 2], [3, 3], rewards=[0.0]), "field 'observations': expected 2 observations around 1 moves"),
-        (
-            buffer([0, 1, 2], [3], rewards=[0.0, 0.0]),
-            r"field 'actions': expected 2 whole numbers, .* \(1,\)",
-        ),
-        (
-            buffer(np.array([[0], [1], [2]]), [3, 3]),
-            r"field 'observations': expected 3 whole numbers, .* \(3, 1\)",
-        ),
+        (buffer([0, 1, 2], [3], rewards=[0.0, 0.0]), r"field 'actions': expected 2 whole numbers, .* \(1,\)"),
+        (buffer(np.array([[0], [1], [2]]), [3, 3]), r"field 'observations': expected 3 whole numbers, .* \(3, 1\)"),
         (buffer([0, 1.5, 2], [3, 3]), "field 'observations': expected 3 whole numbers, found float64"),
         (buffer([0, 1, 2], [3, np.nan]), "field 'actions': expected 2 whole numbers, found float64"),
         (buffer([0, 6, 2], [3, 3]), "field 'observations': expected a whole number in 0…5, found 6 at step 1"),
@@ -335,14 +322,6 @@ def test_read_demonstrations_of_no_dataset_raises(datasets, tmp_path):
     refused(broken, ": the dataset cannot be read: JSONDecodeError")
 
 
-def edited(folder, dataset, edit):
-    """Change the metadata of a whole dataset by hand."""
-    path = folder / dataset / "data" / "metadata.json"
-    metadata = json.loads(path.read_text())
-    edit(metadata)
-    path.write_text(json.dumps(metadata))
-
-
 def set_in_task(**values):
     return lambda metadata: metadata["tasks"][1].update(values)
 
@@ -369,7 +348,10 @@ def set_in_task(**values):
 def test_read_demonstrations_of_bad_tasks_raises(datasets, edit, message):
     dataset = fresh("ours/spoiled")
     write_demonstrations(dataset, towards(2, 5), GRID)
-    edited(datasets, dataset, edit)
+    path = datasets / dataset / "data" / "metadata.json"
+    metadata = json.loads(path.read_text())
+    edit(metadata)
+    path.write_text(json.dumps(metadata))
     refused(dataset, message)
 
 

@@ -158,14 +158,8 @@ def test_read_walks_of_bad_goals_raises(goal, message):
         (Discrete(4), r", field 'achieved_goal': expected a Box of at least two numbers x, y, found Discrete\(4\)"),
         (Box(0, 4, (1,)), ", field 'achieved_goal': expected a Box of at least two numbers x, y, found Box"),
         (Box(0, 4, (2, 2)), ", field 'achieved_goal': expected a Box of at least two numbers x, y, found Box"),
-        (
-            Dict({"seen": PLANE}),
-            ", field 'observation_space': expected achieved_goal among the observations, found Dict",
-        ),
-        (
-            Dict({"achieved_goal": PLANE, "desired_goal": Discrete(4)}),
-            ", field 'desired_goal': expected a Box of at least two numbers x, y, found Discrete",
-        ),
+        (Dict({"seen": PLANE}), ", field 'observation_space': expected achieved_goal among .*, found Dict"),
+        (Dict({"achieved_goal": PLANE, "desired_goal": Discrete(4)}), ", field 'desired_goal': .*found Discrete"),
     ],
 )
 def test_read_walks_without_positions_raises(space, message):

@@ -82,12 +82,7 @@ def test_read_roads_with_numeric_labels_in_any_order(files):
         ("links", "c,8,9,40,1", "c,8,9,40,2", r"links\.csv, row 3, field 'oneway': expected a whole number, 0…1"),
         ("links", "c,8,", "c,,", r"links\.csv, row 3, field 'from_node': expected a label"),
         ("turns", "next_link", "onto", r"turns\.csv, field 'next_link': the column is missing"),
-        (
-            "turns",
-            "a,0,c",
-            "a,0,d",
-            r"turns\.csv, row 2, field 'next_link': expected a link of the table of .*found d",
-        ),
+        ("turns", "a,0,c", "a,0,d", r"turns\.csv, row 2, field 'next_link': expected a link of the table of .*found d"),
         ("turns", "a,0,c", "d,0,c", r"turns\.csv, row 2, field 'link': expected a link of the table of .*found d"),
         ("turns", "b,4,a", "b,4,c", r"turns\.csv, row 3, field 'next_link': expected a link that begins where"),
         ("turns", "a,0,c", "a,0,b", r"turns\.csv, row 2, field 'next_link': the turn appears more than once"),
@@ -134,11 +129,5 @@ def test_demonstrations_from_trips_have_one_task_per_destination(files):
     assert np.argwhere(np.asarray(demos.tasks.terminal)).tolist() == [[0, 0], [1, 3]]
     paid = -demos.tasks.reward[demos.task, demos.states, demos.actions]
     assert paid.tolist() == [20, 15, 60.25, 60.25]
-
-
-def test_demonstrations_from_trips_without_a_turn_raises(files):
-    links, turns, _ = files()
-    roads = read_roads(links, turns)
-    graph = road_network(roads.turns, roads.lengths).graph
     with pytest.raises(InputError, match="trip, row 2: expected a turn"):
         demonstrations_from_trips([np.array([0, 2]), np.array([0, 3])], graph)

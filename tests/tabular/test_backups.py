@@ -38,11 +38,7 @@ def test_backup_of_two_values_equals_the_values_by_hand(name):
 @given(seed=st.integers(0, 2**32 - 1))
 def test_weights_of_random_values_are_the_gradient_and_sum_to_one(name, seed):
     rng = np.random.default_rng(seed)
-    backup, q, beta = (
-        BACKUPS[name],
-        jnp.asarray(rng.normal(size=(3, 5))),
-        jnp.asarray(10 ** rng.uniform(-1, 2)),
-    )
+    backup, q, beta = (BACKUPS[name], jnp.asarray(rng.normal(size=(3, 5))), jnp.asarray(10 ** rng.uniform(-1, 2)))
     gradient = jax.vmap(jax.grad(lambda q: backup.value(q, beta)))(q)
     np.testing.assert_allclose(backup.weights(q, beta), gradient, atol=1e-12)
     for weights in (backup.weights(q, beta), backup.fixed_policy_weights(q, beta)):

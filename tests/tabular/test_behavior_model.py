@@ -1,5 +1,7 @@
 """What is learned of behavior beside the dynamics: β, lapse, discount, reward weights, costs of states."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -148,19 +150,18 @@ def test_tasks_of_with_costs_charges_the_state_that_is_aimed_at():
 
 
 def test_behavior_model_of_wrong_arguments_raises():
-    behavior = Behavior(LogSumExp(), 5.0)
-    with pytest.raises(InputError, match=r"'learn': expected some of .*'lapses'"):
-        behavior_model(behavior, ["lapses"])
-    with pytest.raises(InputError, match=r"'discount': .*between 0 and 1"):
-        behavior_model(behavior, ["discount"], discount=1.0)
-    with pytest.raises(InputError, match=r"'person': expected persons numbered from 0"):
-        behavior_model(behavior, person=np.array([0, 2]))
-    with pytest.raises(InputError, match=r"'features': expected finite numbers"):
-        behavior_model(behavior, features=np.full((3, 1, 1), np.nan))
-    with pytest.raises(InputError, match=r"'reward_weights': expected 1 finite numbers"):
-        behavior_model(behavior, features=np.zeros((3, 1, 1)), reward_weights=np.full(1, np.inf))
-    with pytest.raises(InputError, match=r"'aimed_at': expected states 0…29"):
-        behavior_model(behavior, aimed_at=np.full((30, 4), 30))
+    behavior, features = Behavior(LogSumExp(), 5.0), np.zeros((3, 1, 1))
+    refused: list[tuple[dict[str, Any], str]] = [
+        ({"learn": ["lapses"]}, r"'learn': expected some of .*'lapses'"),
+        ({"learn": ["discount"], "discount": 1.0}, r"'discount': .*between 0 and 1"),
+        ({"person": np.array([0, 2])}, r"'person': expected persons numbered from 0"),
+        ({"features": features * np.nan}, r"'features': expected finite numbers"),
+        ({"features": features, "reward_weights": np.full(1, np.inf)}, r"'reward_weights': expected 1 finite numbers"),
+        ({"aimed_at": np.full((30, 4), 30)}, r"'aimed_at': expected states 0…29"),
+    ]
+    for arguments, message in refused:
+        with pytest.raises(InputError, match=message):
+            behavior_model(behavior, **arguments)
     with pytest.raises(InputError, match=r"'lapse': expected a probability"):
         Behavior(LogSumExp(), 5.0, lapse=1.0)
     with pytest.raises(InputError, match=r"'tempering': expected a number above 0"):

@@ -1,12 +1,11 @@
 """Demonstrations from trajectories, and from walks in metres."""
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
+from helpers.drawn import walk_along
 from sidestep.errors import InputError
 from sidestep.io.demonstrations import demonstrations_from_walks
-from sidestep.io.walks import walks_from_table
 from sidestep.tabular.demonstrations import Trajectory, gather, next_power_of_two, pad_to_power_of_two
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.tasks import reach
@@ -57,17 +56,8 @@ def test_gather_of_nothing_raises():
 
 def walks(*lines, goals=None):
     """Walks along lists of columns of `LINE`, at the centers of cells."""
-    xs = [x + 0.5 for line in lines for x in line]
-    table = {
-        "walk": [walk for walk, line in enumerate(lines) for _ in line],
-        "step": [step for line in lines for step in range(len(line))],
-        "x": xs,
-        "y": [0.5] * len(xs),
-    }
-    if goals:
-        table["goal_x"] = [goals[walk] + 0.5 for walk in table["walk"]]
-        table["goal_y"] = [0.5] * len(xs)
-    return walks_from_table(pa.table(table))
+    centers = [[(x + 0.5, 0.5) for x in line] for line in lines]
+    return walk_along(*centers, goals=goals and [(x + 0.5, 0.5) for x in goals])
 
 
 def test_demonstrations_from_walks_makes_one_task_for_each_goal():

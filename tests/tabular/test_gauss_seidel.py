@@ -163,12 +163,13 @@ def test_solve_in_nested_batches_and_loops_equals_each_alone():
             np.testing.assert_allclose(mine, theirs, rtol=1e-12, atol=1e-12, err_msg=name)
 
 
-def test_solve_of_32_bit_numbers_stays_in_32_bits():
+@pytest.mark.parametrize("solver", [GaussSeidel(), Jacobi()], ids=["GaussSeidel", "Jacobi"])
+def test_solve_of_32_bit_numbers_stays_in_32_bits(solver):
     problem = random_problem()
     inputs = (problem.model, generic_task(problem, 0.9), agent("Boltzmann"))
     exact, exact_slope, _ = values_and_slopes(*inputs)
     narrow = jax.tree.map(lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, inputs)
-    solution, slope, adjoint = values_and_slopes(*narrow, solver=GaussSeidel())
+    solution, slope, adjoint = values_and_slopes(*narrow, solver=solver)
     arrays = (solution.values, solution.action_values, solution.residual, solution.start.values, slope, adjoint)
     assert {array.dtype for array in arrays} == {jnp.dtype(jnp.float32)}
     assert solution.converged

@@ -291,17 +291,6 @@ def test_solve_enclosed_cells_at_discount_1_have_no_effect_on_others(name):
     assert (slope[others] != 0).sum() > 5
 
 
-def test_solve_of_32_bit_inputs_gives_32_bit_values():
-    """32-bit inputs give accurate 32-bit values with 64 bits switched on."""
-    problem = random_problem()
-    inputs = (problem.model, reach(problem.model.graph, 0), agent("Boltzmann"))
-    exact = solve_jit(*inputs)
-    solution = solve_jit(*jax.tree.map(lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, inputs))
-    assert solution.values.dtype == solution.action_values.dtype == solution.residual.dtype == jnp.float32
-    assert solution.converged
-    np.testing.assert_allclose(solution.values, exact.values, rtol=1e-3)
-
-
 # Improper problems, bad settings
 
 

@@ -69,8 +69,7 @@ class LearnOptions:
         float, Option(help="The weight of a blocked cell between two others, in nats.", metavar="NATS")
     ] = PriorConfig.wall_prior
     sensor_map: Annotated[
-        Path | None,
-        Option(help="ROS map (mode scale or raw): P(occupied) where sensors looked.", metavar="MAP.yaml"),
+        Path | None, Option(help="ROS map (mode scale or raw): P(occupied) where sensors looked.", metavar="MAP.yaml")
     ] = None
     sensor_variance: Annotated[str, Option(help="The variance of sensed logits: a number or a .npy file.")] = "0.5"
     connectivity: ConnectivityOption = "4"
