@@ -39,7 +39,7 @@ def run(folder: Path) -> None:
             subprocess.run(["sidestep", *command, "--out", str(folder / name)], check=True)
         if name in mazes:
             truth = str(mazes[name] / "truth.yaml")
-            subprocess.run(["sidestep", "evaluate", str(folder / name), "--true-map", truth], check=True)
+            subprocess.run(["sidestep", "evaluate", str(folder / name), "--truth", truth], check=True)
     depot = [
         "-m",
         "benchmarks",
