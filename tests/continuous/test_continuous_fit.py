@@ -11,30 +11,22 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.stats import norm
 
+import sidestep as ss
+import sidestep.continuous as sc
 from helpers.families import Drift, Gusts, LaplaceDrift, vector
-from sidestep.continuous.dynamics import LinearGaussian
-from sidestep.continuous.fit import fit_dynamics, problem_fingerprint
-from sidestep.continuous.likelihood import FitProgress, Schedule
-from sidestep.continuous.obstacles import ObstacleMotion, Walls
-from sidestep.continuous.planner import Planner
-from sidestep.continuous.policies import FinitePolicy, ScaledNetwork, finite_policy, gaussian_policy
-from sidestep.continuous.simulation import gather_trajectories
-from sidestep.continuous.tasks import QuadraticTask, batch_tasks, reach_region
-from sidestep.errors import InputError, NotConverged
+from sidestep.continuous.fit import problem_fingerprint
+from sidestep.continuous.policies import ScaledNetwork
 from sidestep.inference.checkpoints import Saver
-from sidestep.inference.priors import Normal
-from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax, LogSumExp, Mellowmax
-from sidestep.tabular.demonstrations import Trajectory
 
 pytestmark = pytest.mark.usefixtures("unoptimised")
 
 # Agents on a line move by −1, 0 or 1 and look two moves ahead, to stay near 0: R(s, a) = −s². With the Boltzmann
 # average, Q(s, a) = −s² − γ E(s + a + θ + noise)², for every later choice.
 WAYS, DISCOUNT, NOISE, TRUTH, MOVES = np.array([-1.0, 0.0, 1.0]), 0.9, 0.4, 0.6, 90
-NEAR = QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.zeros((1, 1)), jnp.asarray(DISCOUNT))
-BEHAVIOR, PRIOR = Behavior(BoltzmannAverage(), 1.5), Normal(0.0, 50.0)
-POLICY = finite_policy(jax.random.key(1), vector(*WAYS)[:, None], jnp.linspace(-2, 2, 9)[:, None], width=4, depth=1)
-PLANNER = Planner(horizon=2, batch_size=8, samples=2, learning_rate=0.03, critic_width=4)
+NEAR = sc.QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.zeros((1, 1)), jnp.asarray(DISCOUNT))
+BEHAVIOR, PRIOR = ss.Behavior(ss.BoltzmannAverage(), 1.5), ss.Normal(0.0, 50.0)
+POLICY = sc.finite_policy(jax.random.key(1), vector(*WAYS)[:, None], jnp.linspace(-2, 2, 9)[:, None], width=4, depth=1)
+PLANNER = sc.Planner(horizon=2, batch_size=8, samples=2, learning_rate=0.03, critic_width=4)
 INITIAL = Drift(vector(-0.5), vector(NOISE))
 
 
@@ -53,16 +45,15 @@ def walks(seed=0):
 
 
 def demonstrations_of(states, actions, following, tasks=(NEAR,)):
-    moves = zip(states, actions, following, strict=True)
-    return gather_trajectories(
-        [Trajectory(np.stack(np.atleast_2d(s, t)).reshape(2, -1), a[None], 0) for s, a, t in moves], tasks
-    )
+    moves = zip(np.stack([states, following], axis=1).reshape(len(states), 2, -1), actions, strict=True)
+    return sc.gather_trajectories([ss.Trajectory(places, action[None], 0) for places, action in moves], tasks)
 
 
 STATES, CHOICES, FOLLOWING = walks()
 DEMONSTRATIONS = demonstrations_of(STATES, CHOICES, FOLLOWING)
-learn = partial(fit_dynamics, INITIAL, DEMONSTRATIONS, BEHAVIOR, POLICY, PLANNER, prior=PRIOR)
-SHORT = Schedule(iterations=16, policy_warmup=0, batch_size=30, learning_rate=0.2)
+AGENTS = BEHAVIOR, POLICY, PLANNER
+learn = partial(sc.fit_dynamics, INITIAL, DEMONSTRATIONS, *AGENTS, prior=PRIOR)
+SHORT = sc.Schedule(iterations=16, policy_warmup=0, batch_size=30, learning_rate=0.2)
 BOTH = partial(learn, estimator="pathwise", schedule=SHORT)
 
 
@@ -81,11 +72,11 @@ def test_fit_dynamics_transitions_alone_give_least_squares():
     seen = np.column_stack([STATES, WAYS[CHOICES]])
     following = seen @ [0.7, 0.5] + 0.3 * np.random.default_rng(0).normal(size=MOVES)
     expected = np.linalg.lstsq(seen, following, rcond=None)[0]
-    begin = LinearGaussian(jnp.zeros((1, 1)), jnp.zeros((1, 1)), vector(0.3))
-    result = fit_dynamics(
-        begin, demonstrations_of(STATES, CHOICES, following), BEHAVIOR, POLICY, PLANNER,
-        prior=Normal(0.0, 5e5), terms=("transitions",),
-        schedule=Schedule(iterations=300, batch_size=MOVES, learning_rate=0.05),
+    begin = sc.LinearGaussian(jnp.zeros((1, 1)), jnp.zeros((1, 1)), vector(0.3))
+    result = sc.fit_dynamics(
+        begin, demonstrations_of(STATES, CHOICES, following), *AGENTS,
+        prior=ss.Normal(0.0, 5e5), terms=("transitions",),
+        schedule=sc.Schedule(iterations=300, batch_size=MOVES, learning_rate=0.05),
     )  # fmt: skip
     learned = [float(result.dynamics.parameters[name][0, 0]) for name in ("state", "action")]
     np.testing.assert_allclose(learned, expected, atol=2e-3)
@@ -101,7 +92,7 @@ def test_fit_dynamics_actions_alone_give_the_maximum_likelihood():
     def loss(drift):
         return -log_policy(drift, STATES)[np.arange(MOVES), CHOICES].sum() + drift**2 / 100
 
-    schedule = Schedule(iterations=100, policy_warmup=0, batch_size=MOVES, learning_rate=0.1)
+    schedule = sc.Schedule(iterations=100, policy_warmup=0, batch_size=MOVES, learning_rate=0.1)
     result = learn(terms=("actions",), schedule=schedule)
     learned, best = float(result.dynamics.parameters[0]), minimize_scalar(loss)
     assert learned == pytest.approx(best.x, abs=0.1)  # pyright: ignore[reportAttributeAccessIssue]
@@ -114,7 +105,7 @@ def test_fit_dynamics_actions_alone_give_the_maximum_likelihood():
 def test_fit_dynamics_vector_actions_give_the_true_drift():
     """With R(s, a) = −s² − a² the policy is normal, by Riccati's equation."""
     beta, discount, count = 4.0, 0.6, 300
-    task = QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.eye(1), jnp.asarray(discount))
+    task = sc.QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.eye(1), jnp.asarray(discount))
     curve = 1.0  # V(s) = −curve s² − 2 tilt s, whatever else
     for _ in range(100):
         curve = 1 + discount * curve / (1 + discount * curve)
@@ -125,12 +116,12 @@ def test_fit_dynamics_vector_actions_give_the_true_drift():
     means = -discount * (curve * (states + TRUTH) + tilt) / steepness
     actions = means + spread * random.normal(size=count)
     demos = demonstrations_of(states, actions[:, None], states + actions + TRUTH, (task,))
-    result = fit_dynamics(
-        INITIAL, demos, Behavior(LogSumExp(), beta),
-        gaussian_policy(jax.random.key(0), 1, demos.states, depth=0, spread=0.3),
-        Planner(horizon=8, batch_size=16, samples=2, candidates=8, learning_rate=0.03, critic_width=4),
+    result = sc.fit_dynamics(
+        INITIAL, demos, ss.Behavior(ss.LogSumExp(), beta),
+        sc.gaussian_policy(jax.random.key(0), 1, demos.states, depth=0, spread=0.3),
+        sc.Planner(horizon=8, batch_size=16, samples=2, candidates=8, learning_rate=0.03, critic_width=4),
         prior=PRIOR, terms=("actions",), estimator="pathwise",
-        schedule=Schedule(iterations=200, policy_warmup=60, batch_size=30, learning_rate=0.02),
+        schedule=sc.Schedule(iterations=200, policy_warmup=60, batch_size=30, learning_rate=0.02),
     )  # fmt: skip
     assert result.converged
     assert float(result.dynamics.parameters[0]) == pytest.approx(TRUTH, abs=0.1)
@@ -143,7 +134,7 @@ def test_fit_dynamics_vector_actions_give_the_true_drift():
 @pytest.mark.slow
 def test_fit_dynamics_policy_warmup_plans_for_the_first_model():
     """Without the actions' term there is no policy to plan."""
-    schedule = Schedule(iterations=2, policy_warmup=3, batch_size=30, learning_rate=0.1)
+    schedule = sc.Schedule(iterations=2, policy_warmup=3, batch_size=30, learning_rate=0.1)
     by_actions = learn(terms=("actions",), schedule=schedule)
     by_transitions = learn(terms=("transitions",), schedule=schedule)
     assert by_actions.planner_state.policy_moments[0].count == 3 + 2
@@ -164,9 +155,9 @@ def test_fit_dynamics_objective_is_the_sum_of_its_terms():
 @pytest.mark.slow
 def test_fit_dynamics_batches_of_a_laplace_family_give_the_median():
     """The batch log-likelihood is scaled up to all moves."""
-    result = fit_dynamics(
-        LaplaceDrift(vector(0.1)), DEMONSTRATIONS, BEHAVIOR, POLICY, PLANNER,
-        prior=PRIOR, terms=("transitions",), schedule=Schedule(iterations=150, batch_size=30, learning_rate=0.02),
+    result = sc.fit_dynamics(
+        LaplaceDrift(vector(0.1)), DEMONSTRATIONS, *AGENTS,
+        prior=PRIOR, terms=("transitions",), schedule=sc.Schedule(iterations=150, batch_size=30, learning_rate=0.02),
     )  # fmt: skip
     drifts = FOLLOWING - STATES - WAYS[CHOICES]
     assert float(result.dynamics.parameters[0]) == pytest.approx(np.median(drifts), abs=0.05)
@@ -208,15 +199,15 @@ def test_fit_dynamics_large_policy_gap_is_not_converged():
 @pytest.mark.slow
 def test_fit_dynamics_noisy_policy_gap_is_not_converged():
     """At this β the noise of two rollouts exceeds the gap that it is subtracted from."""
-    sharp = Behavior(BoltzmannAverage(), 40.0)
-    result = fit_dynamics(INITIAL, DEMONSTRATIONS, sharp, POLICY, PLANNER, prior=PRIOR, schedule=SHORT)
+    sharp = ss.Behavior(ss.BoltzmannAverage(), 40.0)
+    result = sc.fit_dynamics(INITIAL, DEMONSTRATIONS, sharp, POLICY, PLANNER, prior=PRIOR, schedule=SHORT)
     assert abs(result.policy_gap) > 0.1
     assert not result.converged
 
 
 @pytest.mark.parametrize(("tolerance", "converged"), [(1.0, True), (1e-6, False)])
 def test_fit_dynamics_drift_is_compared_with_its_tolerance(tolerance, converged):
-    schedule = Schedule(iterations=8, policy_warmup=3, batch_size=MOVES, learning_rate=0.1, drift_tolerance=tolerance)
+    schedule = sc.Schedule(8, batch_size=MOVES, learning_rate=0.1, drift_tolerance=tolerance)
     result = learn(terms=("transitions",), schedule=schedule)
     assert 1e-6 < result.drift < 1
     assert result.converged == converged
@@ -225,8 +216,8 @@ def test_fit_dynamics_drift_is_compared_with_its_tolerance(tolerance, converged)
 
 def test_fit_dynamics_constant_slope_has_drift_1():
     """A distant prior has a nearly constant slope, and Adam then takes full steps."""
-    schedule = Schedule(iterations=40, batch_size=MOVES, learning_rate=0.01)
-    result = learn(terms=("transitions",), schedule=schedule, prior=Normal(1e4, 5e2))
+    schedule = sc.Schedule(iterations=40, batch_size=MOVES, learning_rate=0.01)
+    result = learn(terms=("transitions",), schedule=schedule, prior=ss.Normal(1e4, 5e2))
     assert result.drift == pytest.approx(1, rel=0.05)
     assert not result.converged
 
@@ -251,7 +242,7 @@ def checkpoint(tmp_path, monkeypatch):
 
 
 def interrupted_at(iteration):
-    def report(progress: FitProgress, _):
+    def report(progress: sc.FitProgress, _):
         if progress.iteration == iteration:
             raise KeyboardInterrupt
 
@@ -295,22 +286,22 @@ def test_fit_dynamics_checkpoint_of_another_problem_is_refused(checkpoint):
     before = checkpoint.read_bytes()
     others = {
         "seed": partial(BOTH, seed=1),
-        "prior": partial(BOTH, prior=Normal(0.0, 2.0)),
+        "prior": partial(BOTH, prior=ss.Normal(0.0, 2.0)),
         "terms": partial(BOTH, terms=("actions",)),
-        "data": partial(fit_dynamics, INITIAL, demonstrations_of(*walks(1)), BEHAVIOR, POLICY, PLANNER, schedule=SHORT),
+        "data": partial(sc.fit_dynamics, INITIAL, demonstrations_of(*walks(1)), *AGENTS, schedule=SHORT),
     }
     for other in others.values():
-        with pytest.raises(InputError, match="belongs to a fit of other data or with other settings"):
+        with pytest.raises(ss.InputError, match="belongs to a fit of other data or with other settings"):
             other(checkpoint=checkpoint, resume=True)
     assert checkpoint.read_bytes() == before
-    with pytest.raises(InputError, match="'resume': expected a checkpoint to resume from"):
+    with pytest.raises(ss.InputError, match="'resume': expected a checkpoint to resume from"):
         BOTH(resume=True)
 
 
 def test_problem_fingerprint_ignores_addresses_of_functions():
     def policy(offset):
         network = eqx.nn.MLP(1, 3, 4, 1, activation=lambda x: jnp.tanh(x + offset), key=jax.random.key(0))
-        return FinitePolicy(ScaledNetwork(network, jnp.zeros(1), jnp.ones(1)), POLICY.actions)
+        return sc.FinitePolicy(ScaledNetwork(network, jnp.zeros(1), jnp.ones(1)), POLICY.actions)
 
     first, second = policy(0), policy(0)
     assert str(jax.tree.leaves(first)) != str(jax.tree.leaves(second))
@@ -326,8 +317,12 @@ def changed(**fields):
     return eqx.tree_at(lambda demos: [getattr(demos, name) for name in names], DEMONSTRATIONS, list(values))
 
 
+def with_tasks(task):
+    return changed(tasks=sc.batch_tasks([task]))
+
+
 VECTORS = changed(actions=vector(*WAYS[CHOICES])[:, None])
-GAUSSIAN = gaussian_policy(jax.random.key(0), 1, vector(0, 1)[:, None], width=2, depth=1)
+GAUSSIAN = sc.gaussian_policy(jax.random.key(0), 1, vector(0, 1)[:, None], width=2, depth=1)
 NAN = DEMONSTRATIONS.states.at[4, 0].set(jnp.nan)
 
 
@@ -360,33 +355,33 @@ FIRST_BACK = int(np.argmax(CHOICES == 0)) + 1
     ({"demonstrations": changed(states=NAN)}, "states, row 5: expected finite numbers"),
     ({"demonstrations": changed(task=DEMONSTRATIONS.task.at[1].set(1))}, r"'task': expected tasks in 0…0"),
     ({"demonstrations": changed(task=DEMONSTRATIONS.task.at[1].set(-1))}, r"'task': expected tasks in 0…0"),
-    ({"demonstrations": changed(tasks=batch_tasks([eqx.tree_at(lambda task: task.discount, NEAR, jnp.asarray(0.0))]))},
+    ({"demonstrations": with_tasks(eqx.tree_at(lambda task: task.discount, NEAR, jnp.asarray(0.0)))},
      "'discount': expected a number above 0 and at most 1, found 0"),
     ({"dynamics": broken(jnp.nan)}, f"trajectory {FIRST_BACK}, field 'log_prob': .* found the logarithm nan"),
     ({"dynamics": broken(-jnp.inf)}, "'log_prob': expected a density above 0 .* found the logarithm -inf"),
     ({"dynamics": Drift(vector(jnp.nan), vector(NOISE))}, "'parameters': expected finite numbers"),
-    ({"dynamics": ObstacleMotion(Walls(low=jnp.ones((1, 1)), high=jnp.ones((1, 1))), vector(-9), vector(9), vector(1))},
+    ({"dynamics": sc.ObstacleMotion(sc.Walls(jnp.ones((1, 1)), jnp.ones((1, 1))), vector(-9), vector(9), vector(1))},
      "'dynamics': expected parameters to learn, found none"),
     ({"terms": ()}, r"'terms': expected one or both of .*, found \(\)"),
     ({"demonstrations": changed(next_states=NAN)}, "'next_states': expected finite numbers"),
-    ({"demonstrations": changed(tasks=batch_tasks([reach_region((0.0,), 9.0)]))}, "states, row 1: .*has not ended"),
-    ({"dynamics": LinearGaussian(jnp.eye(2), jnp.ones((2, 1)), vector(1, 1))},
+    ({"demonstrations": with_tasks(sc.reach_region((0.0,), 9.0))}, "states, row 1: .*has not ended"),
+    ({"dynamics": sc.LinearGaussian(jnp.eye(2), jnp.ones((2, 1)), vector(1, 1))},
      r"'demonstrations': expected states and actions that the dynamics can take, found shapes \(1,\)"),
     ({"estimator": "pathwise", "dynamics": Gusts(vector(0, 0, 0))},
      "'estimator': these dynamics jump, .*: expected 'score'"),
-    ({"estimator": "pathwise", "demonstrations": changed(tasks=batch_tasks([reach_region((9.0,), 0.1)]))},
+    ({"estimator": "pathwise", "demonstrations": with_tasks(sc.reach_region((9.0,), 0.1))},
      "'estimator': the returns of these tasks jump, .*: expected 'score'"),
-    *(({"policy": GAUSSIAN, "demonstrations": VECTORS, "behavior": Behavior(backup)},
+    *(({"policy": GAUSSIAN, "demonstrations": VECTORS, "behavior": ss.Behavior(backup)},
        "'behavior': over vectors of actions the policy is known for the log-sum-exp only")
-      for backup in (BoltzmannAverage(), HardMax(), Mellowmax())),
+      for backup in (ss.BoltzmannAverage(), ss.HardMax(), ss.Mellowmax())),
 ])  # fmt: skip
 def test_fit_dynamics_bad_input_is_refused(change, match):
     settings = {
         "dynamics": INITIAL, "demonstrations": DEMONSTRATIONS, "behavior": BEHAVIOR, "policy": POLICY,
         "planner": PLANNER, "schedule": SHORT,
     }  # fmt: skip
-    with pytest.raises(InputError, match=match):
-        fit_dynamics(**{**settings, **change})
+    with pytest.raises(ss.InputError, match=match):
+        sc.fit_dynamics(**{**settings, **change})
 
 
 @pytest.mark.parametrize(("setting", "expected"), [
@@ -399,21 +394,19 @@ def test_fit_dynamics_bad_input_is_refused(change, match):
     ({"policy_gap_tolerance": np.inf}, "a finite number above 0, found inf"),
 ])  # fmt: skip
 def test_schedule_refuses_settings_out_of_range(setting, expected):
-    with pytest.raises(InputError, match=f"'{next(iter(setting))}': expected {expected}"):
-        Schedule(**setting)
+    with pytest.raises(ss.InputError, match=f"'{next(iter(setting))}': expected {expected}"):
+        sc.Schedule(**setting)
 
 
 def test_fit_dynamics_no_moves_are_refused():
     nothing = jax.tree.map(lambda leaf: leaf[:0], eqx.tree_at(lambda demos: demos.tasks, DEMONSTRATIONS, None))
     nothing = eqx.tree_at(lambda demos: demos.tasks, nothing, DEMONSTRATIONS.tasks, is_leaf=lambda leaf: leaf is None)
-    with pytest.raises(InputError, match="'states': expected starts and a task for each, found 0"):
-        fit_dynamics(INITIAL, nothing, BEHAVIOR, POLICY, PLANNER)
+    with pytest.raises(ss.InputError, match="'states': expected starts and a task for each, found 0"):
+        sc.fit_dynamics(INITIAL, nothing, *AGENTS)
 
 
 @pytest.mark.slow
 def test_fit_dynamics_infinite_rewards_raise():
-    tasks = batch_tasks([eqx.tree_at(lambda task: task.state_cost, NEAR, 1e308 * jnp.eye(1))])
-    with pytest.raises(NotConverged, match="the figures ceased to be finite at iteration 0: dynamics or rewards"):
-        fit_dynamics(
-            INITIAL, changed(tasks=tasks), BEHAVIOR, POLICY, PLANNER, prior=PRIOR, estimator="pathwise", schedule=SHORT
-        )
+    demos = with_tasks(eqx.tree_at(lambda task: task.state_cost, NEAR, 1e308 * jnp.eye(1)))
+    with pytest.raises(ss.NotConverged, match="the figures ceased to be finite at iteration 0: dynamics or rewards"):
+        sc.fit_dynamics(INITIAL, demos, *AGENTS, prior=PRIOR, estimator="pathwise", schedule=SHORT)

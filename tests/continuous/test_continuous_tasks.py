@@ -5,18 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import sidestep as ss
+import sidestep.continuous as sc
 from helpers.small_worlds import table_tasks
-from sidestep.continuous.tasks import (
-    PendulumTask,
-    QuadraticTask,
-    ReachTask,
-    batch_tasks,
-    check_tasks,
-    reach_region,
-    task_at,
-)
-from sidestep.errors import InputError
-from sidestep.tabular.tasks import stack_tasks, task
+from sidestep.continuous.tasks import check_tasks
 
 
 def vector(*numbers):
@@ -24,13 +16,14 @@ def vector(*numbers):
 
 
 def pendulum_task(goal, discount=0.9):
-    return PendulumTask(goal=jnp.asarray(goal, float), discount=jnp.asarray(discount))
+    return sc.PendulumTask(goal=jnp.asarray(goal, float), discount=jnp.asarray(discount))
 
 
-QUADRATIC = QuadraticTask(vector(1, -1), jnp.asarray([[2.0, 0.5], [0.5, 1.0]]), jnp.asarray([[0.3]]), jnp.asarray(0.9))
+COST = jnp.asarray([[2.0, 0.5], [0.5, 1.0]])
+QUADRATIC = sc.QuadraticTask(vector(1, -1), COST, jnp.asarray([[0.3]]), jnp.asarray(0.9))
 TABLES = [
-    task(np.array([[-1.0, -2.0], [-3.0, -4.0], [0.0, 0.0]]), 0.9, np.array([False, False, True])),
-    task(np.array([5.0, 0.0, 0.0]), 0.8, np.array([True, False, False])),
+    ss.task(np.array([[-1.0, -2.0], [-3.0, -4.0], [0.0, 0.0]]), 0.9, np.array([False, False, True])),
+    ss.task(np.array([5.0, 0.0, 0.0]), 0.8, np.array([True, False, False])),
 ]
 
 
@@ -39,7 +32,7 @@ TABLES = [
 
 @pytest.mark.parametrize(("step_cost", "pays", "costs"), [(None, 1, 0), (2.0, 0, 2)])
 def test_reach_region_pays_at_the_goal_or_costs_a_step(step_cost, pays, costs):
-    goal = reach_region((1.0, 2.0), 0.5, discount=0.95, step_cost=step_cost)
+    goal = sc.reach_region((1.0, 2.0), 0.5, discount=0.95, step_cost=step_cost)
     assert float(goal.reward(vector(0, 0), vector(1, 1))) == -costs
     assert float(goal.terminal_reward(vector(1, 2))) == pays
     assert float(goal.discount) == 0.95
@@ -47,13 +40,13 @@ def test_reach_region_pays_at_the_goal_or_costs_a_step(step_cost, pays, costs):
 
 def test_reach_region_ends_within_its_radius():
     """The border counts; components beyond the goal's do not."""
-    goal = reach_region((1.0, 2.0), 0.5)
+    goal = sc.reach_region((1.0, 2.0), 0.5)
     places = jnp.asarray([[1.0, 2.0, 9.0], [1.5, 2.0, 0.0], [1.4, 2.4, 0.0], [0.0, 2.0, 0.0]])
     assert jax.vmap(goal.terminal)(places).tolist() == [True, True, False, False]
 
 
 def test_reach_region_features_are_state_goal_and_difference():
-    np.testing.assert_array_equal(reach_region((1.0, 2.0), 0.5).features(vector(3, 5, 7)), [3, 5, 7, 1, 2, -2, -3])
+    np.testing.assert_array_equal(sc.reach_region((1.0, 2.0), 0.5).features(vector(3, 5, 7)), [3, 5, 7, 1, 2, -2, -3])
 
 
 # Quadratic costs
@@ -72,7 +65,7 @@ def test_endless_task_never_ends_and_is_smooth(endless):
     assert not bool(endless.terminal(vector(1, -1)))
     assert float(endless.terminal_reward(vector(1, -1))) == 0
     assert endless.smooth
-    assert not ReachTask.smooth
+    assert not sc.ReachTask.smooth
 
 
 # Holding a pendulum
@@ -96,9 +89,9 @@ def test_pendulum_task_features_are_periodic():
 
 
 def test_table_tasks_agree_with_their_tables():
-    tables = table_tasks(stack_tasks(TABLES), 3, 2)
+    tables = table_tasks(ss.stack_tasks(TABLES), 3, 2)
     for index, table in enumerate(TABLES):
-        one = task_at(tables, index)
+        one = sc.task_at(tables, index)
         for state in range(3):
             rewards = [float(one.reward(jnp.asarray(state), jnp.asarray(action))) for action in range(2)]
             np.testing.assert_array_equal(rewards, np.broadcast_to(table.reward, (3, 2))[state])
@@ -114,20 +107,20 @@ def test_table_tasks_agree_with_their_tables():
 
 
 def test_batch_tasks_task_at_returns_each():
-    goals = [reach_region((float(x), 0.0), 0.5 + x, step_cost=1.0) for x in range(3)]
-    batch = batch_tasks(goals)
+    goals = [sc.reach_region((float(x), 0.0), 0.5 + x, step_cost=1.0) for x in range(3)]
+    batch = sc.batch_tasks(goals)
     assert batch.goal.shape == (3, 2)
     for index, goal in enumerate(goals):
-        assert all(map(np.array_equal, jax.tree.leaves(task_at(batch, index)), jax.tree.leaves(goal)))
-    np.testing.assert_array_equal(task_at(batch, jnp.asarray([2, 0])).radius, [2.5, 0.5])
+        assert all(map(np.array_equal, jax.tree.leaves(sc.task_at(batch, index)), jax.tree.leaves(goal)))
+    np.testing.assert_array_equal(sc.task_at(batch, jnp.asarray([2, 0])).radius, [2.5, 0.5])
 
 
 @pytest.mark.parametrize(
-    "tasks", [[], [pendulum_task(0.0), QUADRATIC], [reach_region((1.0,), 1.0), reach_region((1.0, 2.0), 1.0)]]
+    "tasks", [[], [pendulum_task(0.0), QUADRATIC], [sc.reach_region((1.0,), 1.0), sc.reach_region((1.0, 2.0), 1.0)]]
 )
 def test_batch_tasks_of_different_kinds_are_refused(tasks):
-    with pytest.raises(InputError, match="field 'tasks': expected at least one task, all of a kind"):
-        batch_tasks(tasks)
+    with pytest.raises(ss.InputError, match="field 'tasks': expected at least one task, all of a kind"):
+        sc.batch_tasks(tasks)
 
 
 # Refusals
@@ -145,12 +138,12 @@ def test_batch_tasks_of_different_kinds_are_refused(tasks):
     ({"discount": 1.0}, "'discount': a goal that pays 1 needs a discount below 1"),
 ])  # fmt: skip
 def test_reach_region_settings_out_of_range_are_refused(settings, match):
-    with pytest.raises(InputError, match=match):
-        reach_region(**{"goal": (0.0, 0.0), "radius": 1.0, **settings})
+    with pytest.raises(ss.InputError, match=match):
+        sc.reach_region(**{"goal": (0.0, 0.0), "radius": 1.0, **settings})
 
 
 def test_reach_region_discount_1_needs_a_step_cost():
-    assert float(reach_region((0.0,), 1.0, discount=1.0, step_cost=1.0).discount) == 1
+    assert float(sc.reach_region((0.0,), 1.0, discount=1.0, step_cost=1.0).discount) == 1
 
 
 @pytest.mark.parametrize(("goal", "discount", "match"), [
@@ -159,6 +152,6 @@ def test_reach_region_discount_1_needs_a_step_cost():
     (0.0, 1.5, "'discount': expected a number above 0 and at most 1, found 1.5"),
 ])  # fmt: skip
 def test_check_tasks_refuses_bad_numbers(goal, discount, match):
-    with pytest.raises(InputError, match=match):
-        check_tasks(batch_tasks([pendulum_task(0.0), pendulum_task(goal, discount)]))
-    check_tasks(batch_tasks([pendulum_task(0.0), pendulum_task(1.0, 1.0)]))
+    with pytest.raises(ss.InputError, match=match):
+        check_tasks(sc.batch_tasks([pendulum_task(0.0), pendulum_task(goal, discount)]))
+    check_tasks(sc.batch_tasks([pendulum_task(0.0), pendulum_task(1.0, 1.0)]))

@@ -12,27 +12,10 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from scipy import stats
 
-from helpers.families import (
-    EVERY,
-    GAUSSIAN,
-    HIGH,
-    LINEAR,
-    LOW,
-    NETWORK,
-    NOISE,
-    PLACE,
-    STEP,
-    TABLE,
-    WALLS,
-    Gusts,
-    radial,
-    vector,
-)
-from sidestep.continuous.dynamics import LinearGaussian
-from sidestep.continuous.obstacles import ObstacleMotion, RadialField, Walls, network_field, radial_field
-from sidestep.continuous.physical import Pendulum, PointMass
-from sidestep.continuous.tasks import PendulumTask
-from sidestep.errors import InputError
+import sidestep as ss
+import sidestep.continuous as sc
+from helpers import families
+from helpers.families import EVERY, GAUSSIAN, HIGH, LINEAR, LOW, NOISE, PLACE, STEP, TABLE, WALLS, vector
 
 pytestmark = pytest.mark.usefixtures("unoptimised")
 
@@ -206,7 +189,7 @@ def test_pendulum_matches_gymnasium(constants):
     random, environment = np.random.default_rng(0), gymnasium_pendulum(*constants)
     states = np.concatenate([random.uniform([-7, -8], [7, 8], (40, 2)), [[1.5, 7.99], [-1.5, -7.99]]])
     torques = random.uniform(-2, 2, (42, 1))
-    pendulum, task = Pendulum(*constants), PendulumTask(goal=jnp.zeros(()), discount=jnp.asarray(0.9))
+    pendulum, task = sc.Pendulum(*constants), sc.PendulumTask(goal=jnp.zeros(()), discount=jnp.asarray(0.9))
     means = jax.jit(jax.vmap(lambda *of: pendulum.outcomes(*of).means[0]))(jnp.asarray(states), jnp.asarray(torques))
     rewards = jax.jit(jax.vmap(task.reward))(jnp.asarray(states), jnp.asarray(torques))
     for state, torque, mean, reward in zip(states, torques, means, rewards, strict=True):
@@ -217,7 +200,7 @@ def test_pendulum_matches_gymnasium(constants):
 
 
 def test_pendulum_clips_torques_as_gymnasium():
-    environment, pendulum = gymnasium_pendulum(10.0, 1.0, 1.0), Pendulum()
+    environment, pendulum = gymnasium_pendulum(10.0, 1.0, 1.0), sc.Pendulum()
     for torque in (-5.0, 3.0):
         environment.state = np.array([0.3, -0.2])  # pyright: ignore[reportAttributeAccessIssue]
         environment.step(np.array([torque]))
@@ -226,13 +209,13 @@ def test_pendulum_clips_torques_as_gymnasium():
 
 
 def test_pendulum_constants_have_units_and_parameters_are_logarithms():
-    pendulum = Pendulum(9.0, 2.0, 0.5, unknown=("mass",))
+    pendulum = sc.Pendulum(9.0, 2.0, 0.5, unknown=("mass",))
     assert [float(pendulum.constant(name)) for name in ("gravity", "mass", "length")] == [9, pytest.approx(2), 0.5]
     assert {name: float(value) for name, value in pendulum.parameters.items()} == {"mass": pytest.approx(np.log(2))}
 
 
 def test_point_mass_step_follows_its_equations():
-    mass = PointMass(0.5, (0.3, -0.2), time_step=0.1)
+    mass = sc.PointMass(0.5, (0.3, -0.2), time_step=0.1)
     speed = np.array([-0.5, 1.5]) + 0.1 * (np.array([0.4 + 0.3, -1 - 0.2]) - 0.5 * np.array([-0.5, 1.5]))
     expected = np.concatenate([np.array([1, 2]) + 0.1 * speed, speed])
     log_probabilities, means = outcomes(mass, vector(1, 2, -0.5, 1.5), vector(0.4, -1))
@@ -245,8 +228,8 @@ def test_point_mass_step_follows_its_equations():
 
 def test_obstacle_motion_stops_or_slows_moves():
     """At the logit ln 3, a place is blocked with probability 3/4."""
-    field = RadialField(jnp.full(2, np.log(3.0)), jnp.asarray([[0.0, 0.0], [4.0, 4.0]]), 1.0)
-    stopping, slowing = (ObstacleMotion(field, LOW, HIGH, NOISE, stops=stops) for stops in (True, False))
+    field = sc.RadialField(jnp.full(2, np.log(3.0)), jnp.asarray([[0.0, 0.0], [4.0, 4.0]]), 1.0)
+    stopping, slowing = (sc.ObstacleMotion(field, LOW, HIGH, NOISE, stops=stops) for stops in (True, False))
     assert float(stopping.blocked(PLACE)) == pytest.approx(0.75)
     following = vector(1.4, 0.9)
     moved, stayed = (stats.norm.pdf(following, mean, NOISE).prod() for mean in (PLACE + STEP, PLACE))
@@ -259,7 +242,7 @@ def test_obstacle_motion_stops_or_slows_moves():
 @pytest.mark.parametrize("stops", [True, False])
 def test_obstacle_motion_blocks_at_the_target(stops):
     """Walls block at their border too, moves that start in one go on, and targets are clipped to the room."""
-    motion = ObstacleMotion(WALLS, LOW, HIGH, NOISE, stops=stops)
+    motion = sc.ObstacleMotion(WALLS, LOW, HIGH, NOISE, stops=stops)
 
     def mean(place, step):
         log_probabilities, means = outcomes(motion, vector(*place), vector(*step))
@@ -272,34 +255,34 @@ def test_obstacle_motion_blocks_at_the_target(stops):
 
 
 def test_walls_logit_is_high_in_boxes():
-    walls = Walls(low=jnp.asarray([[0.0, 0.0], [2.0, 2.0]]), high=jnp.asarray([[1.0, 1.0], [3.0, 3.0]]))
+    walls = sc.Walls(low=jnp.asarray([[0.0, 0.0], [2.0, 2.0]]), high=jnp.asarray([[1.0, 1.0], [3.0, 3.0]]))
     places = jnp.asarray([[0.5, 0.5], [1.0, 1.0], [1.5, 1.5], [2.5, 0.5], [2.5, 2.9]])
     assert jax.vmap(walls.inside)(places).tolist() == [True, True, False, False, True]
     assert jax.vmap(walls.logit)(places).tolist() == [12, 12, -12, -12, 12]
 
 
 def test_radial_field_logit_is_weighted_mean():
-    field = radial_field(LOW, HIGH, (3, 2), logit=-1.5)
+    field = sc.radial_field(LOW, HIGH, (3, 2), logit=-1.5)
     np.testing.assert_allclose(field.centers, [[x, y] for x in (0, 2, 4) for y in (0, 4)])
     assert float(field.logit(vector(1.3, 9))) == pytest.approx(-1.5)
-    narrow = RadialField(jnp.arange(6.0), field.centers, 0.1)
+    narrow = sc.RadialField(jnp.arange(6.0), field.centers, 0.1)
     for index, center in enumerate(narrow.centers):
         assert float(narrow.logit(center)) == pytest.approx(index)
     assert float(narrow.logit(vector(0, 2))) == pytest.approx(0.5)
     place, weights = vector(1, 1), np.exp(-np.sum((np.asarray(field.centers) - 1) ** 2, axis=1) / 2 / field.width**2)
     expected = np.arange(6) @ weights / weights.sum()
-    assert float(RadialField(jnp.arange(6.0), field.centers, field.width).logit(place)) == pytest.approx(expected)
+    assert float(sc.RadialField(jnp.arange(6.0), field.centers, field.width).logit(place)) == pytest.approx(expected)
 
 
 def test_network_field_begins_near_its_logit_with_all_gradients():
     places = jnp.asarray(np.random.default_rng(0).uniform(0, 4, (50, 2)))
-    logits = jax.jit(jax.vmap(NETWORK.logit))(places)
+    logits = jax.jit(jax.vmap(families.NETWORK.logit))(places)
     np.testing.assert_allclose(logits, 0.5, atol=1)
     assert (np.abs(evaluate("network, stopping").slope) > 0).all()
 
 
 def test_obstacle_motion_gradient_of_room_and_centers_is_0():
-    motion = radial(True)
+    motion = families.radial(True)
     slopes = jax.jit(jax.grad(lambda motion: motion.log_prob(PLACE, vector(5, 5), PLACE)))(motion)
     assert all(np.abs(leaf).max() == 0 for leaf in (slopes.low, slopes.high, slopes.field.centers))
     assert np.abs(slopes.parameters).max() > 0
@@ -309,7 +292,7 @@ def test_obstacle_motion_gradient_of_room_and_centers_is_0():
 
 
 def test_gaussian_dynamics_subclass_with_outcomes_has_mixture_density():
-    gusts = Gusts(jnp.log(vector(0.5, 0.3, 0.2)))
+    gusts = families.Gusts(jnp.log(vector(0.5, 0.3, 0.2)))
     log_probs = [float(log_prob(gusts, vector(1), vector(2), vector(x))) for x in (3.1, 4.0, 1.9)]
     winds, masses = np.array([0, 1, -1]), np.array([0.5, 0.3, 0.2])
     expected = stats.norm.pdf(np.array([3.1, 4.0, 1.9])[:, None], 3 + winds, 0.3) @ masses
@@ -320,54 +303,55 @@ def test_gaussian_dynamics_subclass_with_outcomes_has_mixture_density():
 
 
 def refused(make, *, match):
-    with pytest.raises(InputError, match=match):
+    with pytest.raises(ss.InputError, match=match):
         make()
 
 
 @pytest.mark.parametrize("noise", [vector(0.1, 0), vector(-1, 1), vector(np.nan, 1), vector(np.inf, 1)])
 def test_noise_not_above_0_is_refused(noise):
     match = "field 'noise': expected finite numbers above 0"
-    refused(lambda: LinearGaussian(jnp.eye(2), jnp.eye(2), noise), match=match)
-    refused(lambda: ObstacleMotion(WALLS, LOW, HIGH, noise), match=match)
-    refused(lambda: Pendulum(noise=tuple(noise.tolist())), match=match)
-    refused(lambda: PointMass(noise=(*noise.tolist(), 1.0, 1.0)), match=match)
+    refused(lambda: sc.LinearGaussian(jnp.eye(2), jnp.eye(2), noise), match=match)
+    refused(lambda: sc.ObstacleMotion(WALLS, LOW, HIGH, noise), match=match)
+    refused(lambda: sc.Pendulum(noise=tuple(noise.tolist())), match=match)
+    refused(lambda: sc.PointMass(noise=(*noise.tolist(), 1.0, 1.0)), match=match)
 
 
 @pytest.mark.parametrize(
     ("name", "wrong"), [("gravity", 0.0), ("mass", -1.0), ("length", np.nan), ("time_step", np.inf)]
 )
 def test_pendulum_constants_not_above_0_are_refused(name, wrong):
-    refused(lambda: Pendulum(**{name: wrong}), match=f"field '{name}': expected a finite number above 0, found {wrong}")
+    match = f"field '{name}': expected a finite number above 0, found {wrong}"
+    refused(lambda: sc.Pendulum(**{name: wrong}), match=match)
 
 
 def test_pendulum_unknown_name_is_refused():
-    refused(lambda: Pendulum(unknown=("color",)), match=r"'unknown': expected some of .*'length'.*, found .*color")
+    refused(lambda: sc.Pendulum(unknown=("color",)), match=r"'unknown': expected some of .*'length'.*, found .*color")
 
 
 def test_point_mass_bad_settings_are_refused():
-    refused(lambda: PointMass(friction=0.0), match="'friction': expected a finite number above 0, found 0")
-    refused(lambda: PointMass(time_step=-0.1), match="'time_step': expected a finite number above 0")
-    refused(lambda: PointMass(wind=(np.nan, 0.0)), match="'parameters': expected finite numbers")
+    refused(lambda: sc.PointMass(friction=0.0), match="'friction': expected a finite number above 0, found 0")
+    refused(lambda: sc.PointMass(time_step=-0.1), match="'time_step': expected a finite number above 0")
+    refused(lambda: sc.PointMass(wind=(np.nan, 0.0)), match="'parameters': expected finite numbers")
 
 
 def test_linear_gaussian_not_finite_is_refused():
-    refused(lambda: LinearGaussian(jnp.eye(2) * jnp.inf, jnp.eye(2), NOISE), match="'parameters': expected finite")
+    refused(lambda: sc.LinearGaussian(jnp.eye(2) * jnp.inf, jnp.eye(2), NOISE), match="'parameters': expected finite")
 
 
 @pytest.mark.parametrize(("low", "high"), [((0, 0), (1, 0)), ((2, 0), (1, 1)), ((0, np.nan), (1, 1))])
 def test_corners_out_of_order_are_refused(low, high):
     low, high = vector(*low), vector(*high)
     match = "field 'low, high': expected corners in order"
-    refused(lambda: ObstacleMotion(WALLS, low, high, NOISE), match=match)
-    refused(lambda: radial_field(low, high, (2, 2)), match=match)
-    refused(lambda: network_field(jax.random.key(0), low, high), match=match)
+    refused(lambda: sc.ObstacleMotion(WALLS, low, high, NOISE), match=match)
+    refused(lambda: sc.radial_field(low, high, (2, 2)), match=match)
+    refused(lambda: sc.network_field(jax.random.key(0), low, high), match=match)
 
 
 @pytest.mark.parametrize("counts", [(2,), (1, 3), (2, 2, 2), (0, 2)])
 def test_radial_field_fewer_than_two_centers_a_side_are_refused(counts):
-    refused(lambda: radial_field(LOW, HIGH, counts), match="'counts': expected 2 numbers of at least 2")
+    refused(lambda: sc.radial_field(LOW, HIGH, counts), match="'counts': expected 2 numbers of at least 2")
 
 
 def test_obstacle_motion_logits_not_finite_are_refused():
-    field = radial_field(LOW, HIGH, (2, 2), logit=np.nan)
-    refused(lambda: ObstacleMotion(field, LOW, HIGH, NOISE), match="'parameters': expected finite numbers")
+    field = sc.radial_field(LOW, HIGH, (2, 2), logit=np.nan)
+    refused(lambda: sc.ObstacleMotion(field, LOW, HIGH, NOISE), match="'parameters': expected finite numbers")

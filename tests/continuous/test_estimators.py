@@ -9,55 +9,36 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from helpers.small_worlds import (
-    ACTIONS,
-    GAIN,
-    OFFSET,
-    PLACES,
-    SPREAD,
-    STATES,
-    TASKS,
-    WHICH,
-    Linear,
-    entropies,
-    exact_policy,
-    exact_values,
-    linear,
-    policy_table,
-    table,
-    with_logits,
-)
-from sidestep.continuous.dynamics import LinearGaussian
-from sidestep.continuous.estimators import check_estimator, value_gradient, with_control_variates
-from sidestep.continuous.policies import Agent, Critic, FinitePolicy, ScaledNetwork, Starts
-from sidestep.continuous.rollouts import q_estimates, sample_rollouts
-from sidestep.continuous.tasks import task_at
-from sidestep.errors import InputError
-from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
+import sidestep as ss
+import sidestep.continuous as sc
+from helpers import small_worlds
+from helpers.small_worlds import ACTIONS, GAIN, OFFSET, PLACES, SPREAD, STATES, TASKS, WHICH, Linear, exact_values
+from sidestep.continuous.estimators import check_estimator, with_control_variates
+from sidestep.continuous.policies import ScaledNetwork
 
 pytestmark = [pytest.mark.usefixtures("unoptimised"), pytest.mark.slow]
 
 BETA, HORIZON = 2.0, 5
-TABLE, LINEAR = table(), linear()
-SOFT = Behavior(LogSumExp(), BETA)
-BEHAVIORS = {"log-sum-exp": SOFT, "Boltzmann": Behavior(BoltzmannAverage(), BETA)}
+TABLE, LINEAR = small_worlds.table(), small_worlds.linear()
+SOFT = ss.Behavior(ss.LogSumExp(), BETA)
+BEHAVIORS = {"log-sum-exp": SOFT, "Boltzmann": ss.Behavior(ss.BoltzmannAverage(), BETA)}
 WEIGHTS = jnp.asarray(np.random.default_rng(1).normal(size=(len(PLACES), ACTIONS)))
 COUNTS = (10, 100, 1000, 10000)
 EACH = 10  # rollouts of a candidate for one estimate
 MANY = 600  # estimates; always the same number, because each one is compiled for
 
 
-EVERYWHERE = Starts(task_at(TABLE.tasks, WHICH), PLACES, jnp.broadcast_to(jnp.arange(ACTIONS), WEIGHTS.shape))
+EVERYWHERE = sc.Starts(sc.task_at(TABLE.tasks, WHICH), PLACES, jnp.broadcast_to(jnp.arange(ACTIONS), WEIGHTS.shape))
 
 
 @eqx.filter_jit
 def estimates(world, behavior, keys, starts, level, tilt, critic=None, estimator="score", horizon=HORIZON):
     """Independent estimates of Σ (level + tilt · Q) ∇Q, in rows; each has `EACH` rollouts of a candidate."""
-    agent = Agent(world.dynamics, world.policy, behavior)
+    agent = sc.Agent(world.dynamics, world.policy, behavior)
     settings = {"horizon": horizon, "samples": EACH, "critic": critic, "estimator": estimator}
 
     def one(key):
-        return ravel_pytree(value_gradient(agent, starts, key, lambda q: level + tilt * q, **settings)[0])[0]
+        return ravel_pytree(sc.value_gradient(agent, starts, key, lambda q: level + tilt * q, **settings)[0])[0]
 
     return jax.lax.map(one, keys, batch_size=50)
 
@@ -91,18 +72,18 @@ def assert_falls_as_root(sample, exact):
     assert slope == pytest.approx(-0.5, abs=0.1)
 
 
-def critic_of(values) -> Critic:
+def critic_of(values) -> sc.Critic:
     """A critic with one value for every task and state of the table world, whatever the fraction left."""
     count = TASKS * STATES + 1
-    linear = eqx.nn.Linear(count, 1, use_bias=False, key=jax.random.key(0))
-    linear = eqx.tree_at(lambda layer: layer.weight, linear, jnp.append(values, 0)[None])
-    return Critic(ScaledNetwork(linear, jnp.zeros(count), jnp.ones(count)), jnp.zeros(()), jnp.ones(()))
+    layer = eqx.nn.Linear(count, 1, use_bias=False, key=jax.random.key(0))
+    layer = eqx.tree_at(lambda layer: layer.weight, layer, jnp.append(values, 0)[None])
+    return sc.Critic(ScaledNetwork(layer, jnp.zeros(count), jnp.ones(count)), jnp.zeros(()), jnp.ones(()))
 
 
 def exact_table(name, world, function=jnp.sum):
     """V of the policy, and the gradient of a function of Q[starts, candidates], by dynamic programming."""
-    pi = policy_table(world.policy)
-    bonus = entropies(pi) / BETA if name == "log-sum-exp" else 0.0
+    pi = small_worlds.policy_table(world.policy)
+    bonus = small_worlds.entropies(pi) / BETA if name == "log-sum-exp" else 0.0
 
     def total(parameters):
         values, q = exact_values(world, parameters, pi, HORIZON, bonus)
@@ -131,11 +112,11 @@ def test_value_gradient_score_in_table_is_unbiased_for_any_critic(in_table, crit
 
 
 def test_value_gradient_exact_critic_halves_the_variance():
-    pi = policy_table(TABLE.policy)
+    pi = small_worlds.policy_table(TABLE.policy)
     for _ in range(4):  # nearly to π ∝ exp βQ^π
-        _, q = exact_values(TABLE, TABLE.dynamics.parameters, pi, HORIZON, entropies(pi) / BETA)
+        _, q = exact_values(TABLE, TABLE.dynamics.parameters, pi, HORIZON, small_worlds.entropies(pi) / BETA)
         pi = jax.nn.softmax(BETA * q)
-    world = TABLE._replace(policy=with_logits(jnp.log(pi)))
+    world = TABLE._replace(policy=small_worlds.with_logits(jnp.log(pi)))
     values, _ = exact_table("log-sum-exp", world)
     without, with_critic = (
         drawn(4, MANY, world, SOFT, EVERYWHERE, WEIGHTS, critic=critic) for critic in (None, critic_of(values))
@@ -144,15 +125,15 @@ def test_value_gradient_exact_critic_halves_the_variance():
 
 
 def test_with_control_variates_exact_critic_removes_all_noise():
-    pi = exact_policy(TABLE, SOFT)
-    values, q = exact_values(TABLE, TABLE.dynamics.parameters, pi, 40, entropies(pi) / BETA)
-    agent = Agent(TABLE.dynamics, with_logits(jnp.log(pi)), SOFT)
+    pi = small_worlds.exact_policy(TABLE, SOFT)
+    values, q = exact_values(TABLE, TABLE.dynamics.parameters, pi, 40, small_worlds.entropies(pi) / BETA)
+    agent = sc.Agent(TABLE.dynamics, small_worlds.with_logits(jnp.log(pi)), SOFT)
 
     @eqx.filter_jit
     def estimate(critic):
-        rolled = sample_rollouts(agent, EVERYWHERE, jax.random.key(0), horizon=40, samples=20)
+        rolled = sc.sample_rollouts(agent, EVERYWHERE, jax.random.key(0), horizon=40, samples=20)
         known = with_control_variates(agent, rolled, critic)
-        return [q_estimates(each)[..., 0] for each in (rolled, known)]
+        return [sc.q_estimates(each)[..., 0] for each in (rolled, known)]
 
     plain, known = estimate(critic_of(values))
     assert plain.std(axis=-1).max() > 0.1
@@ -166,19 +147,20 @@ def test_value_gradient_weights_are_independent_of_gradients():
 
 
 def test_value_gradient_score_error_falls_as_root_of_rollouts():
-    one = Starts(task_at(TABLE.tasks, WHICH[:1]), PLACES[:1], jnp.ones((1, 1), int))
+    one = sc.Starts(sc.task_at(TABLE.tasks, WHICH[:1]), PLACES[:1], jnp.ones((1, 1), int))
     _, exact = exact_table("log-sum-exp", TABLE, lambda q: q[0, 1])
     assert_falls_as_root(drawn(6, 4000, TABLE, SOFT, one, jnp.ones((1, 1))), exact)
 
 
-AROUND = Starts(LINEAR.tasks, jnp.asarray([[1.0, 0.5], [-0.5, -1.0]]), jnp.asarray([[[0.5], [-1.0]], [[0.0], [1.5]]]))
+CANDIDATES = jnp.asarray([[[0.5], [-1.0]], [[0.0], [1.5]]])
+AROUND = sc.Starts(LINEAR.tasks, jnp.asarray([[1.0, 0.5], [-0.5, -1.0]]), CANDIDATES)
 WEIGHTS_AROUND = jnp.asarray([[1.0, -0.5], [0.3, 0.8]])
 
 
-def wrong_critic() -> Critic:
+def wrong_critic() -> sc.Critic:
     """A critic for the linear world, with random weights."""
     network = eqx.nn.MLP(3, 1, 8, 1, jnp.tanh, key=jax.random.key(5))
-    return Critic(ScaledNetwork(network, jnp.zeros(3), jnp.ones(3)), jnp.asarray(0.5), jnp.asarray(2.0))
+    return sc.Critic(ScaledNetwork(network, jnp.zeros(3), jnp.ones(3)), jnp.asarray(0.5), jnp.asarray(2.0))
 
 
 def expected_cost(mean, covariance, weight):
@@ -247,7 +229,8 @@ def choosing(noise) -> Linear:
     network = eqx.nn.Linear(2, len(PUSHES), key=jax.random.key(1))
     network = ScaledNetwork(jax.tree.map(lambda leaf: 3.0 * leaf, network), jnp.zeros(2), jnp.ones(2))
     state, action = LINEAR.dynamics.parameters["state"], LINEAR.dynamics.parameters["action"]
-    return Linear(LinearGaussian(state, action, jnp.full(2, noise)), LINEAR.tasks, FinitePolicy(network, PUSHES))
+    dynamics = sc.LinearGaussian(state, action, jnp.full(2, noise))
+    return Linear(dynamics, LINEAR.tasks, sc.FinitePolicy(network, PUSHES))
 
 
 def value_by_all_paths(policy):
@@ -284,23 +267,21 @@ def test_value_gradient_pathwise_and_score_agree_over_finite_actions():
 
 def short_gradient(**settings):
     """An estimate in the table, by default of two moves and rollouts."""
-    agent = Agent(TABLE.dynamics, TABLE.policy, SOFT)
-    return value_gradient(
-        agent, EVERYWHERE, jax.random.key(0), jnp.ones_like, **{"horizon": 2, "samples": 2, **settings}
-    )
+    agent, settings = sc.Agent(TABLE.dynamics, TABLE.policy, SOFT), {"horizon": 2, "samples": 2} | settings
+    return sc.value_gradient(agent, EVERYWHERE, jax.random.key(0), jnp.ones_like, **settings)
 
 
 def test_check_estimator_refuses_biased_ones():
     for dynamics, tasks in ((TABLE.dynamics, LINEAR.tasks), (LINEAR.dynamics, TABLE.tasks)):
         check_estimator("score", dynamics, tasks)
-        with pytest.raises(InputError, match=r"jump.*expected 'score'"):
+        with pytest.raises(ss.InputError, match=r"jump.*expected 'score'"):
             check_estimator("pathwise", dynamics, tasks)
     check_estimator("pathwise", LINEAR.dynamics, LINEAR.tasks)
-    with pytest.raises(InputError, match="jump"):
+    with pytest.raises(ss.InputError, match="jump"):
         short_gradient(estimator="pathwise")
 
 
 @pytest.mark.parametrize(("setting", "value"), [("horizon", 0), ("samples", 0)])
 def test_value_gradient_horizon_or_samples_below_1_are_refused(setting, value):
-    with pytest.raises(InputError, match=f"{setting}.*at least 1, found {value}"):
+    with pytest.raises(ss.InputError, match=f"{setting}.*at least 1, found {value}"):
         short_gradient(**{setting: value})

@@ -8,25 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.continuous.dynamics import LinearGaussian
-from sidestep.continuous.lattice import Lattice, LatticePlanner
-from sidestep.continuous.obstacles import ObstacleMotion, RadialField, Walls
-from sidestep.continuous.physical import Pendulum
-from sidestep.continuous.tasks import PendulumTask, reach_region
-from sidestep.errors import InputError
+import sidestep as ss
+import sidestep.continuous as sc
 from sidestep.tabular import solve as solver
-from sidestep.tabular.backups import Behavior, HardMax, LogSumExp
 
 pytestmark = pytest.mark.usefixtures("unoptimised")
 
-RANDOM, SOFT = np.random.default_rng(0), Behavior(LogSumExp(), 2.0)
-BOX = Lattice(jnp.asarray([-1.0, 2.0]), jnp.asarray([2.0, 4.0]), (4, 3))
-RING = Lattice(jnp.asarray([-np.pi]), jnp.asarray([np.pi]), (8,), (True,))
-CYLINDER = Lattice(jnp.asarray([-np.pi, -8.0]), jnp.asarray([np.pi, 8.0]), (12, 9), (True, False))
+RANDOM, SOFT = np.random.default_rng(0), ss.Behavior(ss.LogSumExp(), 2.0)
+BOX = sc.Lattice(jnp.asarray([-1.0, 2.0]), jnp.asarray([2.0, 4.0]), (4, 3))
+RING = sc.Lattice(jnp.asarray([-np.pi]), jnp.asarray([np.pi]), (8,), (True,))
+CYLINDER = sc.Lattice(jnp.asarray([-np.pi, -8.0]), jnp.asarray([np.pi, 8.0]), (12, 9), (True, False))
 
 
-tabular_model = eqx.filter_jit(LatticePlanner.tabular_model)
-action_values = eqx.filter_jit(LatticePlanner.action_values)
+tabular_model = eqx.filter_jit(sc.LatticePlanner.tabular_model)
+action_values = eqx.filter_jit(sc.LatticePlanner.action_values)
 solve = eqx.filter_jit(solver.solve)
 
 
@@ -94,16 +89,16 @@ def dense(model):
     return jnp.einsum("sak,sakt->sat", probabilities, jnp.eye(model.graph.states)[model.graph.successors])
 
 
-WALL = Walls(low=jnp.asarray([[0.2, 2.0]]), high=jnp.asarray([[0.8, 3.0]]))
+WALL = sc.Walls(low=jnp.asarray([[0.2, 2.0]]), high=jnp.asarray([[0.8, 3.0]]))
 MOVES = jnp.asarray([[1.0, 0.0], [0.0, -1.0], [-1.0, 1.0]])
 
 
 @pytest.mark.parametrize(("dynamics", "lattice", "actions"), [
-    (Pendulum(), CYLINDER, jnp.asarray([[-2.0], [0.0], [2.0]])),
-    (ObstacleMotion(WALL, BOX.low, BOX.high, jnp.full(2, 0.1)), BOX, MOVES / 3),
+    (sc.Pendulum(), CYLINDER, jnp.asarray([[-2.0], [0.0], [2.0]])),
+    (sc.ObstacleMotion(WALL, BOX.low, BOX.high, jnp.full(2, 0.1)), BOX, MOVES / 3),
 ])  # fmt: skip
 def test_tabular_model_probabilities_add_up_and_keep_the_mean(dynamics, lattice, actions):
-    model = tabular_model(LatticePlanner(dynamics, actions, SOFT, lattice))
+    model = tabular_model(sc.LatticePlanner(dynamics, actions, SOFT, lattice))
     transitions = np.asarray(dense(model))
     np.testing.assert_allclose(transitions.sum(axis=-1), 1, atol=1e-12)
     here = lattice.size // 2 + 1
@@ -113,9 +108,9 @@ def test_tabular_model_probabilities_add_up_and_keep_the_mean(dynamics, lattice,
 
 def test_tabular_model_outcomes_on_points_are_exact():
     """Moves of one step that are stopped by a field: the target or the place itself, and never outside."""
-    field = RadialField(jnp.asarray([1.0, -2.0]), jnp.asarray([[-1.0, 2.0], [2.0, 4.0]]), 1.0)
-    motion = ObstacleMotion(field, BOX.low, BOX.high, jnp.full(2, 0.1))
-    transitions = np.asarray(dense(tabular_model(LatticePlanner(motion, MOVES, SOFT, BOX))))
+    field = sc.RadialField(jnp.asarray([1.0, -2.0]), jnp.asarray([[-1.0, 2.0], [2.0, 4.0]]), 1.0)
+    motion = sc.ObstacleMotion(field, BOX.low, BOX.high, jnp.full(2, 0.1))
+    transitions = np.asarray(dense(tabular_model(sc.LatticePlanner(motion, MOVES, SOFT, BOX))))
     points = np.asarray(BOX.points())
     expected = np.zeros_like(transitions)
     for state, place in enumerate(points):
@@ -132,9 +127,9 @@ def test_tabular_model_outcomes_on_points_are_exact():
 # Values
 
 
-WALK = LinearGaussian(jnp.eye(1), jnp.eye(1), jnp.full(1, 0.1))
-LINE = Lattice(jnp.zeros(1), jnp.full(1, 9.0), (10,))
-WALKER = LatticePlanner(WALK, jnp.asarray([[-1.0], [1.0]]), SOFT, LINE)
+WALK = sc.LinearGaussian(jnp.eye(1), jnp.eye(1), jnp.full(1, 0.1))
+LINE = sc.Lattice(jnp.zeros(1), jnp.full(1, 9.0), (10,))
+WALKER = sc.LatticePlanner(WALK, jnp.asarray([[-1.0], [1.0]]), SOFT, LINE)
 
 
 def test_solve_corridor_with_step_cost_matches_closed_form():
@@ -142,7 +137,7 @@ def test_solve_corridor_with_step_cost_matches_closed_form():
 
     So Z(k) ∝ xᵏ + x¹⁹⁻ᵏ with x = e⁻² (1 + x²).
     """
-    task = WALKER.tabular_task(reach_region((0.0,), 0.5, discount=1.0, step_cost=1.0))
+    task = WALKER.tabular_task(sc.reach_region((0.0,), 0.5, discount=1.0, step_cost=1.0))
     solution = solve(tabular_model(WALKER), task, SOFT)
     x = (1 - np.sqrt(1 - 4 * np.exp(-4))) / (2 * np.exp(-2))
     steps = np.arange(10)
@@ -154,8 +149,8 @@ def test_solve_corridor_with_step_cost_matches_closed_form():
 @pytest.mark.parametrize("stride", [1.0, 0.5])
 def test_solve_corridor_with_goal_reward_matches_closed_form(stride):
     """Strides of a whole step are worth γᵏ; of half a step, x̄ = γ (x̄ + 1)/2 a point, for values are interpolated."""
-    goal, walker = reach_region((0.0,), 0.25, discount=0.9), replace(WALKER, actions=stride * WALKER.actions)
-    solution = solve(tabular_model(walker), walker.tabular_task(goal), Behavior(HardMax()))
+    goal, walker = sc.reach_region((0.0,), 0.25, discount=0.9), replace(WALKER, actions=stride * WALKER.actions)
+    solution = solve(tabular_model(walker), walker.tabular_task(goal), ss.Behavior(ss.HardMax()))
     rate = 0.9 if stride == 1 else 0.45 / 0.55
     np.testing.assert_allclose(solution.values, rate ** np.arange(10), atol=1e-8)
     q = jax.vmap(lambda place: action_values(walker, goal, solution.values, place))(LINE.points())
@@ -163,16 +158,16 @@ def test_solve_corridor_with_goal_reward_matches_closed_form(stride):
 
 
 def test_action_values_between_points_look_one_move_ahead():
-    task = PendulumTask(goal=jnp.zeros(()), discount=jnp.asarray(0.9))
+    task = sc.PendulumTask(goal=jnp.zeros(()), discount=jnp.asarray(0.9))
     state, torques = jnp.asarray([0.3, 0.5]), jnp.asarray([[-1.0], [1.0]])
     values = 1 + 2 * CYLINDER.points()[:, 1]
-    q = action_values(LatticePlanner(Pendulum(), torques, SOFT, CYLINDER), task, values, state)
+    q = action_values(sc.LatticePlanner(sc.Pendulum(), torques, SOFT, CYLINDER), task, values, state)
     speeds = 0.5 + (15 * np.sin(0.3) + 3 * np.array([-1, 1])) * 0.05
     np.testing.assert_allclose(q, -(0.3**2) - 0.1 * 0.5**2 - 0.001 + 0.9 * (1 + 2 * speeds), atol=1e-12)
 
 
 def test_tabular_task_reads_rewards_and_ends_at_points():
-    table = WALKER.tabular_task(reach_region((0.0,), 0.5, discount=0.9))
+    table = WALKER.tabular_task(sc.reach_region((0.0,), 0.5, discount=0.9))
     np.testing.assert_array_equal(table.terminal, np.arange(10) == 0)
     np.testing.assert_array_equal(table.terminal_reward, np.ones(10))
     np.testing.assert_array_equal(table.reward, np.zeros((10, 2)))
@@ -185,11 +180,11 @@ def test_tabular_task_reads_rewards_and_ends_at_points():
     ("low", "high"), [([0, 0], [1, 0]), ([0, 2], [1, 1]), ([0, 0], [1, np.inf]), ([np.nan, 0], [1, 1])]
 )
 def test_lattice_corners_out_of_order_are_refused(low, high):
-    with pytest.raises(InputError, match="field 'low, high': expected corners in order"):
-        Lattice(jnp.asarray(low, float), jnp.asarray(high, float), (2, 2))
+    with pytest.raises(ss.InputError, match="field 'low, high': expected corners in order"):
+        sc.Lattice(jnp.asarray(low, float), jnp.asarray(high, float), (2, 2))
 
 
 @pytest.mark.parametrize(("counts", "periodic"), [((1, 2), None), ((2,), None), ((2, 2, 2), None), ((2, 2), (True,))])
 def test_lattice_fewer_than_two_points_a_side_are_refused(counts, periodic):
-    with pytest.raises(InputError, match="field 'counts': expected 2 numbers of at least 2"):
-        Lattice(jnp.zeros(2), jnp.ones(2), counts, periodic)
+    with pytest.raises(ss.InputError, match="field 'counts': expected 2 numbers of at least 2"):
+        sc.Lattice(jnp.zeros(2), jnp.ones(2), counts, periodic)

@@ -10,44 +10,29 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from scipy.linalg import solve_discrete_are
 
-from helpers.small_worlds import (
-    ACTIONS,
-    PLACES,
-    STATES,
-    TASKS,
-    WHICH,
-    entropies,
-    exact_policy,
-    exact_values,
-    linear,
-    policy_table,
-    table,
-    table_policy,
-    with_logits,
-)
-from sidestep.continuous.planner import Planner, PlannerState, PlanProgress, PolicyPlan, minibatches, plan_policy
-from sidestep.continuous.policies import Agent, gaussian_policy
-from sidestep.continuous.tasks import task_at
-from sidestep.errors import InputError, NotConverged
-from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax, LogSumExp, Mellowmax
+import sidestep as ss
+import sidestep.continuous as sc
+from helpers import small_worlds
+from helpers.small_worlds import ACTIONS, PLACES, STATES, TASKS, WHICH, entropies, exact_values, policy_table
+from sidestep.continuous.planner import minibatches
 
 pytestmark = [pytest.mark.usefixtures("unoptimised"), pytest.mark.slow]
 
-WORLD, BETA = table(), 1.5
-SOFT, OPTIMAL = Behavior(LogSumExp(), BETA), Behavior(HardMax(), BETA)
+WORLD, BETA = small_worlds.table(), 1.5
+SOFT, OPTIMAL = ss.Behavior(ss.LogSumExp(), BETA), ss.Behavior(ss.HardMax(), BETA)
 BEHAVIORS = {
     "log-sum-exp": SOFT,
-    "Boltzmann": Behavior(BoltzmannAverage(), BETA),
-    "mellowmax": Behavior(Mellowmax(), BETA),
+    "Boltzmann": ss.Behavior(ss.BoltzmannAverage(), BETA),
+    "mellowmax": ss.Behavior(ss.Mellowmax(), BETA),
 }
 HERE = len(PLACES)  # as many as there are, so that every step tries each start once
-PLANNER = Planner(horizon=15, batch_size=HERE, samples=8, learning_rate=0.02, critic_rate=0.02, critic_width=8)
-UNIFORM = table_policy(ACTIONS, TASKS * STATES)
+PLANNER = sc.Planner(horizon=15, batch_size=HERE, samples=8, learning_rate=0.02, critic_rate=0.02, critic_width=8)
+UNIFORM = small_worlds.table_policy(ACTIONS, TASKS * STATES)
 
 
-def planned(behavior, policy=UNIFORM, planner=PLANNER, *, steps, **settings) -> PolicyPlan:
-    agent = Agent(WORLD.dynamics, policy, behavior)
-    return plan_policy(agent, WORLD.tasks, PLACES, WHICH, planner, steps=steps, **settings)
+def planned(behavior, policy=UNIFORM, planner=PLANNER, *, steps, **settings) -> sc.PolicyPlan:
+    agent = sc.Agent(WORLD.dynamics, policy, behavior)
+    return sc.plan_policy(agent, WORLD.tasks, PLACES, WHICH, planner, steps=steps, **settings)
 
 
 def divergence(pi, other):
@@ -56,16 +41,16 @@ def divergence(pi, other):
 
 
 @pytest.fixture(scope="module")
-def initial() -> PlannerState:
+def initial() -> sc.PlannerState:
     """PlannerState at its start, from the uniform policy."""
-    agent = Agent(WORLD.dynamics, UNIFORM, SOFT)
-    return PLANNER.initialize(jax.random.key(0), agent, task_at(WORLD.tasks, WHICH), PLACES)
+    agent = sc.Agent(WORLD.dynamics, UNIFORM, SOFT)
+    return PLANNER.initialize(jax.random.key(0), agent, sc.task_at(WORLD.tasks, WHICH), PLACES)
 
 
 @pytest.fixture(scope="module")
 def exact():
     """The policies of all soft agents."""
-    return {name: np.asarray(exact_policy(WORLD, behavior)) for name, behavior in BEHAVIORS.items()}
+    return {name: np.asarray(small_worlds.exact_policy(WORLD, behavior)) for name, behavior in BEHAVIORS.items()}
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +72,7 @@ def test_plan_policy_soft_agent_converges_to_its_own_exact_policy(name, plans, e
 
 
 def test_plan_policy_optimal_agent_chooses_the_best_actions(initial):
-    best = np.asarray(exact_policy(WORLD, OPTIMAL)).argmax(axis=-1)[WHICH, PLACES]
+    best = np.asarray(small_worlds.exact_policy(WORLD, OPTIMAL)).argmax(axis=-1)[WHICH, PLACES]
     pi = np.asarray(policy_table(planned(OPTIMAL, warm_start=initial, steps=150).policy))[WHICH, PLACES]
     assert (pi.argmax(axis=-1) == best).all()
     assert pi.max(axis=-1).min() > 0.9
@@ -116,14 +101,12 @@ def optimal_control(task, dynamics):
 
 
 def test_plan_policy_gaussian_policy_matches_maximum_entropy_control():
-    dynamics, tasks, _ = linear(goals=((0.0, 0.0),))
+    dynamics, tasks, _ = small_worlds.linear(goals=((0.0, 0.0),))
     starts = jax.random.normal(jax.random.key(1), (256, 2))
-    planner = Planner(
-        horizon=12, batch_size=16, samples=2, candidates=16, critic_width=8, learning_rate=0.015, critic_rate=0.02
-    )
-    policy = gaussian_policy(jax.random.key(2), 1, starts, depth=0)
-    result = plan_policy(Agent(dynamics, policy, SOFT), tasks, starts, jnp.zeros(256, int), planner, steps=250)
-    gain, spread = optimal_control(task_at(tasks, 0), dynamics)
+    planner = sc.Planner(12, 16, samples=2, candidates=16, critic_width=8, learning_rate=0.015, critic_rate=0.02)
+    policy = sc.gaussian_policy(jax.random.key(2), 1, starts, depth=0)
+    result = sc.plan_policy(sc.Agent(dynamics, policy, SOFT), tasks, starts, jnp.zeros(256, int), planner, steps=250)
+    gain, spread = optimal_control(sc.task_at(tasks, 0), dynamics)
     mean, middle = result.policy.network, jnp.zeros(2)
     close = 0.05 * np.linalg.norm(gain)
     assert np.linalg.norm(jax.jacobian(mean)(middle) - gain) < close
@@ -131,12 +114,12 @@ def test_plan_policy_gaussian_policy_matches_maximum_entropy_control():
     np.testing.assert_allclose(jnp.exp(result.policy.log_spread), spread, rtol=0.1)
 
 
-PRECISE = Planner(horizon=6, batch_size=HERE, samples=1000, critic_width=8)
+PRECISE = sc.Planner(horizon=6, batch_size=HERE, samples=1000, critic_width=8)
 
 
-def figures_of(behavior, pi, initial) -> PlanProgress:
+def figures_of(behavior, pi, initial) -> sc.PlanProgress:
     """The figures of a policy, by many rollouts."""
-    state = eqx.tree_at(lambda state: state.policy, initial, with_logits(jnp.log(pi)))
+    state = eqx.tree_at(lambda state: state.policy, initial, small_worlds.with_logits(jnp.log(pi)))
     return planned(behavior, planner=PRECISE, steps=1, warm_start=state).history[0]
 
 
@@ -219,34 +202,34 @@ def test_initialize_critic_begins_at_the_mean_return(initial):
 @pytest.mark.parametrize("name", ["horizon", "batch_size", "samples", "candidates", "critic_width", "critic_steps"])
 def test_planner_refuses_counts_that_are_too_small(name):
     least = 2 if name == "samples" else 1
-    with pytest.raises(InputError, match=f"{name}.*at least {least}, found {least - 1}"):
-        Planner(**{"horizon": 2, name: least - 1})
+    with pytest.raises(ss.InputError, match=f"{name}.*at least {least}, found {least - 1}"):
+        sc.Planner(**{"horizon": 2, name: least - 1})
 
 
 @pytest.mark.parametrize(("name", "rate"), [("learning_rate", 0.0), ("critic_rate", float("nan"))])
 def test_planner_refuses_rates_not_above_0(name, rate):
-    with pytest.raises(InputError, match=f"{name}.*finite number above 0"):
-        Planner(horizon=2, **{name: rate})
+    with pytest.raises(ss.InputError, match=f"{name}.*finite number above 0"):
+        sc.Planner(horizon=2, **{name: rate})
 
 
 def test_plan_policy_refuses_bad_starts():
-    agent, tasks = Agent(WORLD.dynamics, UNIFORM, SOFT), WORLD.tasks
+    agent, tasks = sc.Agent(WORLD.dynamics, UNIFORM, SOFT), WORLD.tasks
 
     def planned_from(states, which, steps=1):
-        return plan_policy(agent, tasks, states, which, PLANNER, steps=steps)
+        return sc.plan_policy(agent, tasks, states, which, PLANNER, steps=steps)
 
-    with pytest.raises(InputError, match=r"steps.*at least 1"):
+    with pytest.raises(ss.InputError, match=r"steps.*at least 1"):
         planned_from(PLACES, WHICH, steps=0)
-    with pytest.raises(InputError, match=r"states.*row 2.*finite"):
+    with pytest.raises(ss.InputError, match=r"states.*row 2.*finite"):
         planned_from(jnp.asarray([0.0, jnp.nan]), WHICH[:2])
-    with pytest.raises(InputError, match="found 0 and 0"):
+    with pytest.raises(ss.InputError, match="found 0 and 0"):
         planned_from(PLACES[:0], WHICH[:0])
-    with pytest.raises(InputError, match=r"task.*0…1"):
+    with pytest.raises(ss.InputError, match=r"task.*0…1"):
         planned_from(PLACES[:2], jnp.asarray([0, 2]))
-    with pytest.raises(InputError, match=r"states.*row 2.*has not ended"):
+    with pytest.raises(ss.InputError, match=r"states.*row 2.*has not ended"):
         planned_from(jnp.asarray([0, 4]), jnp.zeros(2, int))
-    with pytest.raises(InputError, match="has not ended"):
-        PLANNER.initialize(jax.random.key(0), agent, task_at(tasks, jnp.zeros(2, int)), jnp.asarray([4, 4]))
+    with pytest.raises(ss.InputError, match="has not ended"):
+        PLANNER.initialize(jax.random.key(0), agent, sc.task_at(tasks, jnp.zeros(2, int)), jnp.asarray([4, 4]))
 
 
 def test_minibatches_hold_every_move_and_are_disjoint():
@@ -261,21 +244,21 @@ def test_minibatches_hold_every_move_and_are_disjoint():
 
 
 def test_fit_critic_with_horizon_1_keeps_the_critic():
-    planner = Planner(horizon=1, batch_size=HERE, samples=2, critic_width=8)
+    planner = sc.Planner(horizon=1, batch_size=HERE, samples=2, critic_width=8)
     result = planned(SOFT, planner=planner, steps=3)
     assert result.planner_state.critic_moments[0].count == 0
     assert result.planner_state.policy_moments[0].count == 3
 
 
 def test_plan_policy_figures_not_finite_raise(initial):
-    nowhere = with_logits(jnp.nan * jnp.zeros((TASKS, STATES, ACTIONS)))
+    nowhere = small_worlds.with_logits(jnp.nan * jnp.zeros((TASKS, STATES, ACTIONS)))
     broken = eqx.tree_at(lambda state: state.policy, initial, nowhere)
-    with pytest.raises(NotConverged, match="step 0"):
+    with pytest.raises(ss.NotConverged, match="step 0"):
         planned(SOFT, warm_start=broken, steps=1)
 
 
 def test_plan_policy_mellowmax_over_vectors_is_refused():
-    dynamics, tasks, policy = linear()
-    agent = Agent(dynamics, policy, BEHAVIORS["mellowmax"])
-    with pytest.raises(InputError, match="mellowmax"):
-        plan_policy(agent, tasks, jnp.zeros((2, 2)), jnp.arange(2), PLANNER, steps=1)
+    dynamics, tasks, policy = small_worlds.linear()
+    agent = sc.Agent(dynamics, policy, BEHAVIORS["mellowmax"])
+    with pytest.raises(ss.InputError, match="mellowmax"):
+        sc.plan_policy(agent, tasks, jnp.zeros((2, 2)), jnp.arange(2), PLANNER, steps=1)

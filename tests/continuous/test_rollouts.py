@@ -8,23 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import sidestep as ss
+import sidestep.continuous as sc
 from helpers.small_worlds import ACTIONS, ENDS, PLACES, WHICH, entropies, exact_values, policy_table, table
-from sidestep.continuous.policies import Agent, Starts
-from sidestep.continuous.rollouts import (
-    Rollout,
-    discounted_returns,
-    q_estimates,
-    returns_to_go,
-    sample_rollout,
-    sample_rollouts,
-)
-from sidestep.continuous.tasks import task_at
-from sidestep.tabular.backups import Behavior, LogSumExp
 
 pytestmark = pytest.mark.usefixtures("unoptimised")
 
 WORLD, HORIZON, BETA, SAMPLES = table(), 6, 2.0, 300
-AGENT = Agent(WORLD.dynamics, WORLD.policy, Behavior(LogSumExp(), BETA))
+AGENT = sc.Agent(WORLD.dynamics, WORLD.policy, ss.Behavior(ss.LogSumExp(), BETA))
 PI = np.asarray(policy_table(WORLD.policy))
 BONUS = entropies(PI) / BETA
 ALL = jnp.append(PLACES, jnp.asarray([4, 0]))  # also where the first task has ended, and the first place once more
@@ -33,18 +24,18 @@ OPTIONS = jnp.asarray([0, 1, 2, 1])  # one of them twice
 
 
 @eqx.filter_jit
-def sample_all(key) -> Rollout:
-    starts = Starts(task_at(WORLD.tasks, OWN), ALL, jnp.broadcast_to(OPTIONS, (len(ALL), len(OPTIONS))))
-    return sample_rollouts(AGENT, starts, key, HORIZON, SAMPLES)
+def sample_all(key) -> sc.Rollout:
+    starts = sc.Starts(sc.task_at(WORLD.tasks, OWN), ALL, jnp.broadcast_to(OPTIONS, (len(ALL), len(OPTIONS))))
+    return sc.sample_rollouts(AGENT, starts, key, HORIZON, SAMPLES)
 
 
 @pytest.fixture(scope="module")
-def rolled() -> Rollout:
+def rolled() -> sc.Rollout:
     """Many rollouts, in plain arrays."""
     return jax.tree.map(np.asarray, sample_all(jax.random.key(0)))
 
 
-def one_by_one(rolled: Rollout) -> list[SimpleNamespace]:
+def one_by_one(rolled: sc.Rollout) -> list[SimpleNamespace]:
     """Rollouts in plain arrays."""
     names = "states", "choices", "rewards", "bonuses", "transition_control_variates", "acting"
     parts = (np.asarray(getattr(rolled, name)) for name in names)
@@ -90,7 +81,7 @@ def test_returns_to_go_q_estimates_and_discounted_returns_are_plain_sums(rolled)
     discounts = np.broadcast_to(np.array([0.8, 1.0])[:, None, None], few.bonuses.shape[:-1])
     variates = np.random.default_rng(0).normal(size=few.bonuses.shape)
     few = eqx.tree_at(lambda few: (few.transition_control_variates, few.task.discount), few, (variates, discounts))
-    sums = [np.asarray(function(few)) for function in (returns_to_go, discounted_returns, q_estimates)]
+    sums = [np.asarray(function(few)) for function in (sc.returns_to_go, sc.discounted_returns, sc.q_estimates)]
     sums = [part.reshape(-1, *part.shape[3:]) for part in sums]
     plain = one_by_one(few)
     for index, each in enumerate(plain):
@@ -107,18 +98,18 @@ def test_returns_to_go_q_estimates_and_discounted_returns_are_plain_sums(rolled)
 
 def test_q_estimates_average_to_exact_action_values(rolled):
     _, q = exact_values(WORLD, WORLD.dynamics.parameters, PI, HORIZON, BONUS)
-    estimates = np.asarray(q_estimates(rolled))[: len(PLACES), :ACTIONS, :, 0]
+    estimates = np.asarray(sc.q_estimates(rolled))[: len(PLACES), :ACTIONS, :, 0]
     error = estimates.std(axis=-1) / np.sqrt(SAMPLES)
     assert error.max() < 0.2
     np.testing.assert_array_less(np.abs(estimates.mean(axis=-1) - np.asarray(q)[WHICH, PLACES]), 3 * error)
 
 
 def test_sample_rollout_without_choice_draws_it_from_the_policy():
-    task, state = task_at(WORLD.tasks, 0), jnp.asarray(1)
+    task, state = sc.task_at(WORLD.tasks, 0), jnp.asarray(1)
 
     def total(key):
-        each = sample_rollout(AGENT, task, key, state, HORIZON)
-        return returns_to_go(each)[0], each.choices[0]
+        each = sc.sample_rollout(AGENT, task, key, state, HORIZON)
+        return sc.returns_to_go(each)[0], each.choices[0]
 
     drawn = jax.jit(jax.vmap(total))(jax.random.split(jax.random.key(1), 2000))
     totals, choices = map(np.asarray, drawn)

@@ -5,36 +5,28 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sidestep.continuous.lattice import Lattice, LatticePlanner
-from sidestep.continuous.obstacles import ObstacleMotion, Walls
-from sidestep.continuous.physical import Pendulum
-from sidestep.continuous.simulation import gather_trajectories, simulate_trajectories
-from sidestep.continuous.tasks import PendulumTask, batch_tasks, reach_region
-from sidestep.errors import ImproperTask, InputError, NotConverged
-from sidestep.tabular.backups import Behavior, LogSumExp
-from sidestep.tabular.demonstrations import Trajectory
-from sidestep.tabular.solve import SolveOptions, solve
-from sidestep.tabular.solvers.jacobi import Jacobi
+import sidestep as ss
+import sidestep.continuous as sc
 
 pytestmark = pytest.mark.usefixtures("unoptimised")
 
 KEY = jax.random.key(0)
 LOW, HIGH = jnp.zeros(2), jnp.full(2, 6.0)
-WALL = Walls(low=jnp.asarray([[2.4, 0.0]]), high=jnp.asarray([[3.6, 4.0]]))
-ROOM = ObstacleMotion(WALL, LOW, HIGH, jnp.full(2, 0.05))
-SQUARES = Lattice(LOW, HIGH, (13, 13))
+WALL = sc.Walls(low=jnp.asarray([[2.4, 0.0]]), high=jnp.asarray([[3.6, 4.0]]))
+ROOM = sc.ObstacleMotion(WALL, LOW, HIGH, jnp.full(2, 0.05))
+SQUARES = sc.Lattice(LOW, HIGH, (13, 13))
 WAYS = jnp.asarray([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-GOALS = [reach_region(goal, 0.8, discount=1.0, step_cost=1.0) for goal in ((5.0, 1.0), (1.0, 1.0))]
+GOALS = [sc.reach_region(goal, 0.8, discount=1.0, step_cost=1.0) for goal in ((5.0, 1.0), (1.0, 1.0))]
 RANDOM = np.random.default_rng(0)
 COUNT = 1000
 STARTS = [RANDOM.uniform([0.2, 0.2], [1.8, 3.0], (COUNT, 2)), RANDOM.uniform([4.0, 0.2], [5.8, 3.0], (COUNT, 2))]
-SHARP, SOFT = Behavior(LogSumExp(), 40.0), Behavior(LogSumExp(), 2.0)
+SHARP, SOFT = ss.Behavior(ss.LogSumExp(), 40.0), ss.Behavior(ss.LogSumExp(), 2.0)
 
 
 def simulate(believed, behavior, tasks=1, starts=STARTS, options=None):
     """Walks to the first goals; always the same number and length, so that this is compiled once."""
-    agent = LatticePlanner(believed, WAYS, behavior, SQUARES)
-    return simulate_trajectories(KEY, agent, ROOM, GOALS[:tasks], starts[:tasks], 30, options)
+    agent = sc.LatticePlanner(believed, WAYS, behavior, SQUARES)
+    return sc.simulate_trajectories(KEY, agent, ROOM, GOALS[:tasks], starts[:tasks], 30, options)
 
 
 def targets(walks):
@@ -70,7 +62,7 @@ def test_simulate_trajectories_known_wall_is_never_a_target(walks):
 
 
 def test_gather_trajectories_keeps_every_move(walks):
-    demonstrations = gather_trajectories(walks, GOALS)
+    demonstrations = sc.gather_trajectories(walks, GOALS)
     assert demonstrations.trajectories == 2 * COUNT
     assert len(demonstrations) == sum(len(walk.actions) for walk in walks)
     ends = np.append(np.diff(demonstrations.trajectory) > 0, True)
@@ -85,7 +77,7 @@ def test_gather_trajectories_keeps_every_move(walks):
 
 def test_simulate_trajectories_unknown_wall_is_run_into():
     misled = simulate(
-        ObstacleMotion(Walls(low=WALL.low + 90, high=WALL.high + 90), LOW, HIGH, jnp.full(2, 0.05)), SHARP
+        sc.ObstacleMotion(sc.Walls(low=WALL.low + 90, high=WALL.high + 90), LOW, HIGH, jnp.full(2, 0.05)), SHARP
     )
     assert len(misled) == COUNT
     assert in_wall(targets(misled)).mean() > 0.5
@@ -102,8 +94,8 @@ def test_simulate_trajectories_start_at_goal_gives_none():
 def test_simulate_trajectories_soft_choices_match_action_values():
     place = np.array([4.2, 4.0])
     walking = simulate(ROOM, SOFT, starts=[np.tile(place, (COUNT, 1))])
-    agent = LatticePlanner(ROOM, WAYS, SOFT, SQUARES)
-    values = solve(agent.tabular_model(), agent.tabular_task(GOALS[0]), SOFT).values
+    agent = sc.LatticePlanner(ROOM, WAYS, SOFT, SQUARES)
+    values = ss.solve(agent.tabular_model(), agent.tabular_task(GOALS[0]), SOFT).values
     q = np.asarray(agent.action_values(GOALS[0], values, jnp.asarray(place)))
     odds = np.exp(2 * (q - q.max()))
     frequencies = np.bincount([walk.actions[0] for walk in walking], minlength=4) / COUNT
@@ -114,14 +106,12 @@ def test_simulate_trajectories_soft_choices_match_action_values():
 @pytest.mark.slow
 def test_simulate_trajectories_wrong_gravity_changes_actions():
     """Agents that believe in less gravity push less, and hold it lower; it swings as the real one."""
-    lattice = Lattice(jnp.asarray([-np.pi, -8.0]), jnp.asarray([np.pi, 8.0]), (20, 17), (True, False))
-    goal, torques, real = np.pi - 0.4, jnp.linspace(-2, 2, 5)[:, None], Pendulum(10.0)
-    task, starts = PendulumTask(jnp.asarray(goal), jnp.asarray(0.9)), RANDOM.normal([goal, 0], 0.1, (8, 2))
+    lattice = sc.Lattice(jnp.asarray([-np.pi, -8.0]), jnp.asarray([np.pi, 8.0]), (20, 17), (True, False))
+    goal, torques, real = np.pi - 0.4, jnp.linspace(-2, 2, 5)[:, None], sc.Pendulum(10.0)
+    task, starts = sc.PendulumTask(jnp.asarray(goal), jnp.asarray(0.9)), RANDOM.normal([goal, 0], 0.1, (8, 2))
     right, light = (
-        simulate_trajectories(
-            KEY, LatticePlanner(Pendulum(gravity), torques, SHARP, lattice), real, [task], [starts], 30
-        )
-        for gravity in (10.0, 2.0)
+        sc.simulate_trajectories(KEY, agent, real, [task], [starts], 30)
+        for agent in (sc.LatticePlanner(sc.Pendulum(gravity), torques, SHARP, lattice) for gravity in (10.0, 2.0))
     )
     pushes = [np.mean([np.asarray(torques)[walk.actions].mean() for walk in walks]) for walks in (right, light)]
     assert pushes[0] + 0.2 < pushes[1] < 0
@@ -137,49 +127,49 @@ def test_simulate_trajectories_wrong_gravity_changes_actions():
 
 
 def test_simulate_trajectories_bad_starts_are_refused():
-    with pytest.raises(InputError, match="starts of task 0: expected rows of 2 finite numbers"):
+    with pytest.raises(ss.InputError, match="starts of task 0: expected rows of 2 finite numbers"):
         simulate(ROOM, SHARP, starts=[np.array([[1.0, np.nan]])])
-    with pytest.raises(InputError, match="starts of task 0: expected rows of 2 finite numbers"):
+    with pytest.raises(ss.InputError, match="starts of task 0: expected rows of 2 finite numbers"):
         simulate(ROOM, SHARP, starts=[np.ones((2, 3))])
-    with pytest.raises(InputError, match="'starts': expected as many as tasks, found 0 for 1"):
+    with pytest.raises(ss.InputError, match="'starts': expected as many as tasks, found 0 for 1"):
         simulate(ROOM, SHARP, starts=[])
 
 
 def test_simulate_trajectories_improper_task_is_refused():
     """At β = 1/2 and four actions, every step is worth ln 4/β − 1 > 0."""
-    with pytest.raises(ImproperTask, match="an endless path is worth more"):
-        simulate(ROOM, Behavior(LogSumExp(), 0.5))
+    with pytest.raises(ss.ImproperTask, match="an endless path is worth more"):
+        simulate(ROOM, ss.Behavior(ss.LogSumExp(), 0.5))
 
 
 def test_simulate_trajectories_values_not_converged_raise():
-    options = SolveOptions(solver=Jacobi(max_sweeps=2))
-    with pytest.raises(NotConverged, match=r"values did not converge for task 0: a finer lattice or a smaller β"):
+    options = ss.SolveOptions(solver=ss.Jacobi(max_sweeps=2))
+    with pytest.raises(ss.NotConverged, match=r"values did not converge for task 0: a finer lattice or a smaller β"):
         simulate(ROOM, SHARP, options=options)
 
 
-ONE = Trajectory(np.zeros((3, 2)), np.array([0, 1]), 0)
+ONE = ss.Trajectory(np.zeros((3, 2)), np.array([0, 1]), 0)
 
 
 @pytest.mark.parametrize(("wrong", "match"), [
-    (Trajectory(np.zeros((1, 2)), np.zeros(0, int), 0), "trajectory, row 2: expected moves and one state"),
-    (Trajectory(np.zeros((2, 2)), np.array([0, 1]), 0), r"row 2: expected moves and one state of shape \(2,\) more"),
-    (Trajectory(np.zeros((3, 3)), np.array([0, 1]), 0), r"row 2: expected .*, found 2 and \(3, 3\)"),
-    (Trajectory(np.zeros((3, 2)), np.array([[0.0], [1.0]]), 0), r"field 'actions': expected actions of shape \(\)"),
-    (Trajectory(np.full((3, 2), np.inf), np.array([0, 1]), 0), "row 2, field 'states': expected finite numbers"),
-    (Trajectory(np.zeros((3, 2)), np.array([0, np.nan]), 0), "row 2, field 'actions': expected finite numbers"),
-    (Trajectory(np.zeros((3, 2)), np.array([0, 1]), 2), r"trajectory, row 2: expected a task in 0…1, found 2"),
-    (Trajectory(np.zeros((3, 2)), np.array([0, 1]), -1), r"row 2: expected a task in 0…1, found -1"),
+    (ss.Trajectory(np.zeros((1, 2)), np.zeros(0, int), 0), "trajectory, row 2: expected moves and one state"),
+    (ss.Trajectory(np.zeros((2, 2)), np.array([0, 1]), 0), r"row 2: expected moves and one state of shape \(2,\) more"),
+    (ss.Trajectory(np.zeros((3, 3)), np.array([0, 1]), 0), r"row 2: expected .*, found 2 and \(3, 3\)"),
+    (ss.Trajectory(np.zeros((3, 2)), np.array([[0.0], [1.0]]), 0), r"field 'actions': expected actions of shape \(\)"),
+    (ss.Trajectory(np.full((3, 2), np.inf), np.array([0, 1]), 0), "row 2, field 'states': expected finite numbers"),
+    (ss.Trajectory(np.zeros((3, 2)), np.array([0, np.nan]), 0), "row 2, field 'actions': expected finite numbers"),
+    (ss.Trajectory(np.zeros((3, 2)), np.array([0, 1]), 2), r"trajectory, row 2: expected a task in 0…1, found 2"),
+    (ss.Trajectory(np.zeros((3, 2)), np.array([0, 1]), -1), r"row 2: expected a task in 0…1, found -1"),
 ])  # fmt: skip
 def test_gather_trajectories_inconsistent_trajectory_is_refused(wrong, match):
-    with pytest.raises(InputError, match=match):
-        gather_trajectories([ONE, wrong], GOALS)
+    with pytest.raises(ss.InputError, match=match):
+        sc.gather_trajectories([ONE, wrong], GOALS)
 
 
 def test_gather_trajectories_without_trajectories_or_proper_tasks_is_refused():
-    with pytest.raises(InputError, match="field 'trajectories': expected at least one trajectory"):
-        gather_trajectories([], GOALS)
-    with pytest.raises(InputError, match="field 'tasks': expected at least one task"):
-        gather_trajectories([ONE], [])
-    endless = batch_tasks([PendulumTask(goal=jnp.zeros(()), discount=jnp.asarray(0.9))])
-    with pytest.raises(InputError, match="field 'discount'"):
-        gather_trajectories([ONE], [PendulumTask(goal=endless.goal[0], discount=jnp.asarray(1.5))])
+    with pytest.raises(ss.InputError, match="field 'trajectories': expected at least one trajectory"):
+        sc.gather_trajectories([], GOALS)
+    with pytest.raises(ss.InputError, match="field 'tasks': expected at least one task"):
+        sc.gather_trajectories([ONE], [])
+    endless = sc.batch_tasks([sc.PendulumTask(goal=jnp.zeros(()), discount=jnp.asarray(0.9))])
+    with pytest.raises(ss.InputError, match="field 'discount'"):
+        sc.gather_trajectories([ONE], [sc.PendulumTask(goal=endless.goal[0], discount=jnp.asarray(1.5))])

@@ -5,23 +5,21 @@ import json
 import numpy as np
 import pytest
 
+import sidestep as ss
+import sidestep.continuous as sc
 from sidestep.cli.app import main
-from sidestep.continuous.likelihood import Schedule
-from sidestep.continuous.planner import Planner
 from sidestep.experiments import pendulum, representations, room
-from sidestep.inference.optimizers import LBFGS
-from sidestep.tabular.demonstrations import Trajectory
 from sidestep.worlds import continuous_room
 from sidestep.worlds.continuous_room import without_moves
 
 pytestmark = pytest.mark.usefixtures("unoptimised")
 QUICK = {
-    "planner": Planner(horizon=3, batch_size=4, samples=2, critic_width=4),
-    "schedule": Schedule(iterations=2, policy_warmup=0, batch_size=4),
+    "planner": sc.Planner(horizon=3, batch_size=4, samples=2, critic_width=4),
+    "schedule": sc.Schedule(iterations=2, policy_warmup=0, batch_size=4),
     "agents_per_goal": 1,
     "width": 4,
 }
-ROOM = representations.RepresentationsConfig(**QUICK, lattice_points=21, grid_optimizer=LBFGS(max_iterations=1))
+ROOM = representations.RepresentationsConfig(**QUICK, lattice_points=21, grid_optimizer=ss.LBFGS(max_iterations=1))
 PENDULUM = pendulum.PendulumConfig(**QUICK, moves=5, lattice_points=(24, 21))
 
 
@@ -70,7 +68,7 @@ def test_demonstrations_never_aim_at_the_wall():
     ("xxxxxx", []),
 ])  # fmt: skip
 def test_without_moves_returns_the_pieces_between(hits, pieces):
-    walk = Trajectory(np.arange(7)[:, None], np.arange(10, 16), 3)
+    walk = ss.Trajectory(np.arange(7)[:, None], np.arange(10, 16), 3)
     left = without_moves(walk, np.array([hit == "x" for hit in hits]))
     assert [each.states.ravel().tolist() for each in left] == [list(piece) for piece in pieces]
     assert [each.actions.tolist() for each in left] == [[10 + state for state in piece[:-1]] for piece in pieces]

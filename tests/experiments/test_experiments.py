@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import sidestep as ss
 from sidestep.experiments import demo
 from sidestep.experiments.reproduce import VARIANTS, ReproduceConfig, reproduce, simulate_walks
-from sidestep.inference.optimizers import LBFGS, Adam
 from sidestep.maps.config import SimulationConfig
-from sidestep.maps.learned_map import load_map
 from sidestep.tabular.graph import walkable_graph
 from sidestep.worlds.grids import block
 
@@ -36,7 +35,7 @@ def test_variants_are_those_of_the_paper():
         "actions_only": (("actions",), "fixed_policy"),
         "transitions_only": (("transitions",), "exact"),
     }
-    kinds = {"fixed_policy": Adam, "exact": LBFGS}
+    kinds = {"fixed_policy": ss.Adam, "exact": ss.LBFGS}
     assert all(isinstance(variant.optimizer, kinds[variant.gradient]) for variant in VARIANTS.values())
 
 
@@ -95,7 +94,7 @@ def test_demo_in_a_small_office_writes_map_and_numbers(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {
         "demo.png", "learned", "summary.json", "truth.pgm", "truth.yaml", "walks.csv",
     }  # fmt: skip
-    learned = load_map(tmp_path / "learned")
+    learned = ss.load_map(tmp_path / "learned")
     assert learned.unknown.all()  # nothing of the office was known
     assert learned.blocked.shape == (10, 10)
     assert np.isfinite(learned.blocked).all()

@@ -5,27 +5,15 @@ import json
 import numpy as np
 import pytest
 
+import sidestep as ss
 from sidestep.baselines.interface import ModelResult
 from sidestep.baselines.maxent_irl import CostlyReward
-from sidestep.experiments.motivation import (
-    COLUMNS,
-    FORMS,
-    OUTCOMES,
-    ROWS,
-    Form,
-    MotivationConfig,
-    run,
-    run_trial,
-    task_at_stakes,
-    true_result,
-)
+from sidestep.experiments import motivation
+from sidestep.experiments.motivation import COLUMNS, FORMS, ROWS, Form, run_trial, task_at_stakes, true_result
 from sidestep.maps.fit import behavior_of
-from sidestep.robots.robot import risk_averse_robot
-from sidestep.tabular.grid import Grid
-from sidestep.tabular.models import ObstacleGrid
 
 pytestmark = pytest.mark.usefixtures("unoptimised")
-BLANK = Grid.unknown(ROWS, COLUMNS)
+BLANK = ss.Grid.unknown(ROWS, COLUMNS)
 GOAL = 8 * COLUMNS + 12
 """The lower right corner, beyond the wall and below the mud."""
 
@@ -33,8 +21,8 @@ GOAL = 8 * COLUMNS + 12
 def uniform_costs(form: Form, cost: float) -> ModelResult:
     """Return a model without obstacles, in which all cells cost the same."""
     reward = CostlyReward(form.config.reward.discount, form.config.reward.step_cost, np.full(BLANK.size, cost))
-    free, behavior = ObstacleGrid(BLANK.passable()), behavior_of(form.config.behavior)
-    return ModelResult(free, reward, behavior, np.zeros(BLANK.shape), risk_averse_robot(free, []), True)
+    free, behavior = ss.ObstacleGrid(BLANK.passable()), behavior_of(form.config.behavior)
+    return ModelResult(free, reward, behavior, np.zeros(BLANK.shape), ss.risk_averse_robot(free, []), True)
 
 
 def steps_to_the_goal(starts):
@@ -82,9 +70,10 @@ def test_run_trial_in_the_true_model_takes_the_fewest_moves():
 @pytest.mark.slow
 def test_run_shows_that_costs_fail_when_the_stakes_change(tmp_path):
     """The transition model does not depend on the stakes; four goals of the agents suffice for that."""
-    usual = MotivationConfig()
+    usual = motivation.MotivationConfig()
     goals, new_goals = tuple(usual.goals[index] for index in (0, 4, 6, 7)), usual.new_goals[:2]
-    summary = run(tmp_path, config=MotivationConfig(1, goals, 6, stakes=(0.1, 1.0, 10.0), new_goals=new_goals))
+    config = motivation.MotivationConfig(1, goals, 6, stakes=(0.1, 1.0, 10.0), new_goals=new_goals)
+    summary = motivation.run(tmp_path, config=config)
     assert json.loads((tmp_path / "summary.json").read_text()) == json.loads(json.dumps(summary))
     assert summary["command"] == "experiment motivation"
     assert (tmp_path / "motivation.png").read_bytes().startswith(b"\x89PNG")
@@ -97,7 +86,7 @@ def test_run_shows_that_costs_fail_when_the_stakes_change(tmp_path):
         assert form["costs"]["bumps"][0] < 0.1
         assert form["costs"]["bumps"][2] > 0.3
         for method in form.values():
-            np.testing.assert_allclose(np.sum([method[outcome] for outcome in OUTCOMES], axis=0), 1)
+            np.testing.assert_allclose(np.sum([method[outcome] for outcome in motivation.OUTCOMES], axis=0), 1)
     assert goal["costs"]["stays_put"][0] > 0.6
     assert goal["costs"]["goal_in_mud"]["stays_put"][0] > 0.6
     assert goal["costs"]["stays_put"][2] == steps["costs"]["stays_put"][2] == 0

@@ -125,8 +125,12 @@ def fit_dynamics(
         arrays, records, _ = saver.load(eqx.filter(state, eqx.is_array))
         state = eqx.combine(arrays, state)
         history = [FitProgress(int(record[0]), *record[1:]) for record in records]
-    if not history:
-        state = _warm_up(problem, state, warmup_key)
+    steps = schedule.policy_warmup if "actions" in terms else 0
+    if steps and not history:
+        starts = demonstrations.tasks, demonstrations.states, demonstrations.task
+        plan_seed = int(jax.random.randint(warmup_key, (), 0, 2**31 - 1))
+        plan = plan_policy(agent, *starts, planner, steps=steps, seed=plan_seed, warm_start=state.planner_state)
+        state = replace(state, planner_state=plan.planner_state)
     for iteration in range(len(history), schedule.iterations):
         state, numbers = _step(problem, state, jax.random.fold_in(key, iteration), jnp.asarray(iteration))
         history.append(FitProgress(iteration, *(float(number) for number in numbers[1:])))
@@ -159,16 +163,6 @@ def _initialize(problem: FitProblem, key: PRNGKeyArray) -> _State:
     flat = ravel_pytree(parameters)[0]
     sums = jnp.zeros((2, len(flat)), flat.dtype)
     return _State(parameters, problem.schedule.adam().init(parameters), planner_state, sums)
-
-
-def _warm_up(problem: FitProblem, state: _State, key: PRNGKeyArray) -> _State:
-    """Plan for the first model, if the objective needs a policy."""
-    steps, demos = problem.schedule.policy_warmup, problem.demonstrations
-    if not steps or "actions" not in problem.terms:
-        return state
-    starts, seed = (demos.tasks, demos.states, demos.task), int(jax.random.randint(key, (), 0, 2**31 - 1))
-    plan = plan_policy(problem.agent, *starts, problem.planner, steps=steps, seed=seed, warm_start=state.planner_state)
-    return replace(state, planner_state=plan.planner_state)
 
 
 @eqx.filter_jit

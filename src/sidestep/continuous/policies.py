@@ -55,7 +55,12 @@ def scaled_network(key: PRNGKeyArray, examples: Examples, outputs: int, width: i
 
     Returns:
         The network.
+
+    Raises:
+        InputError: For no examples, or any that are not finite.
     """
+    valid = len(examples) > 0 and np.isfinite(examples).all()
+    check(valid, "expected one or more rows of finite numbers", field="examples")
     network = eqx.nn.MLP(examples.shape[-1], outputs, width, depth, jnp.tanh, key=key)
     last = network.layers[-1]
     network = eqx.tree_at(lambda net: net.layers[-1], network, jax.tree.map(lambda leaf: 0.01 * leaf, last))
@@ -67,10 +72,10 @@ class Policy(eqx.Module):
     """A distribution π_λ(c | x); λ are all its floating-point arrays that gradients reach.
 
     Attributes:
-        reparameterized: Whether `sample` is smooth in λ and x while the key is held fixed.
+        reparameterized: Whether `sample` is smooth in λ and x while the key is held fixed; no by default.
     """
 
-    reparameterized: ClassVar[bool]
+    reparameterized: ClassVar[bool] = False
 
     @abc.abstractmethod
     def sample(self, key: PRNGKeyArray, x: Features) -> Choice:
@@ -178,7 +183,6 @@ class FinitePolicy(Policy):
 
     network: ScaledNetwork
     actions: Shaped[Array, "actions *action"]
-    reparameterized: ClassVar[bool] = False
 
     def log_probs(self, x: Features) -> Float[Array, " actions"]:
         """Return ln π_λ of every action.
@@ -309,7 +313,6 @@ def finite_policy(
     """
     valid = len(actions) >= 2 and np.isfinite(actions).all()
     check(valid, "expected two or more actions of finite numbers", field="actions")
-    _check_examples(examples)
     return FinitePolicy(scaled_network(key, examples, len(actions), width, depth), jnp.asarray(actions))
 
 
@@ -337,7 +340,6 @@ def gaussian_policy(
         [0.0, 0.0]
     """
     check_positive(spread, "spread")
-    _check_examples(examples)
     network = scaled_network(key, examples, inputs, width, depth)
     return GaussianPolicy(network, jnp.full(inputs, math.log(spread), examples.dtype))
 
@@ -358,6 +360,9 @@ def make_critic(
     Returns:
         The critic.
 
+    Raises:
+        InputError: For no examples, or any that are not finite.
+
     Example:
         >>> critic = make_critic(jax.random.key(0), jnp.eye(2), jnp.ones(2), jnp.array([1.0, 3.0]))
         >>> float(critic.center), float(critic.spread)
@@ -365,8 +370,3 @@ def make_critic(
     """
     network, spread = scaled_network(key, jnp.column_stack([examples, left]), 1, width, depth), returns.std()
     return Critic(network, returns.mean(), jnp.where(spread > 0, spread, 1.0))
-
-
-def _check_examples(examples: Examples) -> None:
-    valid = len(examples) > 0 and np.isfinite(examples).all()
-    check(valid, "expected one or more rows of finite numbers", field="examples")

@@ -5,12 +5,13 @@ module imports neither rollouts nor policies, so that the data do not depend on 
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from sidestep.continuous.dynamics import GaussianDynamics
 from sidestep.continuous.lattice import LatticePlanner
@@ -74,8 +75,9 @@ def simulate_trajectories(
         solution = solve(model, table, agent.behavior, options=options)
         if not solution.converged:
             raise NotConverged(f"values did not converge for task {index}: a finer lattice or a smaller β may help")
-        keys = jax.random.split(jax.random.fold_in(key, index), len(own))
-        parts = _simulate(agent, real, task, solution.values, jnp.asarray(own), keys, moves)
+        own_keys = jax.random.split(jax.random.fold_in(key, index), len(own))
+        keys = jax.vmap(partial(jax.random.split, num=moves))(own_keys)
+        parts = _simulate(agent, real, task, solution.values, jnp.asarray(own), keys)
         for states, choices, acting in zip(*map(np.asarray, parts), strict=True):
             length = int(acting.sum())
             if length:
@@ -142,13 +144,7 @@ def _check_trajectory(trajectory: Trajectory, first: Trajectory, tasks: int, row
 
 @eqx.filter_jit
 def _simulate(
-    agent: LatticePlanner,
-    real: GaussianDynamics,
-    task: ContinuousTask,
-    values: Array,
-    starts: Array,
-    keys: Key[Array, " agents"],
-    moves: int,
+    agent: LatticePlanner, real: GaussianDynamics, task: ContinuousTask, values: Array, starts: Array, keys: Array
 ) -> tuple[Array, Array, Array]:
     """Return states, choices, and whether the task had not ended, of every agent at every move."""
 
@@ -160,9 +156,8 @@ def _simulate(
         after = jnp.where(over, state, real.sample(transition_key, state, agent.actions[choice]))
         return (after, over), (state, choice, ~over)
 
-    def simulate(start: Array, key: PRNGKeyArray) -> tuple[Array, Array, Array]:
-        begin = start, jnp.zeros((), bool)
-        (last, _), (states, choices, acting) = jax.lax.scan(move, begin, jax.random.split(key, moves))
+    def simulate(start: Array, keys: Array) -> tuple[Array, Array, Array]:
+        (last, _), (states, choices, acting) = jax.lax.scan(move, (start, jnp.zeros((), bool)), keys)
         return jnp.concatenate([states, last[None]]), choices, acting
 
     return jax.vmap(simulate)(starts, keys)

@@ -29,11 +29,11 @@ class ContinuousTask(eqx.Module):
 
     Attributes:
         discount: γ in (0, 1].
-        smooth: Whether returns are smooth in the states of a path, so that gradients may pass along it.
+        smooth: Whether returns are smooth in the states of a path, so that gradients may pass along it; no by default.
     """
 
     discount: eqx.AbstractVar[Float[Array, "*tasks"]]
-    smooth: ClassVar[bool]
+    smooth: ClassVar[bool] = False
 
     @abc.abstractmethod
     def reward(self, state: State, action: Action) -> Real:
@@ -85,7 +85,6 @@ class ReachTask(ContinuousTask):
     step_cost: Float[Array, "*tasks"]
     goal_reward: Float[Array, "*tasks"]
     discount: Float[Array, "*tasks"]
-    smooth: ClassVar[bool] = False
 
     def reward(self, state: State, action: Action) -> Real:
         """Return minus the cost of a step.
@@ -246,7 +245,6 @@ class TableTask(ContinuousTask):
     task: Task
     index: Float[Array, "*tasks indices"]
     discount: Float[Array, "*tasks"]
-    smooth: ClassVar[bool] = False
 
     def reward(self, state: State, action: Action) -> Real:
         """Return R(s, a), from the table.

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 import sidestep as ss
 import sidestep.continuous as sc
+from sidestep.experiments.output import Notify
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,9 @@ class ContinuousConfig:
         walks: ss.Demonstrations,
         actions: Float[Array, "actions inputs"],
         seed: int,
-        report: Callable[[int, Any], None] = lambda *_: None,
+        notify: Notify,
+        title: str,
+        observe: Callable[[Any], object] = lambda _: None,
         **settings: Any,
     ) -> sc.ContinuousFit:
         """Fit dynamics to walks.
@@ -50,7 +53,9 @@ class ContinuousConfig:
             walks: The moves to learn from.
             actions: The actions that the agents choose from.
             seed: Draws everything random.
-            report: Called with the number of the iteration and the present dynamics after every iteration.
+            notify: Called with the title and the number of the iteration after every iteration.
+            title: Says what is learned.
+            observe: Called with the present dynamics after every iteration.
             settings: Other settings of `fit_dynamics`.
 
         Returns:
@@ -58,5 +63,10 @@ class ContinuousConfig:
         """
         features = sc.task_features(sc.task_at(walks.tasks, walks.task), walks.states)
         policy = sc.finite_policy(jax.random.key(seed), actions, features, width=self.width)
-        settings |= {"schedule": self.schedule, "seed": seed, "report": lambda now, each: report(now.iteration, each)}
+
+        def report(progress: sc.FitProgress, dynamics: sc.Dynamics) -> None:
+            observe(dynamics)
+            notify(f"{title}, iteration {progress.iteration} of {self.schedule.iterations}")
+
+        settings |= {"schedule": self.schedule, "seed": seed, "report": report}
         return sc.fit_dynamics(dynamics, walks, self.behavior, policy, self.planner, **settings)

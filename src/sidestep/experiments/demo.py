@@ -6,13 +6,12 @@ no walk had.
 
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 import sidestep as ss
 from sidestep._files import write_json
-from sidestep.experiments.output import Notify
+from sidestep.experiments.output import Notify, Summary, quiet
 from sidestep.io.demonstrations import walks_from_trajectories
 from sidestep.maps.config import SimulationConfig
 from sidestep.plotting.maps import Panel, figure_learned, save
@@ -33,9 +32,7 @@ class DemoConfig:
     new_places: int = 4
 
 
-def demo(
-    folder: Path, seed: int = 0, notify: Notify = lambda _: None, config: DemoConfig | None = None
-) -> dict[str, Any]:
+def demo(folder: Path, seed: int = 0, notify: Notify = quiet, config: DemoConfig | None = None) -> Summary:
     """Run the demonstration; write `demo.png`, the true map, the walks and the learned map.
 
     Args:

@@ -27,7 +27,7 @@ import sidestep as ss
 from sidestep.baselines.behavior_aware import behavior_aware
 from sidestep.baselines.interface import ModelResult
 from sidestep.baselines.maxent_irl import maxent_irl
-from sidestep.experiments.output import Notify, write_results
+from sidestep.experiments.output import Notify, Summary, quiet, write_results
 from sidestep.maps.fit import behavior_of
 from sidestep.plotting.policies import Curves, PolicyPanel, figure_policies
 from sidestep.worlds.rooms import rooms_in_a_row
@@ -98,6 +98,10 @@ class Trial(NamedTuple):
     fewest: Float[np.ndarray, " starts"]
 
 
+Trials = dict[str, list[list[Trial]]]
+"""The trials of each method by new goal and stakes."""
+
+
 def true_world() -> ss.ObstacleGrid:
     """Return the model of the two rooms with known walls and mud."""
     known = rooms_in_a_row(ROWS, COLUMNS, (DOOR,)).known.copy()
@@ -105,9 +109,7 @@ def true_world() -> ss.ObstacleGrid:
     return ss.ObstacleGrid(ss.Grid(known), np.log(MUD_FAILS / (1 - MUD_FAILS)))
 
 
-def run(
-    folder: Path, seed: int = 0, notify: Notify = lambda _: None, config: MotivationConfig | None = None
-) -> dict[str, Any]:
+def run(folder: Path, seed: int = 0, notify: Notify = quiet, config: MotivationConfig | None = None) -> Summary:
     """Run the experiment; write `motivation.png` and `summary.json`.
 
     Args:
@@ -122,7 +124,7 @@ def run(
     config, started = config or MotivationConfig(), time.monotonic()
     forms, panels, curves = {}, [], []
     for name, form in FORMS.items():
-        trials: dict[str, list[list[Trial]]] = {method: [] for method in ("truth", *METHODS)}
+        trials: Trials = {method: [] for method in ("truth", *METHODS)}
         for draw in range(config.draws):
             notify(f"reward of the form {name}: draw {draw + 1} of {config.draws}")
             walks = simulate_walks(form, config, seed + draw)
@@ -251,10 +253,7 @@ def _state(cell: tuple[int, int]) -> int:
 
 
 def _panels(
-    results: dict[str, ModelResult],
-    trials: dict[str, list[list[Trial]]],
-    walks: ss.Demonstrations,
-    config: MotivationConfig,
+    results: dict[str, ModelResult], trials: Trials, walks: ss.Demonstrations, config: MotivationConfig
 ) -> list[PolicyPanel]:
     """Return panels of the walks, of what was learned, and of robots that plan with it to the first new goal."""
     truth, goal, paths = rooms_in_a_row(ROWS, COLUMNS, (DOOR,)), _state(config.new_goals[0]), walks.paths()

@@ -1,7 +1,7 @@
 """The files that an experiment writes: a picture and a summary."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,15 @@ from sidestep.plotting.maps import save
 Notify = Callable[[str], None]
 """A function that shows a line of progress."""
 
+Summary = dict[str, Any]
+"""The content of a summary, as JSON has it."""
 
-def write_results(
-    folder: Path, name: str, seed: int, started: float, figure: Figure, results: Mapping[str, Any]
-) -> dict[str, Any]:
+
+def quiet(_: str) -> None:
+    """Show no progress."""
+
+
+def write_results(folder: Path, name: str, seed: int, started: float, figure: Figure, results: Summary) -> Summary:
     """Write the picture `NAME.png` and `summary.json` of an experiment.
 
     Args:

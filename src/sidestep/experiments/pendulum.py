@@ -8,7 +8,6 @@ real one, are not used.
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +17,7 @@ from jaxtyping import Array, Float
 import sidestep as ss
 import sidestep.continuous as sc
 from sidestep.experiments.continuous import ContinuousConfig
-from sidestep.experiments.output import Notify, write_results
+from sidestep.experiments.output import Notify, Summary, quiet, write_results
 from sidestep.plotting.physics import figure_belief
 
 
@@ -85,9 +84,7 @@ class PendulumConfig(ContinuousConfig):
         return sc.simulate_trajectories(jax.random.key(seed), agent, real, self.tasks, starts, self.moves)
 
 
-def run(
-    folder: Path, seed: int = 0, notify: Notify = lambda _: None, config: PendulumConfig | None = None
-) -> dict[str, Any]:
+def run(folder: Path, seed: int = 0, notify: Notify = quiet, config: PendulumConfig | None = None) -> Summary:
     """Run the experiment; write `pendulum.png` and `summary.json`.
 
     Args:
@@ -104,16 +101,11 @@ def run(
     notify("agents swing the pendulum to a stop")
     trajectories = config.trajectories(seed)
     walks = sc.gather_trajectories(trajectories, config.tasks)
-    estimates: list[float] = []
-
-    def report(iteration: int, dynamics: sc.Pendulum) -> None:
-        estimates.append(float(dynamics.constant("gravity")))
-        notify(f"learning gravity, iteration {iteration} of {config.schedule.iterations}")
-
     notify("planning under the real gravity")
+    seen: list[sc.Pendulum] = []
     dynamics, prior = sc.Pendulum(real, noise=config.noise), ss.Normal(np.log(real), 0.5)
     settings = {"prior": prior, "terms": ("actions",), "estimator": "pathwise"}
-    fit = config.fit(dynamics, walks, config.actions, seed, report, **settings)
+    fit = config.fit(dynamics, walks, config.actions, seed, notify, "learning gravity", seen.append, **settings)
     estimate = float(fit.dynamics.constant("gravity"))
     results = {
         "gravity_true": believed,
@@ -126,5 +118,6 @@ def run(
         "message": fit.message,
     }
     angles = [trajectory.states[:, 0] for trajectory in trajectories]
-    figure = figure_belief(angles, dynamics.time_step, np.asarray(estimates), believed, real)
+    estimates = np.asarray([float(each.constant("gravity")) for each in seen])
+    figure = figure_belief(angles, dynamics.time_step, estimates, believed, real)
     return write_results(folder, "pendulum", seed, started, figure, results)

@@ -18,17 +18,17 @@ from jaxtyping import Array, Float
 import sidestep as ss
 import sidestep.continuous as sc
 from sidestep._typing import FloatTree
-from sidestep.experiments.output import Notify, write_results
+from sidestep.experiments.output import Notify, Summary, quiet, write_results
 from sidestep.experiments.room import RoomConfig, blocked_map, score_map
 from sidestep.io.walks import walks_from_table
 from sidestep.plotting.maps import Panel, figure_learned
-from sidestep.worlds.continuous_room import RESOLUTION, SIDE, Room, room
+from sidestep.worlds.continuous_room import RESOLUTION, SIDE, room
 
 CELL = 0.5
 """The side of the grid's cells, in meters."""
 
-LearnedField = tuple[Float[np.ndarray, "rows columns"], int, bool, str]
-"""P(blocked) in small cells, the number of parameters, whether the fit converged, and its message."""
+_SMALL_CELLS = np.ones((round(CELL / RESOLUTION),) * 2)
+"""The cells of the room's map in one of the grid's."""
 
 
 @dataclass(frozen=True)
@@ -70,9 +70,7 @@ class FunctionSpacePrior(ss.Prior):
         return self.each.log_density(jax.vmap(field.logit)(self.places))
 
 
-def run(
-    folder: Path, seed: int = 0, notify: Notify = lambda _: None, config: RepresentationsConfig | None = None
-) -> dict[str, Any]:
+def run(folder: Path, seed: int = 0, notify: Notify = quiet, config: RepresentationsConfig | None = None) -> Summary:
     """Run the experiment; write `representations.png` and `summary.json`.
 
     Args:
@@ -92,17 +90,23 @@ def run(
     network = sc.network_field(jax.random.key(seed), low, high, logit=config.prior_mean)
     on_logits = FunctionSpacePrior(network, radial.centers, config.prior)
     slower = replace(config, schedule=replace(config.schedule, learning_rate=config.network_rate))
+    data = walks, world.actions, seed, notify
     methods = {
-        "basis functions": partial(_fit_field, config, world, walks, radial, config.prior, seed),
-        "network": partial(_fit_field, slower, world, walks, network, on_logits, seed),
+        "basis functions": partial(config.fit, world.with_field(radial), *data, prior=config.prior),
+        "network": partial(slower.fit, world.with_field(network), *data, prior=on_logits),
         "fine grid": partial(_fit_grid, config, walks),
     }
     results, panels = {}, []
     for name, method in methods.items():
         notify(f"learning with {name}")
         began = time.monotonic()
-        blocked, parameters, converged, message = method(notify, name)
-        fitted = {"parameters": parameters, "converged": converged, "message": message}
+        fit = method(title=f"learning with {name}")
+        if isinstance(fit, sc.ContinuousFit):
+            parameters, blocked = fit.dynamics.parameters, blocked_map(fit.dynamics, world)
+        else:
+            parameters, blocked = fit.model.parameters, np.kron(np.asarray(fit.model.blocked), _SMALL_CELLS)
+        count = sum(leaf.size for leaf in jax.tree.leaves(parameters))
+        fitted = {"parameters": count, "converged": fit.converged, "message": fit.message}
         results[name] = {**score_map(blocked, world), **fitted, "seconds": round(time.monotonic() - began, 1)}
         panels.append(Panel(f"{name} ({results[name]['seconds']:.0f} s)", world.cells, blocked, world.cells))
     best = max(results.values(), key=lambda result: result["auc"])
@@ -111,25 +115,7 @@ def run(
     return write_results(folder, "representations", seed, started, figure_learned(panels), entries)
 
 
-def _fit_field(
-    config: RoomConfig,
-    world: Room,
-    walks: ss.Demonstrations,
-    field: sc.Field,
-    prior: ss.Prior,
-    seed: int,
-    notify: Notify,
-    name: str,
-) -> LearnedField:
-    def report(iteration: int, _: sc.Dynamics) -> None:
-        notify(f"learning with {name}, iteration {iteration} of {config.schedule.iterations}")
-
-    fit = config.fit(world.with_field(field), walks, world.actions, seed, report, prior=prior)
-    count = sum(leaf.size for leaf in jax.tree.leaves(field.parameters))
-    return blocked_map(fit.dynamics, world), count, fit.converged, fit.message
-
-
-def _fit_grid(config: RepresentationsConfig, walks: ss.Demonstrations, *_: Any) -> LearnedField:
+def _fit_grid(config: RepresentationsConfig, walks: ss.Demonstrations, **_: Any) -> ss.Fit:
     """Fit cells with exact values: costs and β a meter are the same, under the Boltzmann average.
 
     The Boltzmann average has finite values however short a move is.
@@ -139,9 +125,7 @@ def _fit_grid(config: RepresentationsConfig, walks: ss.Demonstrations, *_: Any) 
     moves = ss.demonstrations_from_walks(_walks(walks), grid, discount=1.0, step_cost=CELL)
     behavior = ss.Behavior(ss.BoltzmannAverage(), config.beta)
     model = ss.ObstacleGrid(grid, config.prior_mean)
-    fit = ss.fit(model, moves, behavior, prior=config.prior, optimizer=config.grid_optimizer)
-    finer = np.ones((round(CELL / RESOLUTION),) * 2)
-    return np.kron(np.asarray(fit.model.blocked), finer), grid.size, fit.converged, fit.message
+    return ss.fit(model, moves, behavior, prior=config.prior, optimizer=config.grid_optimizer)
 
 
 def _walks(demonstrations: ss.Demonstrations) -> ss.Walks:

@@ -22,7 +22,7 @@ import numpy as np
 
 import sidestep as ss
 from sidestep._files import write_json
-from sidestep.experiments.output import Notify
+from sidestep.experiments.output import Notify, Summary, quiet
 from sidestep.plotting.maps import Panel, figure_environments, figure_learned, save
 from sidestep.robots.planners import ModelPlanner
 from sidestep.tabular.backups import Gradient
@@ -69,9 +69,7 @@ class ReproduceConfig:
     prior_variance: float = 4.0 / 2
 
 
-def reproduce(
-    folder: Path, seed: int = 0, notify: Notify = lambda _: None, config: ReproduceConfig | None = None
-) -> dict[str, Any]:
+def reproduce(folder: Path, seed: int = 0, notify: Notify = quiet, config: ReproduceConfig | None = None) -> Summary:
     """Run the experiments; write `figure1.png` to `figure4.png` and `summary.json`.
 
     Args:
@@ -134,10 +132,8 @@ def _learn(
         options=ss.SolveOptions(gradient=variant.gradient),
         optimizer=variant.optimizer,
     )
-    planner, blocked = (
-        ModelPlanner(fit.model, partial(config.reward.reach, fit.model.blank)),
-        np.asarray(fit.model.blocked),
-    )
+    planner = ModelPlanner(fit.model, partial(config.reward.reach, fit.model.blank))
+    blocked = np.asarray(fit.model.blocked)
     everywhere, visited = np.ones(world.truth.shape, dtype=bool), walks.visited_state_goals()
     scores = ss.evaluate(planner, blocked, world.truth, everywhere, visited).to_dict()
     paths, _ = ss.plan_paths(planner, np.array(world.starts), np.array(world.goals))

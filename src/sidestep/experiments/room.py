@@ -8,7 +8,6 @@ walks in the learned room, and walk them in the real one.
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +18,7 @@ import sidestep as ss
 import sidestep.continuous as sc
 from sidestep.evaluation.metrics import ranking_scores
 from sidestep.experiments.continuous import ContinuousConfig
-from sidestep.experiments.output import Notify, write_results
+from sidestep.experiments.output import Notify, Summary, quiet, write_results
 from sidestep.plotting.maps import Panel, figure_learned
 from sidestep.worlds.continuous_room import Room, room, walks_without_collisions
 
@@ -110,9 +109,7 @@ def score_map(blocked: Float[np.ndarray, "rows columns"], world: Room) -> dict[s
     return {"auc": auc or 0.0, **means}
 
 
-def run(
-    folder: Path, seed: int = 0, notify: Notify = lambda _: None, config: RoomConfig | None = None
-) -> dict[str, Any]:
+def run(folder: Path, seed: int = 0, notify: Notify = quiet, config: RoomConfig | None = None) -> Summary:
     """Run the experiment; write `room.png` and `summary.json`.
 
     Args:
@@ -129,14 +126,10 @@ def run(
     notify("agents walk around the wall")
     demonstrations, collisions = config.demonstrations(world, seed)
 
-    def report(iteration: int, _: sc.Dynamics) -> None:
-        notify(f"learning the wall, iteration {iteration} of {config.schedule.iterations}")
-
     notify("planning in an empty room")
-    data = world.with_field(config.radial_field(world)), demonstrations, world.actions, seed
-    fit = config.fit(*data, report, prior=config.prior)
-    notify("learning from transitions alone")
-    transitions_fit = config.fit(*data, prior=config.prior, terms=("transitions",))
+    data = world.with_field(config.radial_field(world)), demonstrations, world.actions, seed, notify
+    fit = config.fit(*data, "learning the wall", prior=config.prior)
+    transitions_fit = config.fit(*data, "learning from transitions alone", prior=config.prior, terms=("transitions",))
     blocked, by_transitions = (blocked_map(each.dynamics, world) for each in (fit, transitions_fit))
     notify("planning in the learned room")
     planned, arrived = _new_walks(world, fit.dynamics, seed)

@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Int
+from numpy.random import Generator
 
 from sidestep.errors import check
 from sidestep.tabular.graph import walkable_graph
@@ -102,7 +103,7 @@ def connected_cells(grid: Grid) -> Int[np.ndarray, " cells"]:
     return np.flatnonzero(free & (label == np.argmax(np.bincount(label, weights=free))))
 
 
-def _crossings(wings: int, columns: int, random: np.random.Generator) -> list[int]:
+def _crossings(wings: int, columns: int, random: Generator) -> list[int]:
     """Return the left columns of the corridors that cross the wings; a single wing has none."""
     if wings == 1:
         return []
@@ -113,34 +114,31 @@ def _crossings(wings: int, columns: int, random: np.random.Generator) -> list[in
     return np.clip(drawn.astype(int), 3, columns - 5).tolist()
 
 
-def _add_wing(cells: np.ndarray, top: int, bottom: int, crossings: list[int], random: np.random.Generator) -> None:
+def _add_wing(cells: np.ndarray, top: int, bottom: int, crossings: list[int], random: Generator) -> None:
     """Clear a corridor and the rooms beside it, between the walls in rows `top` and `bottom`."""
     height = 2 if bottom - top > 12 else 1
     corridor = top + (bottom - top - height) // 2 + int(random.integers(0, 2))
     cells[corridor : corridor + height, 1:-1] = Cell.FREE
     below = corridor + height
-    _add_rooms(cells, (top + 1, corridor - 2), corridor - 1, crossings, random)
-    _add_rooms(cells, (below + 1, bottom - 1), below, crossings, random)
+    _add_rooms(cells, slice(top + 1, corridor - 1), corridor - 1, crossings, random)
+    _add_rooms(cells, slice(below + 1, bottom), below, crossings, random)
 
 
-def _add_rooms(
-    cells: np.ndarray, rows: tuple[int, int], door_row: int, crossings: list[int], random: np.random.Generator
-) -> None:
-    """Clear a row of rooms in `rows` (first and last), each with a door in the wall at `door_row`."""
-    first, last = rows
+def _add_rooms(cells: np.ndarray, rows: slice, door_row: int, crossings: list[int], random: Generator) -> None:
+    """Clear a line of rooms in some rows, each with a door in the wall at `door_row`."""
     # a crossing corridor has a wall on either side, and the rooms end there
     ends = [0, *(column for left in crossings for column in (left - 1, left + 2)), cells.shape[1] - 1]
     for left, right in zip(ends[::2], ends[1::2], strict=True):
         walls = _room_walls(left, right, random)
         for west, east in pairwise(walls):
-            cells[first : last + 1, west + 1 : east] = Cell.FREE
+            cells[rows, west + 1 : east] = Cell.FREE
             cells[door_row, random.integers(west + 1, east)] = Cell.FREE
         for wall in walls[1:-1]:
             if random.random() < 0.3:
-                cells[random.integers(first, last + 1), wall] = Cell.FREE
+                cells[random.integers(rows.start, rows.stop), wall] = Cell.FREE
 
 
-def _room_walls(left: int, right: int, random: np.random.Generator) -> list[int]:
+def _room_walls(left: int, right: int, random: Generator) -> list[int]:
     """Return the columns of the walls of a row of rooms, 3 to 8 columns of floor between them if possible."""
     walls = [left]
     while right - walls[-1] > 9:
