@@ -67,9 +67,8 @@ def evaluate(name) -> Evaluation:
         return samples, log_probs, slope, beside, variates, linear, moved
 
     keys = jax.random.split(jax.random.key(0, impl="unsafe_rbg"), SAMPLES)  # good enough, and compiles quickly
-    samples, log_probs, slope, beside, *variates, moved = compute(
-        keys, jnp.asarray(points), jnp.concatenate([steps, -steps])
-    )
+    both = jnp.concatenate([steps, -steps])
+    samples, log_probs, slope, beside, *variates, moved = compute(keys, jnp.asarray(points), both)
     differences = (beside[: len(flat)] - beside[len(flat) :]) / 2e-5
     return Evaluation(*map(np.asarray, (samples, points, log_probs, slope, differences, *variates, moved)))
 

@@ -1,6 +1,7 @@
 """Eq. 11 by roll-outs beside exact gradients: dynamic programming in a table, moments in a linear-Gaussian world."""
 
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -99,10 +100,8 @@ def in_table(request):
     values, exact = exact_table(request.param, TABLE, lambda q: jnp.sum(WEIGHTS * q))
     wrong = 2 + jnp.asarray(np.random.default_rng(2).normal(size=values.shape))
     critics = {"no": None, "an exact": critic_of(values), "a wrong": critic_of(wrong)}
-    behavior = BEHAVIORS[request.param]
-    return exact, {
-        name: drawn(3, MANY, TABLE, behavior, EVERYWHERE, WEIGHTS, critic=critic) for name, critic in critics.items()
-    }
+    draw = partial(drawn, 3, MANY, TABLE, BEHAVIORS[request.param], EVERYWHERE, WEIGHTS)
+    return exact, {name: draw(critic=critic) for name, critic in critics.items()}
 
 
 @pytest.mark.parametrize("critic", ["no", "an exact", "a wrong"])
@@ -118,10 +117,8 @@ def test_value_gradient_exact_critic_halves_the_variance():
         pi = jax.nn.softmax(BETA * q)
     world = TABLE._replace(policy=small_worlds.with_logits(jnp.log(pi)))
     values, _ = exact_table("log-sum-exp", world)
-    without, with_critic = (
-        drawn(4, MANY, world, SOFT, EVERYWHERE, WEIGHTS, critic=critic) for critic in (None, critic_of(values))
-    )
-    assert with_critic.var(axis=0).sum() < 0.5 * without.var(axis=0).sum()
+    draw = partial(drawn, 4, MANY, world, SOFT, EVERYWHERE, WEIGHTS)
+    assert draw(critic=critic_of(values)).var(axis=0).sum() < 0.5 * draw().var(axis=0).sum()
 
 
 def test_with_control_variates_exact_critic_removes_all_noise():
@@ -258,10 +255,8 @@ def test_value_gradient_pathwise_over_finite_actions_matches_exact_sum(critic):
 
 def test_value_gradient_pathwise_and_score_agree_over_finite_actions():
     world = choosing(noise=0.3)
-    along_paths, scores = (
-        drawn(10, MANY, world, SOFT, PUSHED, PARTS, estimator=estimator, horizon=MOVES)
-        for estimator in ("pathwise", "score")
-    )
+    draw = partial(drawn, 10, MANY, world, SOFT, PUSHED, PARTS, horizon=MOVES)
+    along_paths, scores = draw(estimator="pathwise"), draw(estimator="score")
     assert_agrees(along_paths, scores.mean(axis=0), precision=0.1, uncertain=standard_error(scores))
 
 

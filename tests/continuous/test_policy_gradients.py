@@ -20,11 +20,8 @@ pytestmark = [pytest.mark.usefixtures("unoptimised"), pytest.mark.slow]
 
 WORLD, BETA = small_worlds.table(), 1.5
 SOFT, OPTIMAL = ss.Behavior(ss.LogSumExp(), BETA), ss.Behavior(ss.HardMax(), BETA)
-BEHAVIORS = {
-    "log-sum-exp": SOFT,
-    "Boltzmann": ss.Behavior(ss.BoltzmannAverage(), BETA),
-    "mellowmax": ss.Behavior(ss.Mellowmax(), BETA),
-}
+BACKUPS = {"log-sum-exp": ss.LogSumExp(), "Boltzmann": ss.BoltzmannAverage(), "mellowmax": ss.Mellowmax()}
+BEHAVIORS = {name: ss.Behavior(backup, BETA) for name, backup in BACKUPS.items()}
 HERE = len(PLACES)  # as many as there are, so that every step tries each start once
 PLANNER = sc.Planner(horizon=15, batch_size=HERE, samples=8, learning_rate=0.02, critic_rate=0.02, critic_width=8)
 UNIFORM = small_worlds.table_policy(ACTIONS, TASKS * STATES)
@@ -83,10 +80,8 @@ def test_plan_policy_critic_approaches_exact_values(plans, exact, initial):
     values, _ = exact_values(WORLD, WORLD.dynamics.parameters, exact["log-sum-exp"], PLANNER.horizon, bonus)
     values = np.asarray(values[WHICH, PLACES])
     places = jnp.eye(TASKS * STATES)[WHICH * STATES + PLACES]
-    before, after = (
-        jax.vmap(state.critic, (0, None))(places, jnp.ones(()))
-        for state in (initial, plans["log-sum-exp"].planner_state)
-    )
+    critics = initial.critic, plans["log-sum-exp"].planner_state.critic
+    before, after = (jax.vmap(critic, (0, None))(places, jnp.ones(())) for critic in critics)
     assert np.abs(after - values).mean() < 0.25 * np.abs(before - values).mean()
 
 
@@ -151,9 +146,7 @@ def exact_figures(pi, optimal):
 def test_progress_figures_match_dynamic_programming(policy, behavior, initial):
     pi = policy_table(policy)
     figures = figures_of(behavior, pi, initial)
-    expected_return, gradient, entropy, gap = (
-        float(part) for part in exact_figures(policy_table(policy), behavior is OPTIMAL)
-    )
+    expected_return, gradient, entropy, gap = map(float, exact_figures(pi, behavior is OPTIMAL))
     assert figures.iteration == 0
     assert figures.expected_return == pytest.approx(expected_return, abs=0.05)
     assert figures.gradient == pytest.approx(gradient, rel=0.05)

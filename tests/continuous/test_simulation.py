@@ -76,9 +76,8 @@ def test_gather_trajectories_keeps_every_move(walks):
 
 
 def test_simulate_trajectories_unknown_wall_is_run_into():
-    misled = simulate(
-        sc.ObstacleMotion(sc.Walls(low=WALL.low + 90, high=WALL.high + 90), LOW, HIGH, jnp.full(2, 0.05)), SHARP
-    )
+    elsewhere = sc.Walls(WALL.low + 90, WALL.high + 90)
+    misled = simulate(sc.ObstacleMotion(elsewhere, LOW, HIGH, jnp.full(2, 0.05)), SHARP)
     assert len(misled) == COUNT
     assert in_wall(targets(misled)).mean() > 0.5
     assert np.mean([len(walk.actions) == 30 for walk in misled]) > 0.8
@@ -109,10 +108,8 @@ def test_simulate_trajectories_wrong_gravity_changes_actions():
     lattice = sc.Lattice(jnp.asarray([-np.pi, -8.0]), jnp.asarray([np.pi, 8.0]), (20, 17), (True, False))
     goal, torques, real = np.pi - 0.4, jnp.linspace(-2, 2, 5)[:, None], sc.Pendulum(10.0)
     task, starts = sc.PendulumTask(jnp.asarray(goal), jnp.asarray(0.9)), RANDOM.normal([goal, 0], 0.1, (8, 2))
-    right, light = (
-        sc.simulate_trajectories(KEY, agent, real, [task], [starts], 30)
-        for agent in (sc.LatticePlanner(sc.Pendulum(gravity), torques, SHARP, lattice) for gravity in (10.0, 2.0))
-    )
+    agents = (sc.LatticePlanner(sc.Pendulum(gravity), torques, SHARP, lattice) for gravity in (10.0, 2.0))
+    right, light = (sc.simulate_trajectories(KEY, agent, real, [task], [starts], 30) for agent in agents)
     pushes = [np.mean([np.asarray(torques)[walk.actions].mean() for walk in walks]) for walks in (right, light)]
     assert pushes[0] + 0.2 < pushes[1] < 0
     held = [np.mean([walk.states[-10:, 0].mean() for walk in walks]) for walks in (right, light)]
@@ -170,6 +167,5 @@ def test_gather_trajectories_without_trajectories_or_proper_tasks_is_refused():
         sc.gather_trajectories([], GOALS)
     with pytest.raises(ss.InputError, match="field 'tasks': expected at least one task"):
         sc.gather_trajectories([ONE], [])
-    endless = sc.batch_tasks([sc.PendulumTask(goal=jnp.zeros(()), discount=jnp.asarray(0.9))])
     with pytest.raises(ss.InputError, match="field 'discount'"):
-        sc.gather_trajectories([ONE], [sc.PendulumTask(goal=endless.goal[0], discount=jnp.asarray(1.5))])
+        sc.gather_trajectories([ONE], [sc.PendulumTask(jnp.zeros(()), jnp.asarray(1.5))])
