@@ -337,6 +337,7 @@ def broken(density):
     return Broken(vector(0), vector(NOISE), density)
 
 
+WALL = sc.Walls(low=jnp.ones((1, 1)), high=jnp.ones((1, 1)))
 FIRST_BACK = int(np.argmax(CHOICES == 0)) + 1
 
 
@@ -357,7 +358,7 @@ FIRST_BACK = int(np.argmax(CHOICES == 0)) + 1
     ({"dynamics": broken(jnp.nan)}, f"trajectory {FIRST_BACK}, field 'log_prob': .* found the logarithm nan"),
     ({"dynamics": broken(-jnp.inf)}, "'log_prob': expected a density above 0 .* found the logarithm -inf"),
     ({"dynamics": Drift(vector(jnp.nan), vector(NOISE))}, "'parameters': expected finite numbers"),
-    ({"dynamics": sc.ObstacleMotion(sc.Walls(jnp.ones((1, 1)), jnp.ones((1, 1))), vector(-9), vector(9), vector(1))},
+    ({"dynamics": sc.ObstacleMotion(WALL, vector(-9), vector(9), vector(1))},
      "'dynamics': expected parameters to learn, found none"),
     ({"terms": ()}, r"'terms': expected one or both of .*, found \(\)"),
     ({"demonstrations": changed(next_states=NAN)}, "'next_states': expected finite numbers"),

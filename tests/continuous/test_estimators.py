@@ -260,10 +260,10 @@ def test_value_gradient_pathwise_and_score_agree_over_finite_actions():
     assert_agrees(along_paths, scores.mean(axis=0), precision=0.1, uncertain=standard_error(scores))
 
 
-def short_gradient(**settings):
+def short_gradient(horizon=2, samples=2, **settings):
     """An estimate in the table, by default of two moves and rollouts."""
-    agent, settings = sc.Agent(TABLE.dynamics, TABLE.policy, SOFT), {"horizon": 2, "samples": 2} | settings
-    return sc.value_gradient(agent, EVERYWHERE, jax.random.key(0), jnp.ones_like, **settings)
+    problem = sc.Agent(TABLE.dynamics, TABLE.policy, SOFT), EVERYWHERE, jax.random.key(0), jnp.ones_like
+    return sc.value_gradient(*problem, horizon=horizon, samples=samples, **settings)
 
 
 def test_check_estimator_refuses_biased_ones():

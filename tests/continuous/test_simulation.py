@@ -76,7 +76,7 @@ def test_gather_trajectories_keeps_every_move(walks):
 
 
 def test_simulate_trajectories_unknown_wall_is_run_into():
-    elsewhere = sc.Walls(WALL.low + 90, WALL.high + 90)
+    elsewhere = sc.Walls(low=WALL.low + 90, high=WALL.high + 90)
     misled = simulate(sc.ObstacleMotion(elsewhere, LOW, HIGH, jnp.full(2, 0.05)), SHARP)
     assert len(misled) == COUNT
     assert in_wall(targets(misled)).mean() > 0.5

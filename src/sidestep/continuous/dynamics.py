@@ -33,6 +33,7 @@ State = Shaped[Array, "*state"]
 Action = Shaped[Array, "*action"]
 Real = Float[Scalar, ""]
 Vector = Float[Array, " dimensions"]
+Rows = Float[Array, "dimensions _"]
 PerCandidate = Float[Array, "starts candidates"]
 PerSample = Float[Array, "starts candidates samples"]
 ValueFunction = Callable[[State], Real]
@@ -240,12 +241,10 @@ class LinearGaussian(GaussianDynamics):
         [[3.0, 3.0]]
     """
 
-    parameters: dict[str, Float[Array, "dimensions _"]]
+    parameters: dict[str, Rows]
     noise: Vector
 
-    def __init__(
-        self, state: Float[Array, "dimensions dimensions"], action: Float[Array, "dimensions inputs"], noise: Vector
-    ):
+    def __init__(self, state: Rows, action: Rows, noise: Vector):
         self.noise = checked_noise(noise, len(state))
         self.parameters = {"state": jnp.asarray(state), "action": jnp.asarray(action)}
         fits = np.shape(state) == (len(state),) * 2 and np.ndim(action) == 2 and len(action) == len(state)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from sidestep._typing import FloatTree, Tree
 from sidestep.continuous.dynamics import Dynamics
@@ -166,9 +166,7 @@ def _initialize(problem: FitProblem, key: PRNGKeyArray) -> _State:
 
 
 @eqx.filter_jit
-def _step(
-    problem: FitProblem, state: _State, key: PRNGKeyArray, iteration: Int[Array, ""]
-) -> tuple[_State, FitProgress]:
+def _step(problem: FitProblem, state: _State, key: PRNGKeyArray, iteration: Array) -> tuple[_State, FitProgress]:
     """Make one step of the policy, its critic and the model."""
     schedule, planner_state = problem.schedule, state.planner_state
     model_key, *policy_keys = jax.random.split(key, schedule.policy_steps)

@@ -23,6 +23,8 @@ from sidestep.tabular.graph import Graph
 from sidestep.tabular.models import TabularModel
 from sidestep.tabular.tasks import Task
 
+PerPoint = Float[Array, " points"]
+
 
 class Lattice(eqx.Module):
     """Equally spaced points between two corners.
@@ -90,7 +92,7 @@ class Lattice(eqx.Module):
         strides = jnp.asarray(np.append(np.cumprod(self.counts[:0:-1])[::-1], 1).astype(np.int32))
         return ((first + corners) % counts) @ strides, weights
 
-    def interpolate(self, values: Float[Array, " points"], place: Vector) -> Float[Array, ""]:
+    def interpolate(self, values: PerPoint, place: Vector) -> Float[Array, ""]:
         """Return values of points at any place; outside the corners, those at the border.
 
         Args:
@@ -149,9 +151,7 @@ class LatticePlanner(eqx.Module):
         reward = jax.vmap(jax.vmap(task.reward, (None, 0)), (0, None))(points, self.actions)
         return Task(reward, jax.vmap(task.terminal_reward)(points), jax.vmap(task.terminal)(points), task.discount)
 
-    def action_values(
-        self, task: ContinuousTask, values: Float[Array, " points"], state: Vector
-    ) -> Float[Array, " actions"]:
+    def action_values(self, task: ContinuousTask, values: PerPoint, state: Vector) -> Float[Array, " actions"]:
         """Return Q(s, a) at any place by one move of look-ahead, from the values of the lattice's points.
 
         Args:

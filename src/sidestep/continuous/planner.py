@@ -32,10 +32,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
+from jaxtyping import Array, Int, PRNGKeyArray, Shaped
 
 from sidestep._typing import Tree
-from sidestep.continuous.dynamics import PerCandidate, PerSample, check_finite
+from sidestep.continuous.dynamics import PerCandidate, PerSample, Real, check_finite
 from sidestep.continuous.estimators import with_control_variates
 from sidestep.continuous.policies import Agent, Critic, FinitePolicy, Policy, SomePolicy, Starts, make_critic
 from sidestep.continuous.rollouts import Rollout, discounted_returns, q_estimates, returns_to_go, sample_rollouts
@@ -402,9 +402,7 @@ def minibatches(
     return jnp.swapaxes(flat[: size * count].reshape(size, count, *leaf.shape[4:]), 0, 1)
 
 
-def policy_gap(
-    behavior: Behavior, advantages: PerCandidate, q: PerSample, probabilities: PerCandidate
-) -> Float[Array, ""]:
+def policy_gap(behavior: Behavior, advantages: PerCandidate, q: PerSample, probabilities: PerCandidate) -> Real:
     """Return the mean gap between a policy and its own Q estimates.
 
     For soft agents it is the divergence of π_λ from exp βQ̂ in nats, for optimal ones the gain of the best action in

@@ -130,16 +130,14 @@ def _check_trajectory(trajectory: Trajectory, first: Trajectory, tasks: int, row
     """Refuse a trajectory that is inconsistent, or has other shapes than the first."""
     states, actions, task = trajectory
     shape, action = np.shape(first.states)[1:], np.shape(first.actions)[1:]
-    message, field = "", None
-    if len(actions) == 0 or len(states) != len(actions) + 1 or np.shape(states)[1:] != shape:
-        message = f"expected moves and one state of shape {shape} more, found {len(actions)} and {np.shape(states)}"
-    elif np.shape(actions)[1:] != action:
-        message, field = f"expected actions of shape {action}, found {np.shape(actions)[1:]}", "actions"
-    elif not (np.isfinite(states).all() and np.isfinite(actions).all()):
-        message, field = "expected finite numbers", "actions" if np.isfinite(states).all() else "states"
-    elif not 0 <= task < tasks:
-        message = f"expected a task in 0…{tasks - 1}, found {task}"
-    check(not message, message, source="trajectory", row=row, field=field)
+    expect = partial(check, source="trajectory", row=row)
+    fits = len(states) == len(actions) + 1 > 1 and np.shape(states)[1:] == shape
+    expect(fits, f"expected moves and one state of shape {shape} more, found {len(actions)} and {np.shape(states)}")
+    message = f"expected actions of shape {action}, found {np.shape(actions)[1:]}"
+    expect(np.shape(actions)[1:] == action, message, field="actions")
+    for field, part in {"states": states, "actions": actions}.items():
+        expect(np.isfinite(part).all(), "expected finite numbers", field=field)
+    expect(0 <= task < tasks, f"expected a task in 0…{tasks - 1}, found {task}")
 
 
 @eqx.filter_jit

@@ -19,16 +19,16 @@ class ContinuousConfig:
     Attributes:
         agents_per_goal: The number of agents with each of the goals.
         beta: Their inverse temperature β, in units of one over reward.
-        width: The units in each hidden layer of the policy.
         planner: Rollouts and the policy's optimizers.
         schedule: The length and the steps of the fit.
+        width: The units in each hidden layer of the policy.
     """
 
     agents_per_goal: int
     beta: float
-    width: int
     planner: sc.Planner
     schedule: sc.Schedule
+    width: int = 48
 
     @property
     def behavior(self) -> ss.Behavior:

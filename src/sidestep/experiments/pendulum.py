@@ -39,7 +39,6 @@ class PendulumConfig(ContinuousConfig):
 
     agents_per_goal: int = 5
     beta: float = 10.0
-    width: int = 48
     planner: sc.Planner = field(default_factory=lambda: sc.Planner(horizon=20, learning_rate=0.01))
     schedule: sc.Schedule = field(
         default_factory=lambda: sc.Schedule(300, policy_warmup=150, batch_size=100, learning_rate=0.03)
@@ -77,9 +76,8 @@ class PendulumConfig(ContinuousConfig):
         shape = self.agents_per_goal, 2
         starts = [np.array([goal, 0.0]) + random.uniform(-spread, spread, shape) for goal in self.goals]
         lattice = sc.Lattice(jnp.array([-np.pi, -8.0]), jnp.array([np.pi, 8.0]), self.lattice_points, (True, False))
-        real, believed = (
-            sc.Pendulum(gravity, noise=self.noise) for gravity in (self.real_gravity, self.believed_gravity)
-        )
+        gravities = self.real_gravity, self.believed_gravity
+        real, believed = (sc.Pendulum(gravity, noise=self.noise) for gravity in gravities)
         agent = sc.LatticePlanner(believed, self.actions, self.behavior, lattice)
         return sc.simulate_trajectories(jax.random.key(seed), agent, real, self.tasks, starts, self.moves)
 

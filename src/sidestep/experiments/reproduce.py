@@ -113,9 +113,8 @@ def simulate_walks(world: World, config: ReproduceConfig, seed: int) -> ss.Demon
         The walks.
     """
     tasks = [config.reward.reach(world.truth.forget(), goal) for goal in world.goals]
-    starts = [
-        np.repeat([start for start in world.starts if start != goal], config.walks_per_pair) for goal in world.goals
-    ]
+    others = ([start for start in world.starts if start != goal] for goal in world.goals)
+    starts = [np.repeat(each, config.walks_per_pair) for each in others]
     return ss.gather(ss.simulate(jax.random.key(seed), ss.true_model(world.truth), tasks, starts), tasks)
 
 

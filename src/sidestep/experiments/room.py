@@ -39,7 +39,6 @@ class RoomConfig(ContinuousConfig):
 
     agents_per_goal: int = 24
     beta: float = 4.0
-    width: int = 48
     planner: sc.Planner = field(default_factory=lambda: sc.Planner(horizon=24, learning_rate=0.02))
     schedule: sc.Schedule = field(
         default_factory=lambda: sc.Schedule(300, policy_warmup=80, learning_rate=0.15, policy_gap_tolerance=0.2)

@@ -79,9 +79,7 @@ def draw_cells(
     rows, columns = grid.shape
     x, y, yaw = grid.origin
     extent = (0.0, columns * grid.resolution, 0.0, rows * grid.resolution)
-    image = axes.imshow(
-        values, cmap=colors, vmin=limits[0], vmax=limits[1], extent=extent, origin="upper", interpolation_stage="rgba"
-    )
+    image = axes.imshow(values, cmap=colors, clim=limits, extent=extent, origin="upper", interpolation_stage="rgba")
     image.set_transform(Affine2D().rotate(yaw).translate(x, y) + axes.transData)
     low, high = _corners(grid).min(axis=0), _corners(grid).max(axis=0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x (m)", ylabel="y (m)")
@@ -334,9 +332,7 @@ def _shifts(count: int) -> Float[np.ndarray, "walks 2"]:
     return ((sequence + 0.5) % 1.0 - 0.5) * 0.6
 
 
-def _draw_markers(
-    axes: Axes, places: Marks, grid: Grid, marker: str, color: str, label: str, scale: float = 1.0
-) -> None:
+def _draw_markers(axes: Axes, places: Marks, grid: Grid, marker: str, color: str, label: str, scale: float = 1) -> None:
     if not len(places):
         return
     x, y = _metres(np.asarray(places), grid).T

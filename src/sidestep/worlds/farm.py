@@ -12,10 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+import sidestep as ss
 from sidestep.errors import check
-from sidestep.tabular.graph import graph, straight_moves
-from sidestep.tabular.grid import Grid
-from sidestep.tabular.models import FIXED, IMPOSSIBLE, TiedModel
+from sidestep.tabular.graph import straight_moves
 
 _CERTAIN_LOGIT = 12.0
 
@@ -36,7 +35,7 @@ class Farm(NamedTuple):
         """The number of machines."""
         return int(self.machine.max()) + 1
 
-    def model(self, logits: Float[Array | np.ndarray, "terrains machines"] | float = 0.0) -> TiedModel:
+    def model(self, logits: Float[Array | np.ndarray, "terrains machines"] | float = 0.0) -> ss.TiedModel:
         """Return the model in which terrain t stops machine m with probability σ(logits[t − 1, m]).
 
         Args:
@@ -52,17 +51,17 @@ class Farm(NamedTuple):
         valid = self.terrain.shape == self.machine.shape and terrains >= 1 and count >= 1
         check(valid, "expected maps of one shape with terrain above 0 and machines from 0", field="terrain")
         cells, driven = np.divmod(np.arange(count * self.terrain.size), count)
-        target = straight_moves(Grid.unknown(*self.terrain.shape))[cells]
+        target = straight_moves(ss.Grid.unknown(*self.terrain.shape))[cells]
         moves = target != cells[:, None]
         terrain, standing = self.terrain.ravel()[target], self.machine.ravel()[target]
         after = count * target + np.where(moves & (standing >= 0), standing, driven[:, None])
         staying = np.broadcast_to(np.arange(len(cells))[:, None], after.shape)
-        stopped = np.where(moves & (terrain > 0), count * (terrain - 1) + driven[:, None], IMPOSSIBLE)
-        index = np.stack([np.full_like(stopped, FIXED), stopped], axis=-1)
+        stopped = np.where(moves & (terrain > 0), count * (terrain - 1) + driven[:, None], ss.IMPOSSIBLE)
+        index = np.stack([np.full_like(stopped, ss.FIXED), stopped], axis=-1)
         flat = jnp.broadcast_to(jnp.asarray(logits, jnp.result_type(float)), (terrains, count)).ravel()
-        return TiedModel(graph(np.stack([after, staying], axis=-1)), index, flat)
+        return ss.TiedModel(ss.graph(np.stack([after, staying], axis=-1)), index, flat)
 
-    def known_model(self, enters: Bool[np.ndarray, "terrains machines"]) -> TiedModel:
+    def known_model(self, enters: Bool[np.ndarray, "terrains machines"]) -> ss.TiedModel:
         """Return the model of an agent that knows which machine enters which terrain.
 
         Args:
@@ -73,7 +72,7 @@ class Farm(NamedTuple):
         """
         return self.model(np.where(enters, -_CERTAIN_LOGIT, _CERTAIN_LOGIT))
 
-    def stop_probabilities(self, model: TiedModel) -> Float[Array, "terrains machines"]:
+    def stop_probabilities(self, model: ss.TiedModel) -> Float[Array, "terrains machines"]:
         """Return the probability that each terrain stops each machine, under a model from `model`.
 
         Args:

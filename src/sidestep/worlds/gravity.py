@@ -12,10 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+import sidestep as ss
 from sidestep.errors import check
-from sidestep.tabular.graph import graph, straight_moves
-from sidestep.tabular.grid import Grid
-from sidestep.tabular.models import FIXED, IMPOSSIBLE, TiedModel
+from sidestep.tabular.graph import straight_moves
 
 DIRECTIONS = ("up", "down", "left", "right")
 _OPPOSITE = np.array([1, 0, 3, 2])
@@ -32,7 +31,7 @@ class Gravity(NamedTuple):
 
     colors: Int[np.ndarray, "rows columns"]
 
-    def model(self, logits: Float[Array | np.ndarray, "colors 4"] | float = 0.0) -> TiedModel:
+    def model(self, logits: Float[Array | np.ndarray, "colors 4"] | float = 0.0) -> ss.TiedModel:
         """Return the model in which color c turns gravity to direction g with the softmax of `logits[c - 1]`.
 
         Args:
@@ -47,17 +46,17 @@ class Gravity(NamedTuple):
         count = int(self.colors.max())
         check(self.colors.min() >= 0 and count > 0, "expected colors 0…n, and one above 0", field="colors")
         cells, gravity = np.divmod(np.arange(4 * self.colors.size), 4)
-        target = straight_moves(Grid.unknown(*self.colors.shape))[cells]
+        target = straight_moves(ss.Grid.unknown(*self.colors.shape))[cells]
         moved = (target != cells[:, None]) & (np.arange(4) != _OPPOSITE[gravity][:, None])
         target = np.where(moved, target, cells[:, None])
         color = np.where(moved, self.colors.ravel()[target], 0)[..., None]
         turned = np.where(color > 0, np.arange(4), gravity[:, None, None])
-        index = np.where(color > 0, 4 * (color - 1) + np.arange(4), IMPOSSIBLE)
-        index[..., 0] = np.where(color[..., 0] > 0, index[..., 0], FIXED)
+        index = np.where(color > 0, 4 * (color - 1) + np.arange(4), ss.IMPOSSIBLE)
+        index[..., 0] = np.where(color[..., 0] > 0, index[..., 0], ss.FIXED)
         flat = jnp.broadcast_to(jnp.asarray(logits, jnp.result_type(float)), (count, 4)).ravel()
-        return TiedModel(graph(4 * target[..., None] + turned), index, flat)
+        return ss.TiedModel(ss.graph(4 * target[..., None] + turned), index, flat)
 
-    def known_model(self, rule: Int[np.ndarray, " colors"]) -> TiedModel:
+    def known_model(self, rule: Int[np.ndarray, " colors"]) -> ss.TiedModel:
         """Return the model of an agent that knows that color c turns gravity to direction `rule[c - 1]`.
 
         Args:
@@ -69,7 +68,7 @@ class Gravity(NamedTuple):
         return self.model(_CERTAIN_LOGIT * np.eye(4)[np.asarray(rule)])
 
 
-def most_probable_rule(model: TiedModel) -> Int[np.ndarray, " colors"]:
+def most_probable_rule(model: ss.TiedModel) -> Int[np.ndarray, " colors"]:
     """Return the most probable direction of each color, under a model from `Gravity.model`.
 
     Args:
