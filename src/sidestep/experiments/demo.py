@@ -64,10 +64,9 @@ def demo(folder: Path, seed: int = 0, notify: Notify = quiet, config: DemoConfig
     new = elsewhere[~np.isin(elsewhere, goals)][: config.new_places]
     paths, _ = ss.plan_paths(learned.robot(), new[:1], new[1:])
     title = "what they say of its walls, and new plans"
-    starts, ends = new[:1].tolist(), new[1:].tolist()
     panels = [
         Panel(f"{len(walks)} walks in an office", truth, paths=learning.demonstrations.paths(), goals=goals),
-        Panel(title, learned.grid, learned.blocked, truth, paths, starts, ends),
+        Panel(title, learned.grid, learned.blocked, truth, paths, new[:1], new[1:]),
     ]
     save(figure_learned(panels), folder / "demo.png")
     entries = {"command": "demo", "agents": asdict(agents), "scores": scores.to_dict()}
