@@ -131,7 +131,7 @@ def test_learn_and_simulate_with_an_invalid_map_name_the_field(here, capsys, key
     ("--step-cost -1", "field 'step_cost'"),
     ("--prior-variance 0", "field 'prior variance'"),
     ("--prior-mean inf", "field 'prior mean'"),
-    ("--horizon 0", "at least one action"),
+    ("--horizon 0", "field 'horizon'"),
     ("--max-iterations 0", "field 'max_iterations'"),
     ("--max-walks 0", "field 'max_walks'"),
     ("--max-walks 2", "field 'max_walks'"),

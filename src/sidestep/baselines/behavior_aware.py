@@ -66,5 +66,4 @@ def visit_counts(grid: Grid, demonstrations: Demonstrations, config: MapConfig) 
     """
     ranking = visit_ranking(np.concatenate(demonstrations.paths()), grid)
     blocked = np.clip(1 / (1 - ranking), None, _UNVISITED).ravel()
-    model = ObstacleGrid(grid, np.log(blocked) - np.log1p(-blocked))
-    return model_result(model, demonstrations, config, ranking)
+    return model_result(ObstacleGrid(grid, np.log(blocked) - np.log1p(-blocked)), demonstrations, config, ranking)

@@ -17,6 +17,7 @@ References:
 
 import warnings
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -64,8 +65,7 @@ class ClonedPolicy:
         Args:
             goal: The goal, a state.
         """
-        states = np.arange(self.grid.size)
-        return np.exp(self._log_policy(states, np.full(self.grid.size, goal)))
+        return np.exp(self._log_policy(np.arange(self.grid.size), np.full(self.grid.size, goal)))
 
     @property
     def planner(self) -> PolicyPlanner:
@@ -105,20 +105,18 @@ def behavior_cloning(
     walks = np.asarray(demonstrations.trajectory)
     fold, everything = walks % _FOLDS, np.ones(len(walks), dtype=bool)
 
-    def learn(used: Bool[np.ndarray, " moves"], variance: float) -> ClonedPolicy:
-        return _fit_policy(grid, demonstrations, used, variance, max_iterations)
+    learn = partial(_fit_policy, grid, demonstrations, max_iterations)
 
     def heldout_log_likelihood(variance: float) -> float:
-        return sum(
-            float(learn(fold != own, variance).log_policies(demonstrations)[fold == own].sum()) for own in range(_FOLDS)
-        )
+        each = (learn(fold != own, variance).log_policies(demonstrations)[fold == own] for own in range(_FOLDS))
+        return sum(float(own.sum()) for own in each)
 
     enough = walks[-1] + 1 >= _FOLDS
     return learn(everything, max(_VARIANCES, key=heldout_log_likelihood) if enough else _VARIANCES[1])
 
 
 def _fit_policy(
-    grid: Grid, demonstrations: Demonstrations, used: Bool[np.ndarray, " moves"], variance: float, max_iterations: int
+    grid: Grid, demonstrations: Demonstrations, max_iterations: int, used: Bool[np.ndarray, " moves"], variance: float
 ) -> ClonedPolicy:
     """Fit the regression to some moves, and to one move of each action without features so that none is impossible."""
     from sklearn.exceptions import ConvergenceWarning
@@ -158,5 +156,4 @@ def _features(grid: Grid, states: _Index, goals: _Index) -> csr_array:
 
 
 def _one_hot(index: _Index, size: int) -> csr_array:
-    visits = np.arange(len(index))
-    return csr_array((np.ones(len(index)), (visits, index)), shape=(len(index), size))
+    return csr_array((np.ones(len(index)), (np.arange(len(index)), index)), shape=(len(index), size))

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from sidestep.maps.fit import behavior_of, demonstrations_of
 from sidestep.maps.learn import Learning, learn_map, sample_walks
 from sidestep.maps.learned_map import LearnedMap
 from sidestep.maps.selection import Selection
-from sidestep.maps.sensors import SensorMap
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Grid
 
@@ -76,11 +74,9 @@ def compare_methods(
     *,
     hold_out: float = 0.2,
     baselines: Mapping[str, Method] = BASELINES,
-    sensor: SensorMap | None = None,
     annotations: WalkAnnotations = NO_ANNOTATIONS,
     notify: Callable[[str], None] = lambda _: None,
-    checkpoint: Path | None = None,
-    resume: bool = False,
+    **options: Any,
 ) -> Comparison:
     """Learn by every method from some of the walks, and evaluate the results.
 
@@ -94,11 +90,9 @@ def compare_methods(
         config: The configuration.
         hold_out: The fraction of walks, drawn by the seed, that are scored and not learned from; may be 0.
         baselines: The baselines by name.
-        sensor: As for `learn_map`.
         annotations: As for `learn_map`.
         notify: Called with a line of text at each stage.
-        checkpoint: As for `learn_map`.
-        resume: As for `learn_map`.
+        **options: Other options of `learn_map`: `sensor`, `checkpoint` and `resume`.
 
     Returns:
         The scores of all methods, and the learned map.
@@ -111,10 +105,9 @@ def compare_methods(
     walks, config = sample_walks(walks, config), replace(config, max_walks=None)
     train, test = _split(walks, hold_out, config.seed)
     notify("map: behavior learns")
-    options: dict[str, Any] = {"notify": notify, "checkpoint": checkpoint, "resume": resume}
     learned, failure = None, None
     try:
-        learned = learn_map(grid, train, config, sensor=sensor, annotations=annotations, **options)
+        learned = learn_map(grid, train, config, annotations=annotations, notify=notify, **options)
     except (ImproperTask, NotConverged) as error:
         if config.behavior.select:
             raise  # the baselines need the selected behavior too

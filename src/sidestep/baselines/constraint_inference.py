@@ -58,8 +58,7 @@ def constraint_inference(grid: Grid, demonstrations: Demonstrations, config: Map
             break
         forbidden.append(cell)
         visits, log_likelihood = new_visits, new_log_likelihood
-    model = ObstacleGrid(grid, _logits(candidates, forbidden, visits))
-    return model_result(model, demonstrations, config)
+    return model_result(ObstacleGrid(grid, _logits(candidates, forbidden, visits)), demonstrations, config)
 
 
 def _logits(candidates: Bool[np.ndarray, " cells"], forbidden: list[int], visits: _Visits) -> _Visits:

@@ -20,13 +20,15 @@ from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.reward import Reward
 from sidestep.tabular.tasks import stack_tasks
 
+_Cells = Float[np.ndarray, "rows columns"]
+
 
 @runtime_checkable
 class BaselineResult(MethodResult, Protocol):
     """The result of a method: what a study evaluates, and a picture."""
 
     @property
-    def heatmap(self) -> Float[np.ndarray, "rows columns"] | None:
+    def heatmap(self) -> _Cells | None:
         """The ranking of cells from 0 to 1: P(blocked), if the method has it; None without a ranking."""
         ...
 
@@ -50,12 +52,12 @@ class ModelResult(NamedTuple):
     model: ObstacleGrid
     reward: Reward
     behavior: Behavior
-    ranking: Float[np.ndarray, "rows columns"]
+    ranking: _Cells
     planner: Planner
     converged: bool
 
     @property
-    def heatmap(self) -> Float[np.ndarray, "rows columns"]:
+    def heatmap(self) -> _Cells:
         """P(blocked), or the ranking from 0 to 1 if P(blocked) is constant or the ranking is no probability."""
         blocked = np.asarray(self.model.blocked, dtype=np.float64)
         if np.ptp(self.ranking) and (self.ranking.max() > 1 or not np.ptp(blocked)):
@@ -75,10 +77,7 @@ class ModelResult(NamedTuple):
 
 
 def model_result(
-    model: ObstacleGrid,
-    demonstrations: Demonstrations,
-    config: MapConfig,
-    ranking: Float[np.ndarray, "rows columns"] | None = None,
+    model: ObstacleGrid, demonstrations: Demonstrations, config: MapConfig, ranking: _Cells | None = None
 ) -> ModelResult:
     """Return a learned map as a result, with a risk-averse robot that knows the visited cells.
 

@@ -27,7 +27,7 @@ References:
     simultaneous estimation of rewards and dynamics. Artificial Intelligence and Statistics.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import jax.numpy as jnp
@@ -60,10 +60,10 @@ class CostlyReward(Reward):
     """A reward with a cost of each cell.
 
     Attributes:
-        costs: The cost of a move that aims at each cell, in units of reward; None for no costs.
+        costs: The cost of a move that aims at each cell, in units of reward.
     """
 
-    costs: Float[np.ndarray, " cells"] | None = None
+    costs: Float[np.ndarray, " cells"] = field(kw_only=True)
 
     def reach(self, world: Grid | Graph, goal: int | tuple[float, float]) -> Task:
         """Return the task of reaching a goal, with the costs of cells.
@@ -72,11 +72,8 @@ class CostlyReward(Reward):
             world: A grid, or the graph of any discrete world.
             goal: A state; on a grid also a position (x, y) in metres.
         """
-        task = super().reach(world, goal)
-        if self.costs is None:
-            return task
         graph = world if isinstance(world, Graph) else grid_graph(world)
-        return with_state_costs(task, jnp.asarray(self.costs), graph.successors[..., 0])
+        return with_state_costs(super().reach(world, goal), jnp.asarray(self.costs), graph.successors[..., 0])
 
 
 def maxent_irl(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
@@ -99,7 +96,7 @@ def maxent_irl(grid: Grid, demonstrations: Demonstrations, config: MapConfig) ->
     if not result.converged:
         raise NotConverged(f"the costs of cells did not converge: {result.message}")
     costs = np.asarray(result.behavior.costs)
-    reward = CostlyReward(config.reward.discount, config.reward.step_cost, costs)
+    reward = CostlyReward(config.reward.discount, config.reward.step_cost, costs=costs)
     planner = ModelPlanner(model, partial(reward.reach, model.blank))
     return ModelResult(model, reward, result.behavior.behavior_of(), costs.reshape(grid.shape), planner, True)
 
@@ -129,5 +126,5 @@ def joint_estimation(grid: Grid, demonstrations: Demonstrations, config: MapConf
     model, agents = ObstacleGrid(grid, config.prior.mean), cost_behavior_model(grid, config)
     fit = fit_map(model, demonstrations, config, behavior=agents)
     result = model_result(fit.model, demonstrations, config)
-    reward = CostlyReward(config.reward.discount, config.reward.step_cost, np.asarray(fit.behavior.costs))
+    reward = CostlyReward(config.reward.discount, config.reward.step_cost, costs=np.asarray(fit.behavior.costs))
     return result._replace(reward=reward, behavior=fit.behavior.behavior_of(), converged=fit.converged)

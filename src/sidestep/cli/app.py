@@ -62,8 +62,7 @@ def _prepared(command: Callable[..., None]) -> Callable[..., None]:
 
 
 for _command, _example in _EXAMPLES.items():
-    _name = _command.__name__
-    app.command(name=_name, epilog=f"Example: {_example}")(_prepared(_command))
+    app.command(name=_command.__name__, epilog=f"Example: {_example}")(_prepared(_command))
 
 
 def _print_version(wanted: bool) -> bool:
@@ -119,9 +118,8 @@ def main(arguments: list[str] | None = None) -> int:
         # a defect of the program: one line, and the details on request
         if os.environ.get("SIDESTEP_DEBUG"):
             traceback.print_exc()
-        message = (
-            f"error: sidestep failed ({type(error).__name__}: {error}); set SIDESTEP_DEBUG=1 for details to report"
-        )
+        cause = f"{type(error).__name__}: {error}"
+        message = f"error: sidestep failed ({cause}); set SIDESTEP_DEBUG=1 for details to report"
     from sidestep.cli.display import print_notes
 
     print_notes(message)

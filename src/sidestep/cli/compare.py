@@ -35,18 +35,8 @@ def compare(
     grid, checkpoint = options.grid(map_file), out / "fit.checkpoint"
     truth = read_map_like(true_map, grid)
     with working("starting") as notify:
-        comparison = compare_methods(
-            grid,
-            truth,
-            read_walks(walks),
-            options.config(),
-            hold_out=hold_out,
-            sensor=options.sensor(grid),
-            annotations=options.annotations(),
-            notify=notify,
-            checkpoint=checkpoint,
-            resume=options.resume,
-        )
+        table, inputs = read_walks(walks), options.more_inputs(grid, checkpoint)
+        comparison = compare_methods(grid, truth, table, options.config(), hold_out=hold_out, notify=notify, **inputs)
         save(figure_comparison(comparison), out / "compare.png")
         if comparison.learned is not None:
             save_learned(comparison.learned, out / "behavior", command="learn", files=files)

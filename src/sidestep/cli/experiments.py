@@ -29,12 +29,7 @@ def reproduce(out: Folder = Path("sidestep-reproduce"), seed: Seed = 0) -> None:
 
     with working("starting") as notify:
         summary = reproduce(out, seed, notify)
-    rows = {
-        f"{name} {variant}": scores
-        for name, variants in summary["maps"].items()
-        for variant, scores in variants.items()
-    }
-    print_scores(rows)
+    print_scores({f"{name} {way}": scores for name, ways in summary["maps"].items() for way, scores in ways.items()})
     print_lines(f"figures and numbers in {out}")
 
 

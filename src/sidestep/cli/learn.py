@@ -21,17 +21,8 @@ def learn(walks: Walks, map_file: MapFile, out: Folder, options: LearnOptions) -
     config, checkpoint = options.config(), out / "fit.checkpoint"
     grid = options.grid(map_file)
     with fit_progress(max_iterations(config.fit)) as (callback, notify):
-        learned = learn_map(
-            grid,
-            read_walks(walks),
-            config,
-            sensor=options.sensor(grid),
-            annotations=options.annotations(),
-            callback=callback,
-            notify=notify,
-            checkpoint=checkpoint,
-            resume=options.resume,
-        )
+        table, inputs = read_walks(walks), options.more_inputs(grid, checkpoint)
+        learned = learn_map(grid, table, config, callback=callback, notify=notify, **inputs)
         save_learned(learned, out, command="learn", files={"walks": str(walks), "map": str(map_file)})
     checkpoint.unlink(missing_ok=True)
     learning = learned.learning

@@ -12,8 +12,6 @@ from sidestep.maps.config import BackupName, BehaviorConfig, FitConfig, MapConfi
 from sidestep.tabular.reward import Reward
 
 if TYPE_CHECKING:
-    from sidestep.maps.annotations import WalkAnnotations
-    from sidestep.maps.sensors import SensorMap
     from sidestep.tabular.grid import Connectivity, Grid
 
 _Config = TypeVar("_Config", Reward, BehaviorConfig, FitConfig)
@@ -44,21 +42,17 @@ class LearnOptions:
     beta: Annotated[float, Option(help="The inverse temperature β, in units of one over reward.")] = BehaviorConfig.beta
     lapse: Annotated[float | None, Option(help="The probability of a random action, if any.")] = BehaviorConfig.lapse
     learn: Annotated[
-        list[str] | None,
-        Option(help="Learned together with the map; repeat it for several.", metavar="beta|lapse|discount"),
+        list[str] | None, Option(help="Learned with the map; repeat it for several.", metavar="beta|lapse|discount")
     ] = None
     person_column: Annotated[str | None, Option(help="The column of each walk's person: each has their own β.")] = None
     goal_candidates: Annotated[
         Path | None,
-        Option(
-            help="For walks that do not name their goals: a table of goal_x, goal_y that they may have had.",
-            metavar="GOALS.csv",
-        ),
+        Option(help="A table of goal_x, goal_y that walks without goals may have had.", metavar="GOALS.csv"),
     ] = None
     tempering: Annotated[
         float, Option(help="The weight of the actions, above 0 and at most 1; below 1 if they are dependent.")
     ] = BehaviorConfig.tempering
-    horizon: Annotated[int | None, Option(help="How many actions agents look ahead; no limit by default.")] = (
+    horizon: Annotated[int | None, Option(help="How many actions agents look ahead, if limited.")] = (
         BehaviorConfig.horizon
     )
     discount: Discount = Reward.discount
@@ -85,11 +79,10 @@ class LearnOptions:
 
     def config(self) -> MapConfig:
         """Return the configuration."""
+        learned = tuple(dict.fromkeys(self.learn or ()))
         return MapConfig(
             reward=self._part(Reward),
-            behavior=self._part(
-                BehaviorConfig, learn=tuple(dict.fromkeys(self.learn or ())), select=self.select_behavior
-            ),
+            behavior=self._part(BehaviorConfig, learn=learned, select=self.select_behavior),
             prior=PriorConfig(self.prior_mean, self.prior_variance, self.wall_prior),
             fit=self._part(FitConfig, gradient=self.gradient.replace("-", "_")),
             max_walks=self.max_walks,
@@ -114,32 +107,25 @@ class LearnOptions:
 
         return read_map(map_file, connectivity=connectivity_of(self.connectivity))
 
-    def sensor(self, grid: "Grid") -> "SensorMap | None":
-        """Read the map of the sensors, if there is one.
+    def more_inputs(self, grid: "Grid", checkpoint: Path) -> dict[str, Any]:
+        """Read what sensors saw of the map, and the annotations of the walks, where there are any.
 
         Args:
             grid: The map.
+            checkpoint: The file of the checkpoint.
 
         Returns:
-            What sensors saw of the map; None without an option.
-        """
-        if self.sensor_map is None:
-            return None
-        from sidestep.maps.sensors import read_sensor
-
-        return read_sensor(self.sensor_map, grid, _number_or_file(self.sensor_variance))
-
-    def annotations(self) -> "WalkAnnotations":
-        """Read the annotations of the walks.
-
-        Returns:
-            The column of persons, and the candidates for goals.
+            The arguments `sensor`, `annotations`, `checkpoint` and `resume` of `learn_map` and `compare_methods`.
         """
         from sidestep.maps.annotations import WalkAnnotations
         from sidestep.maps.goal_candidates import read_goal_candidates
+        from sidestep.maps.sensors import read_sensor
 
+        variance = _number_or_file(self.sensor_variance)
+        sensor = None if self.sensor_map is None else read_sensor(self.sensor_map, grid, variance)
         candidates = None if self.goal_candidates is None else read_goal_candidates(self.goal_candidates)
-        return WalkAnnotations(self.person_column, candidates)
+        annotations = WalkAnnotations(self.person_column, candidates)
+        return {"sensor": sensor, "annotations": annotations, "checkpoint": checkpoint, "resume": self.resume}
 
 
 def connectivity_of(option: str) -> "Connectivity":

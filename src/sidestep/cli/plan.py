@@ -32,19 +32,17 @@ def plan(
     steps = np.arange(len(path.states))
     write_table(out / "path.csv", pa.table({"step": steps, "x": x, "y": y, "blocked": path.blocked}))
     draw("figure_plan", out / "path.png", learned.grid, learned.blocked, path.states)
+    moves, likeliest = len(path.states) - 1, float(path.blocked.max())
     summary = {
         "command": "plan",
         "start": first,
         "goal": last,
         "bump_cost": bump_cost,
-        "moves": len(path.states) - 1,
+        "moves": moves,
         "length_metres": path.length,
-        "max_probability_blocked": float(path.blocked.max()),
+        "max_probability_blocked": likeliest,
         "probability_free": float(np.prod(1 - path.blocked)),
     }
     add_to_summary(folder, out, "plan", summary)
-    print_lines(
-        f"{summary['moves']} moves, {path.length:g} m; the likeliest obstacle on the way has "
-        f"P(blocked) = {path.blocked.max():.3f}",
-        f"path in {out}",
-    )
+    print_lines(f"{moves} moves, {path.length:g} m; the likeliest obstacle on the way has P(blocked) = {likeliest:.3f}")
+    print_lines(f"path in {out}")

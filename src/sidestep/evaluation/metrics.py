@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Integer
 from scipy.sparse import csr_array
 
 from sidestep.errors import check
-from sidestep.tabular.graph import free_cells, walkable_graph
+from sidestep.tabular.graph import check_states, free_cells, walkable_graph
 from sidestep.tabular.grid import Cell, Grid
 
 _Cells = Bool[np.ndarray, "rows columns"]
@@ -140,8 +140,8 @@ def score_paths(
     for row, path in enumerate(paths, start=1):
         check(len(path), "expected at least one state", source="path", row=row)
     ends = np.asarray(goals)
-    check_states(np.concatenate(paths), truth, "paths")
-    check_states(ends, truth, "goals")
+    check_states(np.concatenate(paths), truth.size, "paths")
+    check_states(ends, truth.size, "goals")
     graph = walkable_graph(truth)
     starts = np.array([path[0] for path in paths])
     # a single state in an obstacle has no move that could be illegal
@@ -213,20 +213,8 @@ def visit_ranking(visited: Integer[np.ndarray, " moves"], grid: Grid) -> Float[n
     Raises:
         InputError: For numbers that are not states of the map.
     """
-    check_states(visited, grid, "visited")
+    check_states(visited, grid.size, "visited")
     return -np.bincount(visited, minlength=grid.size).reshape(grid.shape).astype(np.float64)
-
-
-def check_states(states: Integer[np.ndarray, " states"], grid: Grid, field: str) -> None:
-    """Raise `InputError` for numbers that are not states of the grid.
-
-    Args:
-        states: The numbers.
-        grid: The map.
-        field: What the error calls them.
-    """
-    valid = np.all((states >= 0) & (states < grid.size))
-    check(valid, f"expected states in 0…{grid.size - 1}", field=field)
 
 
 def _mean(values: np.ndarray) -> float | None:

@@ -11,8 +11,7 @@ from jaxtyping import Bool, Float, Integer
 from scipy.sparse import csr_array, vstack
 
 from sidestep.errors import check
-from sidestep.evaluation.metrics import check_states
-from sidestep.tabular.graph import clear_cells, clear_moves, free_cells, moves_into, walkable_graph
+from sidestep.tabular.graph import check_states, clear_cells, clear_moves, free_cells, moves_into, walkable_graph
 from sidestep.tabular.grid import Cell, Grid
 
 _Lengths = Float[np.ndarray, " states"]
@@ -46,8 +45,8 @@ def relevant_obstacles(
 
     message = f"expected {len(visited)}, one for each visited state, found {len(goals)}"
     check(len(visited) == len(goals), message, field="goals")
-    check_states(visited, truth, "visited")
-    check_states(goals, truth, "goals")
+    check_states(visited, truth.size, "visited")
+    check_states(goals, truth.size, "goals")
     graph = walkable_graph(truth)
     through, past = _moves_of_closed_cells(truth), _prevented_diagonals(truth)
     relevant = np.zeros(truth.size, dtype=bool)

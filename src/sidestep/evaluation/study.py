@@ -45,6 +45,8 @@ class MethodResult(Protocol):
 
 Method = Callable[[Grid, Demonstrations], MethodResult]
 """A method: it learns from demonstrations on a map."""
+Notify = Callable[[str], None]
+"""Called with a line of text at each stage."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,13 +121,7 @@ def run_study(problems: Iterable[Problem], methods: Mapping[str, Method], **opti
 
 
 def run_method(
-    problem: Problem,
-    name: str,
-    learn: Method,
-    *,
-    seed: int = 0,
-    paths: bool = True,
-    notify: Callable[[str], None] = lambda _: None,
+    problem: Problem, name: str, learn: Method, *, seed: int = 0, paths: bool = True, notify: Notify = lambda _: None
 ) -> Record:
     """Learn from one problem by one method, and evaluate the result.
 

@@ -121,5 +121,4 @@ def _merged(visits: Visits) -> Visits:
     """Join successive visits to the same cell."""
     changes = (np.diff(visits.walk) != 0) | (np.diff(visits.cell, axis=0) != 0).any(axis=1)
     first = np.flatnonzero(np.concatenate([[True], changes]))
-    length = np.add.reduceat(visits.length, first)
-    return Visits(visits.walk[first], visits.cell[first], length, visits.arrival[first])
+    return Visits(visits.walk[first], visits.cell[first], np.add.reduceat(visits.length, first), visits.arrival[first])

@@ -110,8 +110,7 @@ def grid_walks(walks: Walks, grid: Grid) -> Moves:
     visits = _around_corners(visits, occupied, diagonals=grid.connectivity == 8)
     message = "the way to this position leads through a cell that the map shows as occupied "
     message += "(image row {}, column {}, from 0); expected walks around known obstacles"
-    free = ~occupied[tuple(visits.cell.T)]
-    check_rows(free, message, walks.source, "x", walks.rows[visits.arrival], visits.cell)
+    check_rows(~occupied[tuple(visits.cell.T)], message, walks.source, "x", walks.rows[visits.arrival], visits.cell)
     goals = _goal_cells(walks, grid, visits, occupied)
     failures = np.flatnonzero(np.isfinite(walks.failed_moves[:, 0]))
     if grid.connectivity == 8:
@@ -172,7 +171,9 @@ def _moves(visits: Visits, failures: _Failures, goals: Int[np.ndarray, " walks"]
     moving, first_rows = np.bincount(walk, minlength=len(walks)) > 0, walks.rows[walks.offsets[:-1]]
     message = "expected at least one move, but walk {!r} never leaves its cell"
     check_rows(moving, message, walks.source, "walk", first_rows, walks.labels)
-    return Moves(states, _actions(steps, grid)[order], next_states, walk, rows, goals, walks.source)
+    action_of = np.full((3, 3), -1)
+    action_of[tuple((grid.steps + 1).T)] = np.arange(len(grid.steps))
+    return Moves(states, action_of[tuple((steps + 1).T)][order], next_states, walk, rows, goals, walks.source)
 
 
 def _failed_steps(failures: _Failures, cells: _Steps, walks: Walks, grid: Grid) -> _Steps:
@@ -185,13 +186,6 @@ def _failed_steps(failures: _Failures, cells: _Steps, walks: Walks, grid: Grid) 
     return steps.astype(np.int64)
 
 
-def _actions(steps: Int[np.ndarray, "moves 2"], grid: Grid) -> Int[np.ndarray, " moves"]:
-    """Return the action of each row and column change."""
-    table = np.full((3, 3), -1)
-    table[tuple((grid.steps + 1).T)] = np.arange(len(grid.steps))
-    return table[tuple((steps + 1).T)]
-
-
 def _goal_cells(walks: Walks, grid: Grid, visits: Visits, occupied: Occupied) -> Int[np.ndarray, " walks"]:
     """Return the goal state of each walk."""
     goals = grid.to_cell_units(walks.goals)
@@ -200,8 +194,7 @@ def _goal_cells(walks: Walks, grid: Grid, visits: Visits, occupied: Occupied) ->
     ends_there = np.all((goals >= corner - TOUCH) & (goals <= corner + 1 + TOUCH), axis=1)
     cells = np.where(ends_there[:, None], last, cells_at(goals, occupied))
     message = "the goal ({}, {}) lies in a cell that the map shows as occupied"
-    first_rows = walks.rows[walks.offsets[:-1]]
-    check_rows(~occupied[tuple(cells.T)], message, walks.source, "goal_x", first_rows, walks.goals)
+    check_rows(~occupied[tuple(cells.T)], message, walks.source, "goal_x", walks.rows[walks.offsets[:-1]], walks.goals)
     return cells @ np.array([grid.shape[1], 1])
 
 

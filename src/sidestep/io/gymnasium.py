@@ -20,6 +20,9 @@ from sidestep.tabular.graph import graph
 from sidestep.tabular.models import FIXED, IMPOSSIBLE, TabularModel, TiedModel
 from sidestep.tabular.tasks import Task, check_discount
 
+Act = Callable[[int, np.random.Generator], int]
+"""Returns an action in a state, with a random generator."""
+
 
 class Environment(NamedTuple):
     """The model and the task of an environment.
@@ -53,8 +56,7 @@ def from_gymnasium(env: Any, discount: float = 0.99) -> Environment:
     """
     check_discount(discount)
     rows = getattr(env.unwrapped, "P", None)
-    if rows is None:
-        raise InputError("expected an environment with a transition table, `P`", source=env)
+    check(rows is not None, "expected an environment with a transition table, `P`", source=env)
     probabilities, successors, rewards, ending, ends = _outcomes(rows)
     terminal = np.isin(np.arange(len(successors)), successors[ending])
     continuing = np.where(ending, 0.0, probabilities)
@@ -137,15 +139,7 @@ def slip_of(model: TiedModel) -> float:
     return odds / (1 + odds)
 
 
-def collect(
-    env: Any,
-    world: Environment,
-    act: Callable[[int, np.random.Generator], int],
-    episodes: int,
-    *,
-    seed: int = 0,
-    task: int = 0,
-) -> list[Trajectory]:
+def collect(env: Any, world: Environment, act: Act, episodes: int, *, seed: int = 0, task: int = 0) -> list[Trajectory]:
     """Return episodes in a Gymnasium environment as trajectories; some may be truncated by a time limit.
 
     Args:

@@ -170,8 +170,8 @@ def read_sensor_map(path: str | Path, grid: Grid) -> Float[np.ndarray, "rows col
         >>> occupied = read_sensor_map("sensed.yaml", grid)  # doctest: +SKIP
     """
     raster = read_raster(path)
-    if raster.mode == "trinary":
-        raise InputError("expected scale or raw: a trinary map has no probabilities", source=path, field="mode")
+    message = "expected scale or raw: a trinary map has no probabilities"
+    check(raster.mode != "trinary", message, source=path, field="mode")
     check_geometry(path, raster.occupancy.shape, raster.resolution, raster.origin, grid)
     return raster.occupancy
 

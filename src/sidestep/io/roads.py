@@ -116,8 +116,7 @@ def read_trips(path: str | Path, roads: Roads) -> list[Int[np.ndarray, " _"]]:
         for link in trip:
             check_trip(link in number, f"there is no link {link}", field="links")
         for one, other in pairwise(trip):
-            connected = (number[one], number[other]) in turns
-            check_trip(connected, f"there is no turn from {one} to {other}", field="links")
+            check_trip((number[one], number[other]) in turns, f"there is no turn from {one} to {other}", field="links")
         for field, label, link in (("origin", origin, trip[0]), ("destination", destination, trip[-1])):
             check_trip(label == link, f"expected {link}, as in its links, found {label}", field=field)
         check_trip(destination not in trip[:-1], "continues after it has reached its destination", field="links")
@@ -146,8 +145,7 @@ def demonstrations_from_trips(
         matches = next_links[trip[:-1]] == trip[1:, None]
         check(matches.any(axis=1).all(), "expected a turn from each link to the next", source="trip", row=row)
         trajectories.append(Trajectory(trip, matches.argmax(axis=1), goal))
-    tasks = [reach(graph, int(goal), discount=discount, step_cost=step_cost) for goal in goals]
-    return gather(trajectories, tasks)
+    return gather(trajectories, [reach(graph, int(goal), discount=discount, step_cost=step_cost) for goal in goals])
 
 
 def _read(path: str | Path, names: tuple[str, ...]) -> pa.Table:
@@ -183,5 +181,4 @@ def _whole(table: pa.Table, name: str, path: object, most: int) -> Int[np.ndarra
 
 def _is_first(values: np.ndarray) -> Bool[np.ndarray, " rows"]:
     """Return which rows differ from all rows before them."""
-    first = np.unique(values, axis=0, return_index=True)[1]
-    return np.isin(np.arange(len(values)), first)
+    return np.isin(np.arange(len(values)), np.unique(values, axis=0, return_index=True)[1])

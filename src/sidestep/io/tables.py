@@ -161,7 +161,6 @@ def _by_ending(path: str | Path, for_csv: Callable, for_parquet: Callable) -> Ca
 def _read_csv(path: Path) -> pa.Table:
     """Return a CSV with every cell as text, nulls where a cell is empty."""
     content = read_whole(path)
-    text = _decoded(content, path)
     ragged: list[pyarrow.csv.InvalidRow] = []
 
     def remember(row: pyarrow.csv.InvalidRow) -> str:
@@ -169,7 +168,7 @@ def _read_csv(path: Path) -> pa.Table:
         return "skip"
 
     try:
-        header = next(filter(None, csv.reader(io.StringIO(text))), [])
+        header = next(filter(None, csv.reader(io.StringIO(_decoded(content, path)))), [])
         table = pyarrow.csv.read_csv(
             pa.BufferReader(content),
             # Rows are numbered only by one thread.

@@ -229,8 +229,5 @@ def _executed_lengths(belief: BeliefState, environment: GridEnvironment, starts:
     """Return the length of the executed path from each start; each robot starts with the same belief."""
     from sidestep.robots.replanning_kernels import executed_length
 
-    def length(start: int) -> float:
-        own = belief._replace(success=belief.success.copy(), values=belief.values.copy())
-        return executed_length(environment, own, start)
-
-    return np.array([length(start) for start in starts.tolist()])
+    own = (belief._replace(success=belief.success.copy(), values=belief.values.copy()) for _ in starts)
+    return np.array([executed_length(environment, *each) for each in zip(own, starts.tolist(), strict=True)])

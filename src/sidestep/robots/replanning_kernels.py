@@ -59,11 +59,9 @@ def _backup(belief, required, state, stale):  # pragma: no cover
     best = -np.inf
     for a in range(belief.reward.shape[1]):
         move = belief.discount * belief.success[state, a]
-        if move > 0 and not stale[required[state, a, 0]]:
-            best = max(
-                best,
-                (belief.reward[state, a] + move * belief.values[required[state, a, 0]]) / (1 - belief.discount + move),
-            )
+        after = required[state, a, 0]
+        if move > 0 and not stale[after]:
+            best = max(best, (belief.reward[state, a] + move * belief.values[after]) / (1 - belief.discount + move))
     return best
 
 

@@ -77,7 +77,7 @@ def check_states(numbers: Int[np.ndarray, "..."], states: int, field: str) -> No
         states: The number of states.
         field: The argument, for the message.
     """
-    check(numbers.min() >= 0 and numbers.max() < states, f"expected states 0…{states - 1}", field=field)
+    check(np.all((numbers >= 0) & (numbers < states)), f"expected states 0…{states - 1}", field=field)
 
 
 def grid_graph(grid: Grid) -> Graph:

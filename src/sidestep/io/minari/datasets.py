@@ -113,7 +113,6 @@ def write_dataset(dataset: str, content: Dataset) -> None:
     Raises:
         InputError: For an id that is malformed or exists already, and for data that Minari cannot store.
     """
-    require_minari(dataset)
     parts = _ID.fullmatch(dataset)
     if parts is None or parts["version"] is None:
         raise InputError("expected an id with a version, such as office/walks-v0", source=dataset)
@@ -128,26 +127,22 @@ def write_dataset(dataset: str, content: Dataset) -> None:
 
 def _fill(data: Path, dataset: str, content: Dataset) -> None:
     from minari import __version__
-    from minari.data_collector import EpisodeBuffer
     from minari.dataset.minari_storage import MinariStorage
 
     storage = MinariStorage.new(data, content.observation_space, content.action_space)
     storage.update_metadata({"dataset_id": dataset, "minari_version": __version__, **content.metadata})
-    storage.update_episodes([EpisodeBuffer(**_buffer_fields(episode)) for episode in content.episodes])
+    storage.update_episodes([_buffer(episode) for episode in content.episodes])
     storage.update_episode_metadata([dict(episode.metadata) for episode in content.episodes])
 
 
-def _buffer_fields(episode: Episode) -> dict[str, Any]:
-    """Return the fields of Minari's buffer of an episode, which is terminated or truncated at its last move."""
+def _buffer(episode: Episode) -> Any:
+    """Return Minari's buffer of an episode, which is terminated or truncated at its last move."""
+    from minari.data_collector import EpisodeBuffer
+
     last = np.arange(len(episode.rewards)) == len(episode.rewards) - 1
-    return {
-        "observations": episode.observations,
-        "actions": episode.actions,
-        "rewards": episode.rewards,
-        "terminations": last & episode.terminated,
-        "truncations": last & (not episode.terminated),
-        "infos": dict(episode.infos),
-    }
+    fields = {name: getattr(episode, name) for name in ("observations", "actions", "rewards")}
+    ends = {"terminations": last & episode.terminated, "truncations": last & (not episode.terminated)}
+    return EpisodeBuffer(**fields, **ends, infos=dict(episode.infos))
 
 
 def _episode(dataset: str | Path, stored: Any, metadata: Mapping[str, Any]) -> Episode:
@@ -170,5 +165,4 @@ def _input_errors(dataset: str | Path, purpose: Literal["read", "written"]) -> I
     except SidestepError:
         raise
     except Exception as error:
-        message = f"the dataset cannot be {purpose}: {type(error).__name__}: {error}"
-        raise InputError(message, source=dataset) from error
+        raise InputError(f"the dataset cannot be {purpose}: {type(error).__name__}: {error}", source=dataset) from error

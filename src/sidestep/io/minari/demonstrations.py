@@ -90,9 +90,13 @@ def read_demonstrations(
     """
     states, actions = _world_size(world)
 
-    def check_spaces(observation_space: object, action_space: object) -> None:
-        _check_space(observation_space, states - len(ends), dataset, "observation_space")
-        _check_space(action_space, actions, dataset, "action_space")
+    def check_spaces(*spaces: object) -> None:
+        from gymnasium.spaces import Discrete
+
+        counts = {"observation_space": states - len(ends), "action_space": actions}
+        for space, (field, count) in zip(spaces, counts.items(), strict=True):
+            fits = isinstance(space, Discrete) and space.n == count and space.start == 0
+            check(fits, f"expected Discrete({count}), as the world has, found {space}", source=dataset, field=field)
 
     stored = read_dataset(dataset, check_spaces)
     if task is None:
@@ -101,10 +105,8 @@ def read_demonstrations(
         tasks, indices = [task], [0] * len(stored.episodes)
     else:
         raise InputError(f"expected one task of {states} states, found {task.terminal.shape}", field="task")
-    trajectories = [
-        _trajectory(episode, index, states - len(ends), actions, ends)
-        for episode, index in zip(stored.episodes, indices, strict=True)
-    ]
+    pairs = zip(stored.episodes, indices, strict=True)
+    trajectories = [_trajectory(episode, index, states - len(ends), actions, ends) for episode, index in pairs]
     try:
         return gather(trajectories, tasks)
     except InputError as error:
@@ -164,13 +166,6 @@ def _within(values: object, length: int, count: int, source: str, field: str) ->
     message = f"expected a whole number in 0…{count - 1}, found {numbers[step]} at step {step}"
     check(0 <= numbers[step] < count, message, source=source, field=field)
     return numbers.astype(np.int64)
-
-
-def _check_space(space: object, count: int, dataset: str | Path, field: str) -> None:
-    from gymnasium.spaces import Discrete
-
-    fits = isinstance(space, Discrete) and space.n == count and space.start == 0
-    check(fits, f"expected Discrete({count}), as the world has, found {space}", source=dataset, field=field)
 
 
 def _describe_tasks(tasks: Task) -> list[dict[str, Any]]:
@@ -249,8 +244,7 @@ def _whole(metadata: Mapping[str, Any], field: str, source: str) -> int:
 def _task(entry: Any, world: Grid | Graph, source: str) -> Task:
     """Return the task of an entry; raise `InputError` for one that does not fit the world."""
     states, actions = _world_size(world)
-    keys = {"discount", "terminal", "terminal_reward", "reward"}
-    complete = isinstance(entry, Mapping) and keys <= entry.keys()
+    complete = isinstance(entry, Mapping) and {"discount", "terminal", "terminal_reward", "reward"} <= entry.keys()
     check(complete, "expected discount, terminal, terminal_reward and reward", source=source)
     discount = _number(entry, "discount", source)
     message = f"expected a number above 0 and at most 1, found {discount}"

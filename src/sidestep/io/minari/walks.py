@@ -71,9 +71,8 @@ def write_positions(dataset: str, table: pa.Table) -> None:
 def _episodes(table: pa.Table, dataset: str) -> Iterator[Episode]:
     """Yield the episode of each walk."""
     infos = {name: _info(table[name], name, dataset) for name in table.column_names if name not in _OWN}
-    positions, goals = (
-        np.stack([table[name].to_numpy() for name in names], axis=1) for names in (("x", "y"), ("goal_x", "goal_y"))
-    )
+    positions = np.stack([table[name].to_numpy() for name in ("x", "y")], axis=1)
+    goals = np.stack([table[name].to_numpy() for name in ("goal_x", "goal_y")], axis=1)
     targets = positions
     if _FAILED[0] in infos:
         failed = np.stack([infos[name] for name in _FAILED], axis=1)
@@ -95,12 +94,10 @@ def _info(column: pa.ChunkedArray, name: str, dataset: str) -> Shaped[np.ndarray
     if name in _FAILED:  # NaN except where a move failed
         return column.to_numpy()
     kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
-    if pa.types.is_string(kind) or pa.types.is_large_string(kind):
-        values = np.asarray(column.to_pylist(), dtype=object)
-    elif pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind):
-        values = column.to_numpy()
-    else:
-        raise InputError(f"expected numbers or text, found {kind}; leave the column out", source=dataset, field=name)
+    is_text = pa.types.is_string(kind) or pa.types.is_large_string(kind)
+    valid = is_text or pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
+    check(valid, f"expected numbers or text, found {kind}; leave the column out", source=dataset, field=name)
+    values = np.asarray(column.to_pylist(), dtype=object) if is_text else column.to_numpy()
     message = "a Minari dataset has no empty cells; fill it, or leave the column out"
     check_rows(column.is_valid().to_numpy(), message, dataset, name)
     return values
