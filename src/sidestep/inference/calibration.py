@@ -98,7 +98,7 @@ def _scores(
 ) -> tuple[Bool[Array, ""], Float[Array, " moves"], Float[Array, " moves"], Float[Array, " moves"]]:
     """Return whether all values converged, and of each move: u, Σ_a π u² and log π(a | s)."""
     solution = solve(model, demonstrations.tasks, behavior, options=options)
-    q = visited_action_values(model, demonstrations.tasks, solution.values, demonstrations.task, demonstrations.states)
+    q = visited_action_values(model, demonstrations, solution.values)
     log_policy, scores = jax.jvp(
         lambda log_beta: Behavior(behavior.backup, jnp.exp(log_beta), behavior.lapse).log_policy(q),
         (jnp.log(behavior.beta),),

@@ -309,18 +309,12 @@ def maximize(
             message = "; ".join(filter(None, (f"{status.value}: {measure}", status.advice)))
             problem, parameters = objective.problem, evaluator.parameters(x)
             tasks = len(problem.demonstrations.tasks.terminal)
-            sweeps, residual, converged = _of_all_tasks(evaluator.solves_at(x), tasks)
-            return Fit(
-                model=problem.model.with_parameters(parameters.model),
-                behavior=problem.behavior.with_parameters(parameters.behavior),
-                history=tuple(history),
-                sweeps=sweeps,
-                residual=residual,
-                task_converged=converged,
-                status=status,
-                converged=status is Status.CONVERGED and bool(np.asarray(converged).all()),
-                message=message,
-            )
+            model = problem.model.with_parameters(parameters.model)
+            behavior = problem.behavior.with_parameters(parameters.behavior)
+            sweeps, residual, task_converged = _of_all_tasks(evaluator.solves_at(x), tasks)
+            solves = sweeps, residual, task_converged
+            converged = status is Status.CONVERGED and bool(np.asarray(task_converged).all())
+            return Fit(model, behavior, tuple(history), *solves, status, converged, message)
 
 
 def solve_tolerances(problem: Problem, optimizer: Optimizer, large_map: int = LARGE_MAP) -> list[float | None]:

@@ -33,18 +33,12 @@ from sidestep.inference.checkpoints import fingerprint
 from sidestep.inference.priors import Prior
 from sidestep.tabular.behavior_model import BehaviorModel, BehaviorParameters
 from sidestep.tabular.demonstrations import Demonstrations
-from sidestep.tabular.likelihood import (
-    Arrivals,
-    Choices,
-    Term,
-    arrival_log_likelihood,
-    arrivals_of,
-    choice_log_likelihood,
-)
+from sidestep.tabular.likelihood import Arrivals, Term, arrival_log_likelihood, arrivals_of, choice_log_likelihood
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.solvers.base import Solver, WarmStart, is_reachable
-from sidestep.tabular.tasks import Task
+
+Flag = Bool[Array | np.ndarray, ""]
 
 AXIS = "tasks"
 """The name of a mesh's axis, over which tasks are spread."""
@@ -359,41 +353,25 @@ def _transitions_and_prior(
 
 @keep_program
 def _batch_result(
-    problem: Problem, parameters: Parameters, batch: Batch, starts: WarmStart, all_states: Bool[Array | np.ndarray, ""]
+    problem: Problem, parameters: Parameters, batch: Batch, starts: WarmStart, all_states: Flag
 ) -> BatchResult:
     """Evaluate the tasks of a batch that are on one device."""
-
-    def of_task(
-        model: TransitionModel,
-        behavior: BehaviorModel,
-        task: Task,
-        person: Array,
-        choices: Choices,
-        start: WarmStart,
-        region: Array,
-    ) -> tuple[Array, tuple[WarmStart, SolveSummary]]:
-        value, solution = choice_log_likelihood(
-            model,
-            behavior.tasks_of(task),
-            choices,
-            behavior.behavior_of(person),
-            start,
-            options=problem.options,
-            region=region,
-        )
-        unreachable = (choices.counts > 0) & ~is_reachable(solution.values[choices.states])
-        return value, (
-            solution.start,
-            SolveSummary(solution.sweeps, solution.residual, solution.converged, unreachable),
-        )
 
     def loss(parameters: Parameters, adjoint: Array) -> tuple[Array, tuple[WarmStart, SolveSummary]]:
         model = problem.model.with_parameters(parameters.model)
         behavior = problem.behavior.with_parameters(parameters.behavior)
-        over_tasks = jax.vmap(of_task, in_axes=(None, None, 0, 0, 0, 0, 0))
-        values, aux = over_tasks(
-            model, behavior, batch.tasks, batch.person, batch.choices, starts._replace(adjoint=adjoint), region
-        )
+
+        def of_task(one: Batch, start: WarmStart, region: Array) -> tuple[Array, tuple[WarmStart, SolveSummary]]:
+            task, own = behavior.tasks_of(one.tasks), behavior.behavior_of(one.person)
+            options = problem.options
+            value, solution = choice_log_likelihood(
+                model, task, one.choices, own, start, options=options, region=region
+            )
+            unreachable = (one.choices.counts > 0) & ~is_reachable(solution.values[one.choices.states])
+            solves = SolveSummary(solution.sweeps, solution.residual, solution.converged, unreachable)
+            return value, (solution.start, solves)
+
+        values, aux = jax.vmap(of_task)(batch, starts._replace(adjoint=adjoint), region)
         return -problem.tempering.astype(values.dtype) * values.sum(), aux
 
     region = starts.region | all_states
@@ -405,12 +383,7 @@ def _batch_result(
 
 @eqx.filter_jit
 def _sharded_batch_result(
-    problem: Problem,
-    parameters: Tree,
-    batch: Batch,
-    starts: WarmStart,
-    all_states: Bool[Array | np.ndarray, ""],
-    mesh: Mesh,
+    problem: Problem, parameters: Tree, batch: Batch, starts: WarmStart, all_states: Flag, mesh: Mesh
 ) -> BatchResult:
     """Evaluate a batch on all devices; the sums over a device's tasks have a leading axis of devices."""
     arrays, static = eqx.partition((problem, parameters, all_states), eqx.is_array)

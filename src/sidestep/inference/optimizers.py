@@ -284,7 +284,7 @@ class _Trial(NamedTuple):
 
 
 @keep_program
-def _lbfgs_memory(memory_size: int, x: Float[Array | np.ndarray, " parameters"]) -> Tree:
+def _lbfgs_memory(memory_size: int, x: Vector | Array) -> Tree:
     """Return the arrays of optax's empty memory: where programs are kept, a fit does not import optax."""
     import optax
 
@@ -292,12 +292,7 @@ def _lbfgs_memory(memory_size: int, x: Float[Array | np.ndarray, " parameters"])
 
 
 @keep_program
-def _lbfgs_direction(
-    memory_size: int,
-    gradient: Float[Array | np.ndarray, " parameters"],
-    memory: Tree,
-    x: Float[Array | np.ndarray, " parameters"],
-) -> tuple[Array, Tree]:
+def _lbfgs_direction(memory_size: int, gradient: Vector | Array, memory: Tree, x: Vector | Array) -> tuple[Array, Tree]:
     import optax
 
     x, transformation = jnp.asarray(x), optax.scale_by_lbfgs(memory_size)

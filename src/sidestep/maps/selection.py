@@ -34,6 +34,9 @@ from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.reward import Reward
 from sidestep.tabular.solve import SolveOptions
 
+Notify = Callable[[str], None] | None
+"""Called with a line of text at each stage."""
+
 FOLDS = 3
 """The number of folds of the cross-validation."""
 _BETA_FACTOR = 4.0
@@ -107,11 +110,7 @@ class Selection:
 
 
 def select_behavior(
-    grid: Grid,
-    moves: Moves,
-    config: MapConfig,
-    cell_prior: Normal | None = None,
-    notify: Callable[[str], None] | None = None,
+    grid: Grid, moves: Moves, config: MapConfig, cell_prior: Normal | None = None, notify: Notify = None
 ) -> Selection:
     """Select the reward, β and tempering that held-out walks support.
 
@@ -195,11 +194,7 @@ def _other_reward(config: MapConfig) -> MapConfig:
 
 
 def _cross_validate(
-    model: ObstacleGrid,
-    demonstrations: Demonstrations,
-    config: MapConfig,
-    cell_prior: Normal | None,
-    notify: Callable[[str], None] | None,
+    model: ObstacleGrid, demonstrations: Demonstrations, config: MapConfig, cell_prior: Normal | None, notify: Notify
 ) -> Trial:
     """Learn from the complement of each fold, and score the fold."""
     count = demonstrations.trajectories

@@ -157,10 +157,10 @@ def behavior_model(
     learn: Sequence[str] = (),
     *,
     discount: float | None = None,
-    person: Int[np.ndarray, " tasks"] | None = None,
-    features: Float[np.ndarray, "#states #actions features"] | None = None,
+    person: Int[Array | np.ndarray, " tasks"] | None = None,
+    features: Float[Array | np.ndarray, "#states #actions features"] | None = None,
     reward_weights: Float[np.ndarray, " features"] | None = None,
-    aimed_at: Int[np.ndarray, "states actions"] | None = None,
+    aimed_at: Int[Array | np.ndarray, "states actions"] | None = None,
 ) -> BehaviorModel:
     """Return a model of agents that behave as `behavior` describes, except for what is learned.
 
@@ -192,6 +192,7 @@ def behavior_model(
     if person is not None:
         numbered = np.array_equal(np.unique(person), np.arange(np.max(person) + 1))
         check(numbered, "expected persons numbered from 0, each with a task", field="person")
+        person = to_jax(person, jnp.int32)
     log_beta = logit_lapse = logit_discount = weights = cost_parameters = None
     if "beta" in learn or person is not None:
         log_beta = jnp.full(1 if person is None else int(np.max(person)) + 1, jnp.log(behavior.beta))
@@ -207,16 +208,9 @@ def behavior_model(
         initial = np.zeros(features.shape[-1]) if reward_weights is None else np.asarray(reward_weights)
         complete = initial.shape == features.shape[-1:] and np.isfinite(initial).all()
         check(complete, f"expected {features.shape[-1]} finite numbers, found {initial}", field="reward_weights")
-        weights = to_jax(initial, jnp.result_type(float))
+        weights, features = (to_jax(each, jnp.result_type(float)) for each in (initial, features))
     if aimed_at is not None:
         check_states(aimed_at, len(aimed_at), "aimed_at")
-        cost_parameters = to_jax(np.full(len(aimed_at), _COST_MEAN))
+        cost_parameters, aimed_at = to_jax(np.full(len(aimed_at), _COST_MEAN)), to_jax(aimed_at, jnp.int32)
     start = BehaviorParameters(log_beta, logit_lapse, logit_discount, weights, cost_parameters)
-    return BehaviorModel(
-        behavior,
-        start,
-        start,
-        None if person is None else to_jax(person, jnp.int32),
-        None if features is None else to_jax(features, jnp.result_type(float)),
-        None if aimed_at is None else to_jax(aimed_at, jnp.int32),
-    )
+    return BehaviorModel(behavior, start, start, person, features, aimed_at)

@@ -143,9 +143,8 @@ def log_policies(
 def _log_policies(
     model: TransitionModel, demonstrations: Demonstrations, behavior: Behavior, options: SolveOptions
 ) -> Float[Array, " moves"]:
-    tasks, task, states = demonstrations.tasks, demonstrations.task, demonstrations.states
-    solution = solve(model, tasks, behavior, options=options)
-    q = visited_action_values(model, tasks, solution.values, task, states)
+    solution = solve(model, demonstrations.tasks, behavior, options=options)
+    q = visited_action_values(model, demonstrations, solution.values)
     # a factor, so that the gradient is NaN too
     return _log_policy(behavior, q, demonstrations.actions) * jnp.where(solution.converged.all(), 1.0, jnp.nan)
 
@@ -262,21 +261,16 @@ def arrival_log_likelihood(model: TransitionModel, arrivals: Arrivals) -> Float[
 
 
 def visited_action_values(
-    model: TransitionModel,
-    tasks: Task,
-    values: Float[Array, "tasks states"],
-    task: Int[Array, " visits"],
-    states: Int[Array, " visits"],
-) -> Float[Array, "visits actions"]:
-    """Return Q(s, a) of visited states, from the values of all tasks.
+    model: TransitionModel, demonstrations: Demonstrations, values: Float[Array, "tasks states"]
+) -> Float[Array, "moves actions"]:
+    """Return Q(s, a) of the state before each move, from the values of all tasks.
 
     Args:
         model: The transition model.
-        tasks: All tasks.
+        demonstrations: Moves and tasks.
         values: V of each task.
-        task: The task of each visit.
-        states: The state of each visit.
     """
+    tasks, task, states = demonstrations.tasks, demonstrations.task, demonstrations.states
     after = values[task[:, None, None], model.graph.successors[states]]
     reward = tasks.reward[task, states if tasks.reward.shape[1] > 1 else 0].astype(values.dtype)
     discount = tasks.discount[task, None].astype(values.dtype)

@@ -23,11 +23,14 @@ from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.models.base import TransitionModel
 
+Logits = Float[Array | np.ndarray, "..."] | float
+"""Logits of a model: one number for all of them, or one for each."""
+
 FIXED, IMPOSSIBLE = -1, -2
 """Entries of an index: an outcome with a logit of 0 that is not learned, and an impossible outcome."""
 
 
-def logit_array(logits: Float[Array | np.ndarray, "..."] | float, shape: tuple[int, ...]) -> Float[Array, "..."]:
+def logit_array(logits: Logits, shape: tuple[int, ...]) -> Float[Array, "..."]:
     """Return logits of the given shape, from one number for all or one for each; arrays keep their precision.
 
     Args:
@@ -102,12 +105,7 @@ class TiedModel(TransitionModel):
     parameters: Float[Array, " logits"]
     index: Int[Array, "states actions outcomes"]
 
-    def __init__(
-        self,
-        graph: Graph,
-        index: Int[Array | np.ndarray, "states actions outcomes"],
-        logits: Float[Array | np.ndarray, " logits"] | float = 0.0,
-    ):
+    def __init__(self, graph: Graph, index: Int[Array | np.ndarray, "states actions outcomes"], logits: Logits = 0.0):
         """Make a model with logits: one number for all, or one for each index.
 
         Raises:

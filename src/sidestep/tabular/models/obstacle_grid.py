@@ -26,6 +26,9 @@ from sidestep.tabular.grid import STEPS, Cell, Grid
 from sidestep.tabular.models.base import TransitionModel
 from sidestep.tabular.models.categorical import FIXED, IMPOSSIBLE, TiedModel, logit_array
 
+Network = Callable[[Float[Array, " features"]], Float[Array, ""]]
+"""The logit of a cell, as a function of its features."""
+
 
 class ObstacleGrid(TransitionModel):
     """A grid with cells that may be blocked; moves into a blocked cell stay.
@@ -88,16 +91,11 @@ class FeaturedGrid(TransitionModel):
 
     graph: Graph
     parameters: FloatTree
-    network: Callable[[Float[Array, " features"]], Float[Array, ""]]
+    network: Network
     features: Float[Array, "cells features"]
     known: Int[Array, "rows columns"]
 
-    def __init__(
-        self,
-        grid: Grid,
-        features: Float[Array | np.ndarray, "cells features"],
-        network: Callable[[Float[Array, " features"]], Float[Array, ""]],
-    ):
+    def __init__(self, grid: Grid, features: Float[Array | np.ndarray, "cells features"], network: Network):
         """Make a model from a network (an Equinox module) that maps the features of a cell to its logit.
 
         Raises:

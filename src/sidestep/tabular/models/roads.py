@@ -12,13 +12,13 @@ from jaxtyping import Array, Float, Int
 from sidestep.errors import check
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph
-from sidestep.tabular.models.categorical import FIXED, IMPOSSIBLE, TiedModel, logit_array
+from sidestep.tabular.models.categorical import FIXED, IMPOSSIBLE, Logits, TiedModel, logit_array
 
 
 def road_network(
     turns: Int[np.ndarray, "turns 2"],
     lengths: Float[np.ndarray, " links"],
-    logits: Float[Array | np.ndarray, " _"] | float = -2.0,
+    logits: Logits = -2.0,
     *,
     by_turn: bool = False,
 ) -> TiedModel:

@@ -19,7 +19,7 @@ from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph, grid_successors
 from sidestep.tabular.grid import STEPS, Grid
 from sidestep.tabular.models.base import TransitionModel
-from sidestep.tabular.models.categorical import logit_array
+from sidestep.tabular.models.categorical import Logits, logit_array
 from sidestep.tabular.models.obstacle_grid import blocked_of, chances_of_moves
 
 _DIRECTIONS = np.array([[STEPS.tolist().index(way) for way in ([i, j], [j, -i], [-j, i])] for i, j in STEPS.tolist()])
@@ -48,8 +48,8 @@ class SlipperyGrid(TransitionModel):
     def __init__(
         self,
         grid: Grid,
-        logits: Float[Array | np.ndarray, " cells"] | float = -2.0,
-        slip: Float[Array | np.ndarray, " terrains"] | float = -2.0,
+        logits: Logits = -2.0,
+        slip: Logits = -2.0,
         terrain: Int[np.ndarray, "rows columns"] | None = None,
     ):
         """Make a model with logits of cells and of slips: one number for all, or one for each cell or terrain.

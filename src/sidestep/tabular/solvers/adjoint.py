@@ -5,6 +5,8 @@ tenfold from sweep to sweep, until the sum of all that remain is within the tole
 the values were solved turn out to matter, there is no gradient (see `base`).
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -18,33 +20,27 @@ _FINER = 0.1
 
 
 def vjp_of_process(
-    kind: int,
-    tie: float,
     exact: bool,
     max_sweeps: int,
     max_region_sweeps: int,
     into: tuple[Cotangents, SolveResult],
-    process: list[np.ndarray],
-    beta: Float[np.ndarray, ""],
+    equation: native.NativeEquation,
     start: WarmStart,
     cotangent: Float[np.ndarray, " states"],
     region: Bool[np.ndarray, " states"],
-    tolerance: Float[np.ndarray, ""],
 ) -> None:
     """Write the gradient and the adjoint into the arrays of records.
 
     Args:
-        kind, tie, beta: The backup (see `NativeBackup`).
         exact: Whether the gradient is the backup's own, or that of the policy held fixed.
         max_sweeps, max_region_sweeps: When to stop (see `GaussSeidel`).
         into: The gradient, and the adjoint as a result.
-        process: The arrays of `HostProcess`.
+        equation: The equation; its tolerance is the part of the cotangent's sum that may remain.
         start: The solution with its order, and an adjoint to start from.
         cotangent: The gradient of a scalar by the values.
         region: The states that were solved.
-        tolerance: The part of the cotangent's sum that may remain.
     """
-    (values, first, order), (by, result) = start, into
+    (values, first, order), (by, result), process = start, into, equation.process
     number = values.dtype.type
     position = native.inverse_permutation(order)
     total = np.abs(cotangent).sum()
@@ -54,31 +50,30 @@ def vjp_of_process(
         _fill(residual, result.values, *by)
         native.write_info(result, order, native.SolveInfo(0, residual, bool(total == 0)))
         return
-    host_process = native.HostProcess.from_arrays(process)
     reachable_above = number(-((-neg_inf(values.dtype)) ** 0.5))
-    backup = native.NativeBackup(kind, number(beta), number(tie))
-    problem = adjoint_kernels.AdjointProblem(backup, exact, values, reachable_above, order, position)
+    problem = adjoint_kernels.AdjointProblem(equation.backup, exact, values, reachable_above, order, position)
     known = np.where(np.isfinite(first), first, number(0))
-    actions, outcomes, width = host_process.kernel_sizes()
-    work = _empty_state(host_process, width, known[order], cotangent[order])
+    actions, outcomes, width = process.kernel_sizes()
+    work = _empty_state(process, width, known[order], cotangent[order])
     kernels, is_whole = adjoint_kernels.kernels_for(actions, outcomes, width), region.all()
+    solve = _AdjointSolve(kernels, process, problem, work)
     sweeps = max_sweeps if is_whole else min(max_sweeps, max_region_sweeps)
-    info = _push_all(kernels, host_process, problem, work, number(total), number(tolerance), sweeps)
+    info = solve.push_all(total, equation.tolerance, sweeps)
     if info.converged and not is_whole:
-        cost = _omission_cost(kernels, host_process, problem, work, region)
-        info = info._replace(residual=cost, converged=bool(cost <= tolerance))
+        cost = solve.omission_cost(region)
+        info = info._replace(residual=cost, converged=bool(cost <= equation.tolerance))
     if not info.converged:
         _fill(np.nan, result.values, *by)
         native.write_info(result, order, info)
         return
     solution = work.adjoint, work.row, work.weights, work.beta
-    del work  # the gradient takes the memory that it held
+    del solve, work  # the gradient takes the memory that they held
     _fill(0.0, *by[1:])
 
     def pull_back_range(begin: int, end: int) -> Cotangents:
         sums = [np.zeros_like(part) if len(np.atleast_1d(part)) == 1 else part for part in by[1:]]
         own = Cotangents(by.probabilities, *sums)
-        kernels.vjp_of_process(begin, end, host_process, problem, *solution, result.values, own)
+        kernels.vjp_of_process(begin, end, process, problem, *solution, result.values, own)
         return own
 
     for own in native.map_ranges(pull_back_range, len(order)):
@@ -112,46 +107,41 @@ def _empty_state(
     )
 
 
-def _omission_cost(
-    kernels: adjoint_kernels.AdjointKernels,
-    process: native.HostProcess,
-    problem: adjoint_kernels.AdjointProblem,
-    work: adjoint_kernels.AdjointState,
-    region: Bool[np.ndarray, " states"],
-) -> float:
-    """Return the cost of the states outside the region that were not solved, as a part of Σ |λ V|."""
-    is_reachable = problem.values > problem.reachable_above
-    size = np.abs(work.adjoint * np.where(is_reachable, problem.values, 0)[problem.order]).sum()
-    cost = kernels.omission_cost(process, problem, work.adjoint, region)
-    return float(cost / size) if size > 0 else float(np.inf if cost > 0 else cost)
+class _AdjointSolve(NamedTuple):
+    """A solve of the adjoint equation: what is solved, λ so far, and the native code for it."""
 
+    kernels: adjoint_kernels.AdjointKernels
+    process: native.HostProcess
+    problem: adjoint_kernels.AdjointProblem
+    work: adjoint_kernels.AdjointState
 
-def _push_all(
-    kernels: adjoint_kernels.AdjointKernels,
-    process: native.HostProcess,
-    problem: adjoint_kernels.AdjointProblem,
-    work: adjoint_kernels.AdjointState,
-    total: np.floating,
-    tolerance: np.floating,
-    max_sweeps: int,
-) -> native.SolveInfo:
-    """Push until the residuals' sum is no more than the part `tolerance` of `total`."""
-    states = len(work.residual)
-    finest = tolerance * total / states
-    threshold = max(finest, _COARSEST * total)
-    pushed, left, filled = 0, np.inf, 0
-    if work.adjoint.any():
-        # what a first λ amounts to, its rows filled in on all cores
-        needed = np.flatnonzero(np.abs(work.adjoint) > finest)
-        native.map_ranges(lambda begin, end: kernels.fill_rows(begin, end, needed, process, problem, work), len(needed))
-        _, _, filled = kernels.push(finest, True, len(needed), process, problem, work)
-    for _ in range(max_sweeps):
-        native.check_interrupt()
-        pushes, remaining, filled = kernels.push(threshold, False, filled, process, problem, work)
-        pushed += pushes
-        if pushes == 0:
-            left = float(remaining / total)
-        if left <= tolerance or np.isnan(remaining):
-            break
-        threshold = max(finest, _FINER * threshold)
-    return native.SolveInfo(-(-pushed // states), left, bool(left <= tolerance))
+    def push_all(self, total: np.floating, tolerance: np.floating, max_sweeps: int) -> native.SolveInfo:
+        """Push until the residuals' sum is no more than the part `tolerance` of `total`."""
+        kernels, *arrays = self
+        adjoint, states = self.work.adjoint, len(self.work.residual)
+        finest = tolerance * total / states
+        threshold = max(finest, _COARSEST * total)
+        pushed, left, filled = 0, np.inf, 0
+        if adjoint.any():
+            # what a first λ amounts to, its rows filled in on all cores
+            needed = np.flatnonzero(np.abs(adjoint) > finest)
+            native.map_ranges(lambda begin, end: kernels.fill_rows(begin, end, needed, *arrays), len(needed))
+            _, _, filled = kernels.push(finest, True, len(needed), *arrays)
+        for _ in range(max_sweeps):
+            native.check_interrupt()
+            pushes, remaining, filled = kernels.push(threshold, False, filled, *arrays)
+            pushed += pushes
+            if pushes == 0:
+                left = float(remaining / total)
+            if left <= tolerance or np.isnan(remaining):
+                break
+            threshold = max(finest, _FINER * threshold)
+        return native.SolveInfo(-(-pushed // states), left, bool(left <= tolerance))
+
+    def omission_cost(self, region: Bool[np.ndarray, " states"]) -> float:
+        """Return the cost of the states outside the region that were not solved, as a part of Σ |λ V|."""
+        kernels, process, problem, work = self
+        is_reachable = problem.values > problem.reachable_above
+        size = np.abs(work.adjoint * np.where(is_reachable, problem.values, 0)[problem.order]).sum()
+        cost = kernels.omission_cost(process, problem, work.adjoint, region)
+        return float(cost / size) if size > 0 else float(np.inf if cost > 0 else cost)

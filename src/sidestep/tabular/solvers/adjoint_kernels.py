@@ -18,15 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sidestep.tabular.solvers.native import (
-    BOLTZMANN,
-    HARD_MAX,
-    MELLOWMAX,
-    NativeBackup,
-    NativeFunction,
-    compiled,
-    inlined,
-)
+from sidestep.tabular.solvers import native
 from sidestep.tabular.solvers.value_kernels import Scratch, backed_up
 
 
@@ -41,7 +33,7 @@ class AdjointProblem(NamedTuple):
         order: The states, nearest first; `position` is its inverse.
     """
 
-    backup: NativeBackup
+    backup: native.NativeBackup
     exact: bool
     values: np.ndarray
     reachable_above: np.floating
@@ -89,13 +81,13 @@ class WeightScratch(NamedTuple):
 class AdjointKernels(NamedTuple):
     """The native code for one number of actions, of outcomes, and of outcomes that leave a state."""
 
-    fill_rows: NativeFunction
-    push: NativeFunction
-    omission_cost: NativeFunction
-    vjp_of_process: NativeFunction
+    fill_rows: native.NativeFunction
+    push: native.NativeFunction
+    omission_cost: native.NativeFunction
+    vjp_of_process: native.NativeFunction
 
 
-@inlined()
+@native.inlined()
 def differentiate_backup(backup, exact, scratch):  # pragma: no cover
     """Fill in the weights of the gradient and the policy by action values; return the gradient by β."""
     kind, beta, tie, actions = backup.kind, backup.beta, backup.tie, len(scratch.action_values)
@@ -105,7 +97,9 @@ def differentiate_backup(backup, exact, scratch):  # pragma: no cover
     total = 0.0 * best
     for a in range(actions):
         difference = scratch.action_values[a] - best
-        scratch.policy[a] = (difference >= -tie * abs(best)) * 1.0 if kind == HARD_MAX else np.exp(beta * difference)
+        scratch.policy[a] = (
+            (difference >= -tie * abs(best)) * 1.0 if kind == native.HARD_MAX else np.exp(beta * difference)
+        )
         total += scratch.policy[a]
     average = 0.0 * best
     for a in range(actions):
@@ -116,16 +110,18 @@ def differentiate_backup(backup, exact, scratch):  # pragma: no cover
         difference, probability = scratch.action_values[a] - best - average, scratch.policy[a]
         # in this order, because an action that is never taken may be worth all but −∞
         variance += probability * difference * difference
-        scratch.weights[a] = probability * (1 + beta * difference) if kind == BOLTZMANN and exact else probability
+        scratch.weights[a] = (
+            probability * (1 + beta * difference) if kind == native.BOLTZMANN and exact else probability
+        )
     by_beta = 0.0 * best
-    if exact and kind == BOLTZMANN:
+    if exact and kind == native.BOLTZMANN:
         by_beta = variance
-    elif exact and kind != HARD_MAX:
-        by_beta = (average - np.log(total / (actions if kind == MELLOWMAX else 1)) / beta) / beta
+    elif exact and kind != native.HARD_MAX:
+        by_beta = (average - np.log(total / (actions if kind == native.MELLOWMAX else 1)) / beta) / beta
     return by_beta
 
 
-@inlined()
+@native.inlined()
 def _expected_value(process, values, state, a, outcomes):  # pragma: no cover
     """Return the expected value after an action, summed as in `action_values`."""
     here = values[state]
@@ -137,14 +133,14 @@ def _expected_value(process, values, state, a, outcomes):  # pragma: no cover
     return expected
 
 
-@inlined()
+@native.inlined()
 def _action_value(process, values, state, a, outcomes):  # pragma: no cover
     """Return Q(s, a)."""
     reward = process.reward[state if process.reward.shape[0] > 1 else 0, a if process.reward.shape[1] > 1 else 0]
     return reward + process.discount * _expected_value(process, values, state, a, outcomes)
 
 
-@inlined()
+@native.inlined()
 def _fill_row(i, row, actions, outcomes, width, process, problem, work, scratch):  # pragma: no cover
     """Fill in the row of the state at position i; zeros if it is terminal or cannot reach a terminal state."""
     state = problem.order[i]
@@ -181,7 +177,7 @@ def _fill_row(i, row, actions, outcomes, width, process, problem, work, scratch)
 def kernels_for(actions: int, outcomes: int, width: int) -> AdjointKernels:
     """Return the native code for these numbers; as constants they make it twice as fast."""
 
-    @compiled()
+    @native.compiled()
     def fill_rows(begin, end, positions, process, problem, work):  # pragma: no cover
         """Fill in a range of rows, of the states at `positions`."""
         dtype = problem.values.dtype
@@ -189,7 +185,7 @@ def kernels_for(actions: int, outcomes: int, width: int) -> AdjointKernels:
         for row in range(begin, end):
             _fill_row(positions[row], row, actions, outcomes, width, process, problem, work, scratch)
 
-    @compiled()
+    @native.compiled()
     def push(threshold, warm, filled, process, problem, work):  # pragma: no cover
         """Push the residuals above a threshold, the farthest first; or (`warm`) the first λ.
 
@@ -220,7 +216,7 @@ def kernels_for(actions: int, outcomes: int, width: int) -> AdjointKernels:
                     work.residual[work.successors[row, a, m]] += amount * work.jacobian[row, a, m]
         return pushes, remaining, filled
 
-    @compiled()
+    @native.compiled()
     def omission_cost(process, problem, adjoint, region):  # pragma: no cover
         """Return Σ |λ (B(Q) − V)| over the states outside the region."""
         values = problem.values
@@ -238,7 +234,7 @@ def kernels_for(actions: int, outcomes: int, width: int) -> AdjointKernels:
             cost += abs(adjoint[i] * gain)
         return cost
 
-    @compiled()
+    @native.compiled()
     def vjp_of_process(begin, end, process, problem, solution, row, weights, beta, adjoint, by):  # pragma: no cover
         """Fill in λᵀ ∂F/∂φ for a range of positions, and λ with the states' own numbers.
 

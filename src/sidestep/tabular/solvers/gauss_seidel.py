@@ -72,14 +72,11 @@ class GaussSeidel(base.Solver):
 
     def values(self, equation: base.BellmanEquation, start: base.WarmStart, region: base.Region) -> base.SolveResult:
         """Return V of the fixed point; of all states where the start's values turn out to be of no use."""
-        kind, tie = _native_backup(equation.backup, start.values.dtype)
         # another solver may have left an order of no states
         order = start.order if start.order.shape == start.values.shape else _no_order(len(start.values))
-        tolerance = self.tolerance_for(start.values.dtype)
-        process, start = equation.process, start._replace(order=order)
-        bound = base.lower_bound(process)
-        arguments = (jax.tree.leaves(process), bound, equation.beta, start, region, tolerance)
-        solve = partial(_solve_values, kind, tie, self.max_sweeps)
+        bound = base.lower_bound(equation.process)
+        arguments = (self._native_equation(equation), bound, start._replace(order=order), region)
+        solve = partial(_solve_values, self.max_sweeps)
         return native.call_host(solve, arguments, _result_shapes(start.values, order))
 
     def vjp(
@@ -91,12 +88,10 @@ class GaussSeidel(base.Solver):
         region: base.Region,
     ) -> tuple[base.Cotangents, base.SolveResult]:
         """Return the gradient by all that the values depend on; it takes a fraction of the time that they took."""
-        kind, tie = _native_backup(equation.backup, start.values.dtype)
-        tolerance = self.tolerance_for(start.values.dtype)
-        arguments = (jax.tree.leaves(equation.process), equation.beta, start, cotangent, region, tolerance)
+        arguments = (self._native_equation(equation), start, cotangent, region)
         shapes = (native.shapes_of(equation.inputs), _result_shapes(start.adjoint, start.order))
-        limits = self.max_sweeps, self.max_region_sweeps
-        return native.call_host(partial(_pull_back, kind, tie, gradient == "exact", *limits), arguments, shapes)
+        pull_back = partial(_pull_back, gradient == "exact", self.max_sweeps, self.max_region_sweeps)
+        return native.call_host(pull_back, arguments, shapes)
 
     def gather_rows(
         self, probabilities: Float[Array, "states actions outcomes"], visited: Int[Array, " visited"]
@@ -108,6 +103,17 @@ class GaussSeidel(base.Solver):
         visited = jnp.where(visited < 0, visited + len(probabilities), visited)
         shape = jax.ShapeDtypeStruct((*visited.shape, *probabilities.shape[1:]), probabilities.dtype)
         return native.call_host(_take_rows, (probabilities, visited), shape)
+
+    def _native_equation(self, equation: base.BellmanEquation) -> native.NativeEquation:
+        process, backup, beta = equation
+        if type(backup) not in KERNELS:
+            known = ", ".join(kind.__name__ for kind in KERNELS)
+            raise InputError(f"expected one that has native code ({known}), or Jacobi() as the solver", field="backup")
+        dtype = process.probabilities.dtype
+        tie = max(backup.tie, 64 * float(jnp.finfo(dtype).eps)) if isinstance(backup, HardMax) else 0.0
+        native_backup = native.NativeBackup(KERNELS[type(backup)], jnp.asarray(beta, dtype), dtype.type(tie))
+        tolerance = jnp.asarray(self.tolerance_for(dtype), dtype)
+        return native.NativeEquation(native.HostProcess(*jax.tree.leaves(process)), native_backup, tolerance)
 
 
 def _solve_values(*arguments: Any) -> None:
@@ -124,15 +130,6 @@ def _pull_back(*arguments: Any) -> None:
 
 def _take_rows(into: np.ndarray, probabilities: np.ndarray, states: np.ndarray) -> None:
     np.take(probabilities, states, axis=0, out=into, mode="clip")
-
-
-def _native_backup(backup: Backup, dtype: jnp.dtype) -> tuple[int, float]:
-    """Return the number of a backup, and the part of the best value within which actions tie."""
-    if type(backup) not in KERNELS:
-        known = ", ".join(kind.__name__ for kind in KERNELS)
-        raise InputError(f"expected one that has native code ({known}), or Jacobi() as the solver", field="backup")
-    tie = max(backup.tie, 64 * float(jnp.finfo(dtype).eps)) if isinstance(backup, HardMax) else 0.0
-    return KERNELS[type(backup)], tie
 
 
 def _no_order(states: int) -> Array:

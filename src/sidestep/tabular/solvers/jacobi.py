@@ -27,6 +27,8 @@ from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Backup, Gradient
 from sidestep.tabular.solvers import base
 
+ByAction = Float[Array, "actions states"]
+
 _STALLED = 1_000
 """The number of sweeps without progress after which an oscillating solve starts anew.
 
@@ -72,7 +74,7 @@ class Jacobi(base.Solver):
         exits = _exits(process)
         reward = jnp.broadcast_to(process.reward, process.successors.shape[:2]).T
 
-        def sweep(values: Float[Array, " states"]) -> tuple[Float[Array, " states"], Float[Array, " states"]]:
+        def sweep(values: base.Values) -> tuple[base.Values, base.Values]:
             after = values[exits.successors]
             probs = _probs_so_far(exits, values, after)
             exit_values = reward + jnp.sum(probs * after, axis=1)
@@ -110,23 +112,6 @@ class Jacobi(base.Solver):
         q = action_values(process)
         policy = backup.fixed_policy_weights(q, beta)
         weights = backup.weights(q, beta) if gradient == "exact" else policy
-        result = self._adjoint(process, weights, policy, live, cotangent, start)
-        adjoint = jnp.where(result.converged, result.values, jnp.nan)
-        by = jax.vjp(one_backup, equation.inputs)[1](adjoint)[0]
-        # what the adjoint had no part in would stay 0
-        by = jax.tree.map(lambda leaf: jnp.where(result.converged, leaf, jnp.nan), by)
-        return by, result._replace(values=adjoint)
-
-    def _adjoint(
-        self,
-        process: base.DecisionProcess,
-        weights: Float[Array, "states actions"],
-        policy: Float[Array, "states actions"],
-        live: Bool[Array, " states"],
-        cotangent: Float[Array, " states"],
-        start: base.WarmStart,
-    ) -> base.SolveResult:
-        """Solve λ = g + Wᵀλ, with the `weights` in W and the `policy` held fixed, over `live` states."""
         exits = _exits(process)
         exit_weights = exits.one_minus_discount + exits.discounted_probs.sum(axis=1)
         jacobian = jnp.where(live, weights.T, 0)[:, None] * exits.discounted_probs
@@ -134,18 +119,20 @@ class Jacobi(base.Solver):
         divisor = jnp.where(live, _divisor(weights, policy, exit_weights), 1)
         largest = jnp.abs(cotangent).max()
 
-        def sweep(adjoint: Float[Array, " states"]) -> tuple[Float[Array, " states"], Float[Array, " states"]]:
+        def sweep(adjoint: base.Values) -> tuple[base.Values, base.Values]:
             arriving = jnp.zeros_like(adjoint).at[exits.successors].add(jacobian * adjoint)
             solved = (cotangent + arriving + (divisor - diagonal) * adjoint) / divisor
             return solved, jnp.maximum(jnp.abs(solved), largest)
 
-        return self._iterate(sweep, jnp.nan_to_num(start.adjoint, nan=0), start.order)
+        result = self._iterate(sweep, jnp.nan_to_num(start.adjoint, nan=0), start.order)
+        adjoint = jnp.where(result.converged, result.values, jnp.nan)
+        by = jax.vjp(one_backup, equation.inputs)[1](adjoint)[0]
+        # what the adjoint had no part in would stay 0
+        by = jax.tree.map(lambda leaf: jnp.where(result.converged, leaf, jnp.nan), by)
+        return by, result._replace(values=adjoint)
 
     def _iterate(
-        self,
-        sweep: Callable[[Array], tuple[Array, Array]],
-        start: Float[Array, " states"],
-        order: Int[Array, " ordered"],
+        self, sweep: Callable[[Array], tuple[Array, Array]], start: base.Values, order: Int[Array, " ordered"]
     ) -> base.SolveResult:
         """Sweep until no change is large beside the sizes that `sweep` returns with its values."""
         tolerance = self.tolerance_for(start.dtype)
@@ -237,12 +224,8 @@ def _probs_so_far(
 
 
 def _solve_states(
-    backup: Backup,
-    beta: base.Beta,
-    exit_values: Float[Array, "actions states"],
-    exit_weights: Float[Array, "actions states"],
-    old: Float[Array, " states"],
-) -> Float[Array, " states"]:
+    backup: Backup, beta: base.Beta, exit_values: ByAction, exit_weights: ByAction, old: base.Values
+) -> base.Values:
     """Return one Newton step on each state's own equation, kept on the right side of the repeat-action value."""
     bottom = base.neg_inf(old.dtype)
     repeated = jnp.where(exit_weights > 0, exit_values / jnp.where(exit_weights > 0, exit_weights, 1), bottom)
@@ -263,10 +246,8 @@ def _solve_states(
 
 
 def _divisor(
-    weights: Float[Array, "states actions"],
-    policy: Float[Array, "states actions"],
-    exit_weights: Float[Array, "actions states"],
-) -> Float[Array, " states"]:
+    weights: Float[Array, "states actions"], policy: Float[Array, "states actions"], exit_weights: ByAction
+) -> base.Values:
     """Return the divisor of the Newton step: Σ w l, and never less than Σ π l, so that no step is too long.
 
     For a state that no action leaves it is 1: the state gives nothing to its neighbors and takes nothing from them.

@@ -4,8 +4,8 @@
   cores where there is one task only.
 - `compiled` and `inlined` mark functions for numba. numba is imported when one is first called, and the machine code is
   kept in `cache_folder()`.
-- `HostProcess` and `NativeBackup` are a decision process and a backup as the host sees them. Records of `base` with
-  NumPy arrays stand for results and gradients: the host writes into these.
+- `NativeEquation` is an equation as the host sees it. Records of `base` with NumPy arrays stand for results and
+  gradients: the host writes into these.
 """
 
 import ctypes
@@ -24,6 +24,7 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any, NamedTuple, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -57,12 +58,6 @@ class HostProcess(NamedTuple):
     terminal: Bool[np.ndarray, " states"]
     discount: np.floating
 
-    @classmethod
-    def from_arrays(cls, arrays: list[np.ndarray]) -> "HostProcess":
-        """Return the process of its fields as arrays."""
-        *others, discount = arrays
-        return cls(*others, discount=discount.dtype.type(discount))
-
     def kernel_sizes(self) -> tuple[int, int, int]:
         """Return the numbers of actions and outcomes, and the most outcomes of an action that leave its state."""
         states, actions, outcomes = self.successors.shape
@@ -82,6 +77,14 @@ class NativeBackup(NamedTuple):
     kind: int
     beta: np.floating
     tie: np.floating
+
+
+class NativeEquation(NamedTuple):
+    """A Bellman equation, and the relative change at which to stop when it is solved; numbers are of one type."""
+
+    process: HostProcess
+    backup: NativeBackup
+    tolerance: np.floating
 
 
 class SolveInfo(NamedTuple):
@@ -115,12 +118,13 @@ def call_host(function: Callable[..., None], arguments: tuple, shapes: Any) -> A
 
     Args:
         function: Called with writable arrays of the structure and shapes of `shapes`, then with `arguments` as
-            read-only arrays; under `vmap` once for each task, on all cores. What it raises reaches the user only as an
-            error of JAX's.
-        arguments: A tree of arrays.
+            read-only arrays and NumPy numbers; under `vmap` once for each task, on all cores. What it raises reaches
+            the user only as an error of JAX's.
+        arguments: A tree of arrays, and of other things that are passed as they are.
         shapes: A tree of `jax.ShapeDtypeStruct`.
     """
-    argument_leaves, argument_structure = jax.tree.flatten(arguments)
+    arrays, others = eqx.partition(arguments, eqx.is_array)
+    argument_leaves, argument_structure = jax.tree.flatten(arrays)
     result_leaves, result_structure = jax.tree.flatten(shapes)
     argument_axes = [jnp.ndim(leaf) for leaf in argument_leaves]
     result_axes = [len(leaf.shape) for leaf in result_leaves]
@@ -137,11 +141,12 @@ def call_host(function: Callable[..., None], arguments: tuple, shapes: Any) -> A
         def call_one(task: tuple[int, ...]) -> None:
             # the ellipsis keeps numbers arrays that can be written into
             result = jax.tree.unflatten(result_structure, [array[*task, ...] for array in into])
-            function(result, *jax.tree.unflatten(argument_structure, [array[*task, ...] for array in arrays]))
+            given = jax.tree.unflatten(argument_structure, [array[task] for array in arrays])
+            function(result, *eqx.combine(given, others))
 
         _run_batch(call_one, list(np.ndindex(batch)))
         if sum(result.nbytes for result in into) >= _MIN_BYTES_TO_TRIM:
-            _trim_memory()
+            _memory_trimmer()(0)
 
     results = buffer_callback(call_all, result_leaves, vmap_method="expand_dims")(*argument_leaves)
     return jax.tree.unflatten(result_structure, results)
@@ -165,19 +170,14 @@ def _run_batch(call_one: Callable[[tuple[int, ...]], None], tasks: Sequence[tupl
     _run_in_pool([partial(work, task) for task in tasks], stop.set)
 
 
-def _trim_memory() -> None:
-    """Give free memory back to the system, where the C library is glibc.
+@cache
+def _memory_trimmer() -> Callable[[int], object]:
+    """Return the function that gives free memory back to the system; it does nothing unless the C library is glibc.
 
     glibc keeps it for each thread, and JAX calls from any thread, so that each would keep what the largest solve took.
     """
-    trim = getattr(_c_library(), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
-
-
-@cache
-def _c_library() -> ctypes.CDLL | None:
-    return ctypes.CDLL(None) if os.name == "posix" else None
+    library = ctypes.CDLL(None) if os.name == "posix" else None
+    return getattr(library, "malloc_trim", lambda _: None)
 
 
 # Cores

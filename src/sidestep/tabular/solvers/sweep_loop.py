@@ -16,6 +16,7 @@ The other backups are not shifted: on a real map (mellowmax, the depot) it saved
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple, TypeVar
 
@@ -47,19 +48,23 @@ _SKIP = 0.25
 
 
 class _Sweep(NamedTuple):
-    """A sweep: its number, that of the first one of its round, and the history that it reads and writes."""
+    """A sweep: the history that it reads and writes, its number, and that of the first one of its round."""
 
+    history: SweepHistory
     number: int
     round_first: int
-    history: SweepHistory
 
 
+@dataclass
 class SweepLoop:
     """Values on their way to the fixed point, by position, and what has been done so far.
 
     Attributes:
+        process: What is solved, under which `backup`.
         values: The values, changed in place.
+        greedy_successor: Of each state, by the first values; changed in place.
         positions: The states that are to be solved, ascending.
+        tolerance, max_sweeps, max_rounds: When to stop.
         history: What the sweeps leave for later ones.
         blocks: `positions` in blocks.
         number: That of the last sweep over any states.
@@ -68,23 +73,20 @@ class SweepLoop:
         solved: The number of states solved, in all sweeps together.
     """
 
-    def __init__(
-        self,
-        process: NumberedProcess,
-        values: Float[np.ndarray, " states"],
-        greedy_successor: Int[np.ndarray, " states"],
-        positions: Int[np.ndarray, " solved"],
-        backup: native.NativeBackup,
-        tolerance: np.floating,
-        max_sweeps: int,
-        max_rounds: int,
-    ):
-        self.process, self.values, self.positions = process, values, positions
-        self.backup, self.tolerance = backup, tolerance
-        self.max_sweeps, self.max_rounds = max_sweeps, max_rounds
-        self.history = SweepHistory(values.copy(), greedy_successor, *np.zeros((2, len(values)), np.int32))
-        size = max(_SMALLEST_BLOCK, int(_BLOCK_FACTOR * len(positions) ** 0.5))
-        self.blocks = np.split(positions, range(size, len(positions), size))
+    process: NumberedProcess
+    values: Float[np.ndarray, " states"]
+    greedy_successor: Int[np.ndarray, " states"]
+    positions: Int[np.ndarray, " solved"]
+    backup: native.NativeBackup
+    tolerance: np.floating
+    max_sweeps: int
+    max_rounds: int
+
+    def __post_init__(self) -> None:
+        marks = np.zeros((2, len(self.values)), np.int32)
+        self.history = SweepHistory(self.values.copy(), self.greedy_successor, *marks)
+        size = max(_SMALLEST_BLOCK, int(_BLOCK_FACTOR * len(self.positions) ** 0.5))
+        self.blocks = np.split(self.positions, range(size, len(self.positions), size))
         self.number = self.round_first = self.rounds = self.solved = 0
 
     def run(self) -> native.SolveInfo:
@@ -192,26 +194,15 @@ class SweepLoop:
 
     def _next_sweep(self) -> _Sweep:
         self.number += 1
-        return _Sweep(self.number, self.round_first, self.history)
+        return _Sweep(self.history, self.number, self.round_first)
 
     def _solve(
         self, into: np.ndarray, sweep: _Sweep, positions: np.ndarray, shift_from: int, solve_all: bool = False
     ) -> tuple[float, int]:
         """Solve states in a sweep, without skips in the very first; return the largest change and their number."""
-        return sweep_kernel(*self.process.discounted_probs.shape[1:])(
-            positions,
-            self.backup,
-            self.process,
-            self.values,
-            into,
-            sweep.history,
-            sweep.number,
-            sweep.round_first,
-            shift_from,
-            solve_all or sweep.number == 1,
-            _SKIP * self.tolerance,
-            self.values.dtype.type(neg_inf(self.values.dtype)),
-        )
+        kernel, unknown = sweep_kernel(*self.process.discounted_probs.shape[1:]), neg_inf(self.values.dtype)
+        rules = shift_from, solve_all or sweep.number == 1, _SKIP * self.tolerance, self.values.dtype.type(unknown)
+        return kernel(positions, self.backup, self.process, self.values, into, *sweep, *rules)
 
     def _limit_reached(self) -> bool:
         # rounds count too: a few states that never converge should not keep all others waiting

@@ -28,101 +28,71 @@ _TRUSTED_ROUNDS = 4
 """The number of rounds for each of these sweeps; most rounds solve few states, and are cheap."""
 
 
-class _Problem(NamedTuple):
-    """What is to be solved, and how well; `bound` is a lower bound of the values."""
-
-    process: native.HostProcess
-    backup: native.NativeBackup
-    bound: np.floating
-    tolerance: np.floating
-
-    def has_nan(self) -> bool:
-        process = self.process
-        numbers = (process.probabilities, process.reward, process.terminal_reward, process.discount)
-        return any(np.isnan(np.min(part)) for part in (*numbers, self.backup.beta, self.tolerance))
-
-
 def solve_values(
-    kind: int,
-    tie: float,
     max_sweeps: int,
     into: SolveResult,
-    process: list[np.ndarray],
-    bound: Float[np.ndarray, ""],
-    beta: Float[np.ndarray, ""],
+    equation: native.NativeEquation,
+    bound: np.floating,
     start: WarmStart,
     region: Bool[np.ndarray, " states"],
-    tolerance: Float[np.ndarray, ""],
 ) -> None:
     """Solve for the values and write them into the arrays of a result.
 
     Args:
-        kind, tie, beta: The backup (see `NativeBackup`).
         max_sweeps: When to stop (see `GaussSeidel`).
         into: The result.
-        process: The arrays of `HostProcess`.
+        equation: What is to be solved, and how well.
         bound: A lower bound of the values.
         start: Values and an order.
         region: The states that have to be solved.
-        tolerance: The relative change at which to stop.
     """
-    values, _, order = start
-    number = values.dtype.type
-    backup = native.NativeBackup(kind, number(beta), number(tie))
-    problem = _Problem(native.HostProcess.from_arrays(process), backup, number(bound), number(tolerance))
-    if problem.has_nan():
+    values, order = start.values, start.order
+    if _has_nan(equation):
         into.values[:] = np.nan
         native.write_info(into, order, native.SolveInfo(0, np.nan, False))
         return
-    unknown = number(neg_inf(values.dtype))
+    unknown = neg_inf(values.dtype)
     info = native.SolveInfo(0, np.inf, False)
     region = region if region.any() else np.ones_like(region)
     if (values > unknown).any():
-        digits = -np.log10(max(problem.tolerance, np.finfo(values.dtype).eps))
+        digits = -np.log10(max(equation.tolerance, np.finfo(values.dtype).eps))
         trusted = min(int(np.ceil(_TRUST * max(1.0, digits))), max_sweeps)
-        info = _solve_from(values, order, region, problem, trusted, _TRUSTED_ROUNDS * trusted, into)
+        info = _solve_from(start, region, equation, bound, (trusted, _TRUSTED_ROUNDS * trusted), into)
     if not info.converged and info.sweeps < max_sweeps:
         # where the start's values did not serve, its order is no better
-        cold, known_order = np.full_like(values, unknown), np.full_like(order, -1) if info.sweeps else order
-        left = max_sweeps - info.sweeps
-        again = _solve_from(cold, known_order, np.ones_like(region), problem, left, left, into)
+        known_order = np.full_like(order, -1) if info.sweeps else order
+        cold, left = start._replace(values=np.full_like(values, unknown), order=known_order), max_sweeps - info.sweeps
+        again = _solve_from(cold, np.ones_like(region), equation, bound, (left, left), into)
         info = again._replace(sweeps=info.sweeps + again.sweeps)
     native.write_info(into, into.order, info)
 
 
+def _has_nan(equation: native.NativeEquation) -> bool:
+    process = equation.process
+    numbers = (process.probabilities, process.reward, process.terminal_reward, process.discount)
+    return any(np.isnan(np.min(part)) for part in (*numbers, equation.backup.beta, equation.tolerance))
+
+
 def _solve_from(
-    start: Float[np.ndarray, " states"],
-    order: Int[np.ndarray, " states"],
+    start: WarmStart,
     region: Bool[np.ndarray, " states"],
-    problem: _Problem,
-    max_sweeps: int,
-    max_rounds: int,
-    result: SolveResult,
+    equation: native.NativeEquation,
+    bound: np.floating,
+    limits: tuple[int, int],
+    into: SolveResult,
 ) -> native.SolveInfo:
     """Solve from values and an order, or a new one if that does not serve; write the values and the order."""
-    position = native.inverse_permutation(order)
-    begun = None if position is None else _begin(start, order, position, problem)
-    if begun is None or begun.out_of_order > _OUT_OF_ORDER * len(order):
-        best = order_by_distance(problem.process)
-        position = native.inverse_permutation(best)
-        assert position is not None
-        begun = _begin(start, best, position, problem)
-    positions = np.arange(len(order), dtype=np.int32)
+    begun = _begin(start, equation, bound)
+    if begun is None or begun.out_of_order > _OUT_OF_ORDER * len(start.order):
+        begun = _begin(start._replace(order=order_by_distance(equation.process)), equation, bound)
+        assert begun is not None
+    positions = np.arange(len(start.order), dtype=np.int32)
     if not region.all():
         positions = positions[region[begun.order]]
-    loop = SweepLoop(
-        begun.process,
-        begun.values,
-        begun.greedy_successor,
-        positions,
-        problem.backup,
-        problem.tolerance,
-        max_sweeps,
-        max_rounds,
-    )
-    info = loop.run()
-    result.values[begun.order] = begun.values
-    result.order[:] = begun.order
+    rules = equation.backup, equation.tolerance, *limits
+    info = SweepLoop(begun.process, begun.values, begun.greedy_successor, positions, *rules).run()
+    into.values[begun.order] = begun.values
+    into.order[:] = begun.order
     return info
 
 
@@ -141,19 +111,19 @@ class _Begun(NamedTuple):
     out_of_order: int
 
 
-def _begin(
-    start: Float[np.ndarray, " states"],
-    order: Int[np.ndarray, " states"],
-    position: Int[np.ndarray, " states"],
-    problem: _Problem,
-) -> _Begun:
-    unknown = start.dtype.type(neg_inf(start.dtype))
-    process, kernels = number_process(problem.process, order, position)
-    values, ends = start[order], np.flatnonzero(process.terminal)
-    values[ends] = np.broadcast_to(problem.process.terminal_reward, start.shape)[order[ends]]
+def _begin(start: WarmStart, equation: native.NativeEquation, bound: np.floating) -> _Begun | None:
+    """Return the task numbered in the start's order; None if this is not a permutation of all states."""
+    known, order = start.values, start.order
+    position = native.inverse_permutation(order)
+    if position is None:
+        return None
+    unknown = known.dtype.type(neg_inf(known.dtype))
+    process, kernels = number_process(equation.process, order, position)
+    values, ends = known[order], np.flatnonzero(process.terminal)
+    values[ends] = np.broadcast_to(equation.process.terminal_reward, known.shape)[order[ends]]
     greedy = np.empty_like(order)
     counts = native.map_ranges(
         lambda begin, end: kernels.greedy_successors(begin, end, process, values, unknown, greedy), len(order)
     )
-    first_values_kernel(*process.discounted_probs.shape[1:])(problem.backup, process, values, unknown, problem.bound)
+    first_values_kernel(*process.discounted_probs.shape[1:])(equation.backup, process, values, unknown, bound)
     return _Begun(order, process, values, greedy, sum(counts))
