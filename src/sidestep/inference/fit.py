@@ -36,7 +36,7 @@ from sidestep.inference.priors import Normal, Prior
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.behavior_model import BehaviorModel, behavior_model
 from sidestep.tabular.demonstrations import Demonstrations
-from sidestep.tabular.likelihood import ALL_TERMS, Term, choices_of, transition_probabilities
+from sidestep.tabular.likelihood import ALL_TERMS, Terms, choices_of, transition_probabilities
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import SolveOptions, check_proper
 from sidestep.tabular.solvers.base import WarmStart
@@ -166,7 +166,7 @@ def fit(
     *,
     prior: Prior | None = None,
     tempering: float = 1.0,
-    terms: tuple[Term, ...] = ALL_TERMS,
+    terms: Terms = ALL_TERMS,
     options: SolveOptions | None = None,
     optimizer: Optimizer | None = None,
     memory: float = MEMORY,
@@ -223,14 +223,11 @@ def fit(
     """
     optimizer, options = optimizer or LBFGS(), options or SolveOptions()
     behavior = behavior_model(behavior) if isinstance(behavior, Behavior) else behavior
-    _check_settings(terms, tempering, options, behavior.behavior, optimizer)
-    _check_sizes(model, demonstrations)
-    tasks = demonstrations.tasks
-    check_proper(behavior.tasks_of(tasks), behavior.behavior_of(), model.graph.actions, options.horizon)
     solver = options.solver_for(behavior.behavior.backup, model.graph.states)
     options = SolveOptions(options.gradient, options.horizon, solver)
     problem = Problem(model, behavior, demonstrations, prior or Normal(), terms, options, tempering)
-    count, devices, reuse = len(tasks.terminal), 1 if mesh is None else mesh.size, optimizer.approximates
+    _check_problem(problem, optimizer)
+    count, devices, reuse = len(demonstrations.tasks.terminal), 1 if mesh is None else mesh.size, optimizer.approximates
     plan = plan_batches(model, solver, count, memory=memory, devices=devices, reuse=reuse, large_map=large_map)
     objective, tolerances = Objective(problem, plan, mesh), solve_tolerances(problem, optimizer, large_map)
     saver = Saver(checkpoint, fingerprint((problem, optimizer.key)) if checkpoint is not None else "")
@@ -463,27 +460,24 @@ def _of_all_tasks(batches: list[SolveSummary], tasks: int) -> list[Array]:
     return [jax.device_put(leaf[:tasks]) for leaf in (joined(batches)[:3] if batches else unsolved)]
 
 
-def _check_settings(
-    terms: tuple[Term, ...], tempering: float, options: SolveOptions, behavior: Behavior, optimizer: Optimizer
-) -> None:
+def _check_problem(problem: Problem, optimizer: Optimizer) -> None:
+    terms, tempering, options, behavior = problem.terms, float(problem.tempering), problem.options, problem.behavior
+    graph, demos = problem.model.graph, problem.demonstrations
     known = terms and set(terms) <= set(ALL_TERMS)
     check(known, f"expected one or both of {ALL_TERMS}, found {terms}", field="terms")
     check(0 < tempering <= 1, f"expected a number above 0 and at most 1, found {tempering}", field="tempering")
-    has_objective = options.gradient == "exact" or not isinstance(behavior.backup, BoltzmannAverage)
+    has_objective = options.gradient == "exact" or not isinstance(behavior.behavior.backup, BoltzmannAverage)
     check(
         has_objective or isinstance(optimizer, Adam),
         "the fixed-policy gradient of the Boltzmann average is not the gradient of any function, so a line search is "
         "impossible: expected Adam() as the optimizer, or SolveOptions('exact')",
         field="gradient",
     )
-
-
-def _check_sizes(model: TransitionModel, demonstrations: Demonstrations) -> None:
-    states, actions = demonstrations.tasks.terminal.shape[-1], int(np.asarray(demonstrations.actions).max())
-    graph = model.graph
+    states, actions = demos.tasks.terminal.shape[-1], int(np.asarray(demos.actions).max())
     check(
         states == graph.states and actions < graph.actions,
         f"expected demonstrations in the model's {graph.states} states with its {graph.actions} actions, found "
         f"{states} states and actions up to {actions}",
         field="demonstrations",
     )
+    check_proper(behavior.tasks_of(demos.tasks), behavior.behavior_of(), graph.actions, options.horizon)

@@ -33,7 +33,7 @@ from sidestep.inference.checkpoints import fingerprint
 from sidestep.inference.priors import Prior
 from sidestep.tabular.behavior_model import BehaviorModel, BehaviorParameters
 from sidestep.tabular.demonstrations import Demonstrations
-from sidestep.tabular.likelihood import Arrivals, Term, arrival_log_likelihood, arrivals_of, choice_log_likelihood
+from sidestep.tabular.likelihood import Arrivals, Terms, arrival_log_likelihood, arrivals_of, choice_log_likelihood
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.solvers.base import Solver, WarmStart, is_reachable
@@ -67,7 +67,7 @@ class Problem(eqx.Module):
     behavior: BehaviorModel
     demonstrations: Demonstrations
     prior: Prior
-    terms: tuple[Term, ...] = eqx.field(static=True)
+    terms: Terms = eqx.field(static=True)
     options: SolveOptions
     tempering: Float[Array, ""] = eqx.field(converter=lambda number: jax.device_put(np.asarray(number)), default=1.0)
 

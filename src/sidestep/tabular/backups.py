@@ -31,6 +31,7 @@ Gradient = Literal["exact", "fixed_policy"]
 
 Values = Float[Array, "*states"]
 ActionValues = Float[Array, "*states actions"]
+Number = float | Float[Array, ""]
 
 
 class Backup(eqx.Module):
@@ -246,9 +247,7 @@ class Behavior(eqx.Module):
     beta: Float[Array, ""]
     lapse: Float[Array, ""] | None
 
-    def __init__(
-        self, backup: Backup, beta: float | Float[Array, ""] = 10.0, lapse: float | Float[Array, ""] | None = None
-    ):
+    def __init__(self, backup: Backup, beta: Number = 10.0, lapse: Number | None = None):
         self.backup = backup
         self.beta = to_jax(beta, jnp.result_type(float))
         self.lapse = None if lapse is None else to_jax(lapse, jnp.result_type(float))

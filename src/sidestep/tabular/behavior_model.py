@@ -141,12 +141,8 @@ class BehaviorModel(eqx.Module):
         if now.log_beta is not None and start.log_beta is not None:
             mean = now.log_beta.mean()
             deviations += [(mean - start.log_beta.mean())[None], (now.log_beta - mean) / _PERSON_STD]
-        for value, mean, std in (
-            (now.logit_lapse, start.logit_lapse, 1.0),
-            (now.logit_discount, start.logit_discount, 1.0),
-            (now.reward_weights, start.reward_weights, 1.0),
-            (now.cost_parameters, start.cost_parameters, _COST_STD),
-        ):
+        # the other numbers in the order of the fields
+        for value, mean, std in zip(now[1:], start[1:], (1.0, 1.0, 1.0, _COST_STD), strict=True):
             if value is not None and mean is not None:
                 deviations.append(jnp.atleast_1d((value - mean) / std))
         return -0.5 * jnp.sum(jnp.concatenate(deviations) ** 2)
@@ -210,7 +206,7 @@ def behavior_model(
         check(complete, f"expected {features.shape[-1]} finite numbers, found {initial}", field="reward_weights")
         weights, features = (to_jax(each, jnp.result_type(float)) for each in (initial, features))
     if aimed_at is not None:
-        check_states(aimed_at, len(aimed_at), "aimed_at")
+        check_states(np.asarray(aimed_at), len(aimed_at), "aimed_at")
         cost_parameters, aimed_at = to_jax(np.full(len(aimed_at), _COST_MEAN)), to_jax(aimed_at, jnp.int32)
     start = BehaviorParameters(log_beta, logit_lapse, logit_discount, weights, cost_parameters)
     return BehaviorModel(behavior, start, start, person, features, aimed_at)

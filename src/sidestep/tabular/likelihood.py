@@ -24,7 +24,8 @@ from sidestep.tabular.solvers.base import WarmStart, action_values
 from sidestep.tabular.tasks import Task
 
 Term = Literal["actions", "transitions"]
-ALL_TERMS: tuple[Term, ...] = ("actions", "transitions")
+Terms = tuple[Term, ...]
+ALL_TERMS: Terms = ("actions", "transitions")
 _MIN_LENGTH = 16
 """Lists of choices and of arrivals are padded to this length at least."""
 
@@ -55,7 +56,7 @@ def log_likelihood(
     demonstrations: Demonstrations,
     behavior: Behavior,
     *,
-    terms: tuple[Term, ...] = ALL_TERMS,
+    terms: Terms = ALL_TERMS,
     options: SolveOptions | None = None,
 ) -> LogLikelihood:
     """Return log L(θ) of demonstrations by agents that act as `behavior` describes and know `model`.
@@ -95,11 +96,7 @@ def log_likelihood(
 
 @eqx.filter_jit
 def _log_likelihood(
-    model: TransitionModel,
-    demonstrations: Demonstrations,
-    behavior: Behavior,
-    terms: tuple[Term, ...],
-    options: SolveOptions,
+    model: TransitionModel, demonstrations: Demonstrations, behavior: Behavior, terms: Terms, options: SolveOptions
 ) -> LogLikelihood:
     actions = transitions = jnp.zeros((), model.probabilities().dtype)
     if "actions" in terms:

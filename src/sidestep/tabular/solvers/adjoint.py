@@ -5,7 +5,7 @@ tenfold from sweep to sweep, until the sum of all that remain is within the tole
 the values were solved turn out to matter, there is no gradient (see `base`).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -40,7 +40,8 @@ def vjp_of_process(
         cotangent: The gradient of a scalar by the values.
         region: The states that were solved.
     """
-    (values, first, order), (by, result), process = start, into, equation.process
+    values, first, order = (np.asarray(part) for part in start)
+    (by, result), process = into, equation.process
     number = values.dtype.type
     position = native.inverse_permutation(order)
     total = np.abs(cotangent).sum()
@@ -71,7 +72,7 @@ def vjp_of_process(
     _fill(0.0, *by[1:])
 
     def pull_back_range(begin: int, end: int) -> Cotangents:
-        sums = [np.zeros_like(part) if len(np.atleast_1d(part)) == 1 else part for part in by[1:]]
+        sums: list[Any] = [np.zeros_like(part) if len(np.atleast_1d(part)) == 1 else part for part in by[1:]]
         own = Cotangents(by.probabilities, *sums)
         kernels.vjp_of_process(begin, end, process, problem, *solution, result.values, own)
         return own
@@ -79,11 +80,11 @@ def vjp_of_process(
     for own in native.map_ranges(pull_back_range, len(order)):
         for part, added in zip(by[1:], own[1:], strict=True):
             if added is not part:
-                np.add(part, added, out=part)
+                part[...] += added
     native.write_info(result, order, info)
 
 
-def _fill(number: float, *arrays: np.ndarray) -> None:
+def _fill(number: float, *arrays: Any) -> None:
     for array in arrays:
         array[...] = number
 
@@ -94,17 +95,11 @@ def _empty_state(
     """Return a state without rows; rows that are not needed take no memory."""
     states, actions, _ = process.successors.shape
     dtype = adjoint.dtype
-    return adjoint_kernels.AdjointState(
-        row=np.full(states, -1, np.int32),
-        adjoint=adjoint,
-        residual=residual,
-        weights=np.empty((states, actions), dtype),
-        beta=np.empty(states, dtype),
-        successors=np.empty((states, actions, width), np.int32),
-        jacobian=np.empty((states, actions, width), dtype),
-        exit_weight=np.empty(states, dtype),
-        divisor=np.empty(states, dtype),
-    )
+    row, successors = np.full(states, -1, np.int32), np.empty((states, actions, width), np.int32)
+    weights, jacobian = np.empty((states, actions), dtype), np.empty(successors.shape, dtype)
+    beta, exit_weight, divisor = (np.empty(states, dtype) for _ in range(3))
+    by_row = weights, beta, successors, jacobian, exit_weight, divisor
+    return adjoint_kernels.AdjointState(row, adjoint, residual, *by_row)
 
 
 class _AdjointSolve(NamedTuple):

@@ -27,6 +27,7 @@ from jaxtyping import Array, Float, Int
 from sidestep.errors import InputError
 from sidestep.tabular.backups import Backup, BoltzmannAverage, Gradient, HardMax, LogSumExp, Mellowmax
 from sidestep.tabular.solvers import base, native
+from sidestep.tabular.solvers.base import BellmanEquation, Region, Values, WarmStart
 
 KERNELS: dict[type[Backup], int] = {
     HardMax: native.HARD_MAX,
@@ -66,11 +67,11 @@ class GaussSeidel(base.Solver):
     max_sweeps: int = eqx.field(default=5_000, static=True)
     max_region_sweeps: int = eqx.field(default=100, static=True)
 
-    def cold_start(self, states: int, dtype: jnp.dtype) -> base.WarmStart:
+    def cold_start(self, states: int, dtype: jnp.dtype) -> WarmStart:
         """Return a start without values, adjoint and order."""
-        return base.WarmStart(jnp.full(states, base.neg_inf(dtype), dtype), jnp.zeros(states, dtype), _no_order(states))
+        return WarmStart(jnp.full(states, base.neg_inf(dtype), dtype), jnp.zeros(states, dtype), _no_order(states))
 
-    def values(self, equation: base.BellmanEquation, start: base.WarmStart, region: base.Region) -> base.SolveResult:
+    def values(self, equation: BellmanEquation, start: WarmStart, region: Region) -> base.SolveResult:
         """Return V of the fixed point; of all states where the start's values turn out to be of no use."""
         # another solver may have left an order of no states
         order = start.order if start.order.shape == start.values.shape else _no_order(len(start.values))
@@ -80,12 +81,7 @@ class GaussSeidel(base.Solver):
         return native.call_host(solve, arguments, _result_shapes(start.values, order))
 
     def vjp(
-        self,
-        equation: base.BellmanEquation,
-        gradient: Gradient,
-        cotangent: base.Values,
-        start: base.WarmStart,
-        region: base.Region,
+        self, equation: BellmanEquation, gradient: Gradient, cotangent: Values, start: WarmStart, region: Region
     ) -> tuple[base.Cotangents, base.SolveResult]:
         """Return the gradient by all that the values depend on; it takes a fraction of the time that they took."""
         arguments = (self._native_equation(equation), start, cotangent, region)
@@ -104,15 +100,15 @@ class GaussSeidel(base.Solver):
         shape = jax.ShapeDtypeStruct((*visited.shape, *probabilities.shape[1:]), probabilities.dtype)
         return native.call_host(_take_rows, (probabilities, visited), shape)
 
-    def _native_equation(self, equation: base.BellmanEquation) -> native.NativeEquation:
+    def _native_equation(self, equation: BellmanEquation) -> native.NativeEquation:
         process, backup, beta = equation
         if type(backup) not in KERNELS:
             known = ", ".join(kind.__name__ for kind in KERNELS)
             raise InputError(f"expected one that has native code ({known}), or Jacobi() as the solver", field="backup")
         dtype = process.probabilities.dtype
         tie = max(backup.tie, 64 * float(jnp.finfo(dtype).eps)) if isinstance(backup, HardMax) else 0.0
-        native_backup = native.NativeBackup(KERNELS[type(backup)], jnp.asarray(beta, dtype), dtype.type(tie))
-        tolerance = jnp.asarray(self.tolerance_for(dtype), dtype)
+        beta, tolerance = jax.tree.map(lambda number: jnp.asarray(number, dtype), (beta, self.tolerance_for(dtype)))
+        native_backup = native.NativeBackup(KERNELS[type(backup)], beta, dtype.type(tie))
         return native.NativeEquation(native.HostProcess(*jax.tree.leaves(process)), native_backup, tolerance)
 
 
@@ -138,7 +134,6 @@ def _no_order(states: int) -> Array:
 
 def _result_shapes(values: Array, order: Array) -> Any:
     """Return a `SolveResult` of shapes."""
-    count = jax.ShapeDtypeStruct((), jax.dtypes.canonicalize_dtype(int))
-    residual = jax.ShapeDtypeStruct((), values.dtype)
-    converged = jax.ShapeDtypeStruct((), jnp.dtype(bool))
-    return base.SolveResult(*native.shapes_of((values, order)), count, residual, converged)
+    types = jax.dtypes.canonicalize_dtype(int), values.dtype, jnp.dtype(bool)
+    info = [jax.ShapeDtypeStruct((), dtype) for dtype in types]
+    return base.SolveResult(*native.shapes_of((values, order)), *info)

@@ -26,6 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Backup, Gradient
 from sidestep.tabular.solvers import base
+from sidestep.tabular.solvers.base import BellmanEquation, Region, Values, WarmStart
 
 ByAction = Float[Array, "actions states"]
 
@@ -62,19 +63,19 @@ class Jacobi(base.Solver):
     tolerance: base.Tolerance = None
     max_sweeps: int = eqx.field(default=20_000, static=True)
 
-    def cold_start(self, states: int, dtype: jnp.dtype) -> base.WarmStart:
+    def cold_start(self, states: int, dtype: jnp.dtype) -> WarmStart:
         """Return a start without values and adjoint; an order is not used."""
         values, adjoint = np.full(states, base.neg_inf(dtype), dtype), np.zeros(states, dtype)
-        return base.WarmStart(to_jax(values), to_jax(adjoint), to_jax(np.zeros(0, np.int32)))
+        return WarmStart(to_jax(values), to_jax(adjoint), to_jax(np.zeros(0, np.int32)))
 
-    def values(self, equation: base.BellmanEquation, start: base.WarmStart, region: base.Region) -> base.SolveResult:
+    def values(self, equation: BellmanEquation, start: WarmStart, region: Region) -> base.SolveResult:
         """Return V of the fixed point, of all states whatever the region."""
         del region
         process, backup, beta = equation
         exits = _exits(process)
         reward = jnp.broadcast_to(process.reward, process.successors.shape[:2]).T
 
-        def sweep(values: base.Values) -> tuple[base.Values, base.Values]:
+        def sweep(values: Values) -> tuple[Values, Values]:
             after = values[exits.successors]
             probs = _probs_so_far(exits, values, after)
             exit_values = reward + jnp.sum(probs * after, axis=1)
@@ -86,12 +87,7 @@ class Jacobi(base.Solver):
         return self._iterate(sweep, process.with_terminal_rewards(known), start.order)
 
     def vjp(
-        self,
-        equation: base.BellmanEquation,
-        gradient: Gradient,
-        cotangent: base.Values,
-        start: base.WarmStart,
-        region: base.Region,
+        self, equation: BellmanEquation, gradient: Gradient, cotangent: Values, start: WarmStart, region: Region
     ) -> tuple[base.Cotangents, base.SolveResult]:
         """Return the gradient by all that the values depend on: the adjoint, and one backup pulled back by JAX."""
         del region
@@ -119,7 +115,7 @@ class Jacobi(base.Solver):
         divisor = jnp.where(live, _divisor(weights, policy, exit_weights), 1)
         largest = jnp.abs(cotangent).max()
 
-        def sweep(adjoint: base.Values) -> tuple[base.Values, base.Values]:
+        def sweep(adjoint: Values) -> tuple[Values, Values]:
             arriving = jnp.zeros_like(adjoint).at[exits.successors].add(jacobian * adjoint)
             solved = (cotangent + arriving + (divisor - diagonal) * adjoint) / divisor
             return solved, jnp.maximum(jnp.abs(solved), largest)
@@ -132,7 +128,7 @@ class Jacobi(base.Solver):
         return by, result._replace(values=adjoint)
 
     def _iterate(
-        self, sweep: Callable[[Array], tuple[Array, Array]], start: base.Values, order: Int[Array, " ordered"]
+        self, sweep: Callable[[Array], tuple[Array, Array]], start: Values, order: Int[Array, " ordered"]
     ) -> base.SolveResult:
         """Sweep until no change is large beside the sizes that `sweep` returns with its values."""
         tolerance = self.tolerance_for(start.dtype)
@@ -224,8 +220,8 @@ def _probs_so_far(
 
 
 def _solve_states(
-    backup: Backup, beta: base.Beta, exit_values: ByAction, exit_weights: ByAction, old: base.Values
-) -> base.Values:
+    backup: Backup, beta: base.Beta, exit_values: ByAction, exit_weights: ByAction, old: Values
+) -> Values:
     """Return one Newton step on each state's own equation, kept on the right side of the repeat-action value."""
     bottom = base.neg_inf(old.dtype)
     repeated = jnp.where(exit_weights > 0, exit_values / jnp.where(exit_weights > 0, exit_weights, 1), bottom)
@@ -247,7 +243,7 @@ def _solve_states(
 
 def _divisor(
     weights: Float[Array, "states actions"], policy: Float[Array, "states actions"], exit_weights: ByAction
-) -> base.Values:
+) -> Values:
     """Return the divisor of the Newton step: Σ w l, and never less than Σ π l, so that no step is too long.
 
     For a state that no action leaves it is 1: the state gives nothing to its neighbors and takes nothing from them.

@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from sidestep._cache import cache_folder, keep_entry, kept_entry
 from sidestep.tabular.solvers.base import SolveResult
@@ -95,7 +95,7 @@ class SolveInfo(NamedTuple):
     converged: bool
 
 
-def write_info(result: SolveResult, order: Int[np.ndarray, " states"], info: SolveInfo) -> None:
+def write_info(result: SolveResult, order: Int[Array | np.ndarray, " states"], info: SolveInfo) -> None:
     """Write all but the values into the arrays of a result."""
     for into, part in zip(result[1:], (order, *info), strict=True):
         into[...] = part

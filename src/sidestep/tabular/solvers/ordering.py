@@ -103,17 +103,12 @@ def number_process(
     kernels = numbering_kernels(*process.kernel_sizes())
     states, actions, _ = process.successors.shape
     dtype = process.probabilities.dtype
-    reward = np.broadcast_to(process.reward, (len(process.reward), actions))
-    numbered = NumberedProcess(
-        successors=np.empty((states, actions, kernels.width), np.int32),
-        discounted_probs=np.empty((states, actions, kernels.width), dtype),
-        self_loop_factor=np.empty((states, actions), dtype),
-        reward=np.ascontiguousarray(reward[order] if len(reward) > 1 else reward),
-        terminal=np.empty(states, bool),
-        one_minus_discount=1 - process.discount,
-        bandwidth=0,
-    )
-    arrays = (order, position, process.successors, process.probabilities, process.terminal, process.discount, numbered)
+    successors = np.empty((states, actions, kernels.width), np.int32)
+    probs, self_loop_factor = np.empty(successors.shape, dtype), np.empty((states, actions), dtype)
+    reward, terminal = np.broadcast_to(process.reward, (len(process.reward), actions)), np.empty(states, bool)
+    reward = np.ascontiguousarray(reward[order] if len(reward) > 1 else reward)
+    numbered = NumberedProcess(successors, probs, self_loop_factor, reward, terminal, 1 - process.discount, bandwidth=0)
+    arrays = (order, position, process, numbered)
     bandwidth = max(map_ranges(lambda begin, end: kernels.number_states(begin, end, *arrays), states))
     return numbered._replace(bandwidth=bandwidth), kernels
 
@@ -123,21 +118,19 @@ def numbering_kernels(actions: int, outcomes: int, width: int) -> NumberingKerne
     """Return the native code for these numbers; as constants they make it twice as fast."""
 
     @compiled()
-    def number_states(
-        begin, end, order, position, successors, probabilities, terminal, discount, numbered
-    ):  # pragma: no cover
+    def number_states(begin, end, order, position, process, numbered):  # pragma: no cover
         """Fill in `numbered` for a range of positions; return their bandwidth."""
         bandwidth = 0
         for i in range(begin, end):
             state = order[i]
-            numbered.terminal[i] = terminal[state]
+            numbered.terminal[i] = process.terminal[state]
             for a in range(actions):
                 exit_weight = numbered.one_minus_discount
                 m = 0
                 for k in range(outcomes):
-                    after = successors[state, a, k]
+                    after = process.successors[state, a, k]
                     if after != state:
-                        move = discount * probabilities[state, a, k]
+                        move = process.discount * process.probabilities[state, a, k]
                         numbered.successors[i, a, m] = position[after]
                         bandwidth = max(bandwidth, abs(position[after] - i))
                         numbered.discounted_probs[i, a, m] = move

@@ -235,16 +235,10 @@ def pipeline(
     while len(second) < len(blocks):
         native.check_interrupt()
         ahead, behind = len(first), len(second)
-        works = []
-        if ahead < len(blocks):
-            front = int(blocks[ahead][0])
-            on_progress(front)
-            works.append((first, partial(leading, blocks[ahead])))
-            follows = ends[behind] + 2 * bandwidth < front
-        else:
-            on_progress(ends[-1] + bandwidth + 1)
-            follows = True
-        if follows:
+        works = [(first, partial(leading, blocks[ahead]))] if ahead < len(blocks) else []
+        front = int(blocks[ahead][0]) if works else ends[-1] + 2 * bandwidth + 1
+        on_progress(min(front, ends[-1] + bandwidth + 1))
+        if ends[behind] + 2 * bandwidth < front:
             works.append((second, partial(following, blocks[behind])))
         for (results, _), result in zip(works, native.run_parallel([work for _, work in works]), strict=True):
             results.append(result)

@@ -221,9 +221,8 @@ def sweep_kernel(actions: int, width: int) -> NativeFunction:
         Returns:
             The largest relative change, NaN if any is, and the number of states that were solved.
         """
-        scratch = Scratch(
-            np.empty(actions, values.dtype), np.empty(actions, values.dtype), np.empty(actions, values.dtype)
-        )
+        dtype = values.dtype
+        scratch = Scratch(np.empty(actions, dtype), np.empty(actions, dtype), np.empty(actions, dtype))
         last_changed, last_solved = history.last_changed, history.last_solved
         # below this lie values at discount 1 of states that cannot reach a terminal state
         reachable_above = -np.sqrt(-neg_inf)
@@ -273,9 +272,8 @@ def first_values_kernel(actions: int, width: int) -> NativeFunction:
         An action that leads to none counts as one that costs its price twice, there and back. Where no nearer state is
         known the value is `bound`.
         """
-        scratch = Scratch(
-            np.empty(actions, values.dtype), np.empty(actions, values.dtype), np.empty(actions, values.dtype)
-        )
+        dtype = values.dtype
+        scratch = Scratch(np.empty(actions, dtype), np.empty(actions, dtype), np.empty(actions, dtype))
         for i in range(len(values)):
             if process.terminal[i] or values[i] > neg_inf:
                 continue

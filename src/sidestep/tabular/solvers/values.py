@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sidestep.tabular.solvers import native
 from sidestep.tabular.solvers.base import SolveResult, WarmStart, neg_inf
+from sidestep.tabular.solvers.native import NativeEquation, SolveInfo, inverse_permutation, map_ranges, write_info
 from sidestep.tabular.solvers.ordering import NumberedProcess, number_process, order_by_distance
 from sidestep.tabular.solvers.sweep_loop import SweepLoop
 from sidestep.tabular.solvers.value_kernels import first_values_kernel
@@ -31,7 +31,7 @@ _TRUSTED_ROUNDS = 4
 def solve_values(
     max_sweeps: int,
     into: SolveResult,
-    equation: native.NativeEquation,
+    equation: NativeEquation,
     bound: np.floating,
     start: WarmStart,
     region: Bool[np.ndarray, " states"],
@@ -46,54 +46,47 @@ def solve_values(
         start: Values and an order.
         region: The states that have to be solved.
     """
-    values, order = start.values, start.order
+    values, order = np.asarray(start.values), np.asarray(start.order)
     if _has_nan(equation):
         into.values[:] = np.nan
-        native.write_info(into, order, native.SolveInfo(0, np.nan, False))
+        write_info(into, order, SolveInfo(0, np.nan, False))
         return
+
+    def solve_from(start: WarmStart, region: np.ndarray, max_sweeps: int, max_rounds: int) -> SolveInfo:
+        """Solve from values and an order, or a new one if that does not serve; write the values and the order."""
+        begun = _begin(start, equation, bound)
+        if begun is None or begun.out_of_order > _OUT_OF_ORDER * len(order):
+            begun = _begin(start._replace(order=order_by_distance(equation.process)), equation, bound)
+            assert begun is not None
+        positions = np.arange(len(order), dtype=np.int32)
+        if not region.all():
+            positions = positions[region[begun.order]]
+        rules = equation.backup, equation.tolerance, max_sweeps, max_rounds
+        info = SweepLoop(begun.process, begun.values, begun.greedy_successor, positions, *rules).run()
+        into.values[begun.order] = begun.values
+        into.order[:] = begun.order
+        return info
+
     unknown = neg_inf(values.dtype)
-    info = native.SolveInfo(0, np.inf, False)
+    info = SolveInfo(0, np.inf, False)
     region = region if region.any() else np.ones_like(region)
     if (values > unknown).any():
         digits = -np.log10(max(equation.tolerance, np.finfo(values.dtype).eps))
         trusted = min(int(np.ceil(_TRUST * max(1.0, digits))), max_sweeps)
-        info = _solve_from(start, region, equation, bound, (trusted, _TRUSTED_ROUNDS * trusted), into)
+        info = solve_from(start, region, trusted, _TRUSTED_ROUNDS * trusted)
     if not info.converged and info.sweeps < max_sweeps:
         # where the start's values did not serve, its order is no better
         known_order = np.full_like(order, -1) if info.sweeps else order
         cold, left = start._replace(values=np.full_like(values, unknown), order=known_order), max_sweeps - info.sweeps
-        again = _solve_from(cold, np.ones_like(region), equation, bound, (left, left), into)
+        again = solve_from(cold, np.ones_like(region), left, left)
         info = again._replace(sweeps=info.sweeps + again.sweeps)
-    native.write_info(into, into.order, info)
+    write_info(into, into.order, info)
 
 
-def _has_nan(equation: native.NativeEquation) -> bool:
+def _has_nan(equation: NativeEquation) -> bool:
     process = equation.process
     numbers = (process.probabilities, process.reward, process.terminal_reward, process.discount)
     return any(np.isnan(np.min(part)) for part in (*numbers, equation.backup.beta, equation.tolerance))
-
-
-def _solve_from(
-    start: WarmStart,
-    region: Bool[np.ndarray, " states"],
-    equation: native.NativeEquation,
-    bound: np.floating,
-    limits: tuple[int, int],
-    into: SolveResult,
-) -> native.SolveInfo:
-    """Solve from values and an order, or a new one if that does not serve; write the values and the order."""
-    begun = _begin(start, equation, bound)
-    if begun is None or begun.out_of_order > _OUT_OF_ORDER * len(start.order):
-        begun = _begin(start._replace(order=order_by_distance(equation.process)), equation, bound)
-        assert begun is not None
-    positions = np.arange(len(start.order), dtype=np.int32)
-    if not region.all():
-        positions = positions[region[begun.order]]
-    rules = equation.backup, equation.tolerance, *limits
-    info = SweepLoop(begun.process, begun.values, begun.greedy_successor, positions, *rules).run()
-    into.values[begun.order] = begun.values
-    into.order[:] = begun.order
-    return info
 
 
 class _Begun(NamedTuple):
@@ -111,10 +104,10 @@ class _Begun(NamedTuple):
     out_of_order: int
 
 
-def _begin(start: WarmStart, equation: native.NativeEquation, bound: np.floating) -> _Begun | None:
+def _begin(start: WarmStart, equation: NativeEquation, bound: np.floating) -> _Begun | None:
     """Return the task numbered in the start's order; None if this is not a permutation of all states."""
-    known, order = start.values, start.order
-    position = native.inverse_permutation(order)
+    known, order = np.asarray(start.values), np.asarray(start.order)
+    position = inverse_permutation(order)
     if position is None:
         return None
     unknown = known.dtype.type(neg_inf(known.dtype))
@@ -122,7 +115,7 @@ def _begin(start: WarmStart, equation: native.NativeEquation, bound: np.floating
     values, ends = known[order], np.flatnonzero(process.terminal)
     values[ends] = np.broadcast_to(equation.process.terminal_reward, known.shape)[order[ends]]
     greedy = np.empty_like(order)
-    counts = native.map_ranges(
+    counts = map_ranges(
         lambda begin, end: kernels.greedy_successors(begin, end, process, values, unknown, greedy), len(order)
     )
     first_values_kernel(*process.discounted_probs.shape[1:])(equation.backup, process, values, unknown, bound)
