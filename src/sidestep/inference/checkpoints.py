@@ -127,14 +127,5 @@ class Saver:
         started = time.monotonic()
         write_whole(Path(self.checkpoint.path), write)
         ended = time.monotonic()
-        self.next = ended + self.pause(ended - started)
-
-    def pause(self, duration: float) -> float:
-        """Return how many seconds to wait after a save of this duration.
-
-        Args:
-            duration: Of the save, in seconds.
-        """
-        if self.checkpoint is None:
-            return 0.0
-        return float(max(self.checkpoint.min_interval, duration * (1 / self.checkpoint.max_fraction - 1)))
+        pause = (ended - started) * (1 / self.checkpoint.max_fraction - 1)
+        self.next = ended + max(self.checkpoint.min_interval, pause)

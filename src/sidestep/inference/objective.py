@@ -198,15 +198,13 @@ class Objective:
         uses_actions = "actions" in problem.terms
         batches = make_batches(problem.demonstrations, problem.behavior, self.plan.size) if uses_actions else []
         self.batches = [_shard(batch, mesh) for batch in batches]
+        self.arrivals = arrivals_of(problem.demonstrations) if "transitions" in problem.terms else None
         # batches and arrivals replace the demonstrations
+        problem = eqx.tree_at(lambda each: each.demonstrations, problem, None)
         self.constants = eqx.tree_at(
-            lambda all: (all.demonstrations, all.behavior.person),
-            problem,
-            (None, None),
-            is_leaf=lambda leaf: leaf is None,
+            lambda each: each.behavior.person, problem, None, is_leaf=lambda leaf: leaf is None
         )
         self.replicated = _replicate(self.constants, mesh)
-        self.arrivals = arrivals_of(problem.demonstrations) if "transitions" in problem.terms else None
 
     @property
     def processes(self) -> list[int]:

@@ -186,15 +186,11 @@ def flatten(trajectories: Sequence[Trajectory], tasks: Task) -> Demonstrations[T
         trajectories: At least one, each with at least one move.
         tasks: The tasks that `Trajectory.task` counts through, stacked.
     """
-    lengths = [len(trajectory.actions) for trajectory in trajectories]
-    return Demonstrations(
-        states=flat_moves([trajectory.states[:-1] for trajectory in trajectories]),
-        actions=flat_moves([trajectory.actions for trajectory in trajectories]),
-        next_states=flat_moves([trajectory.states[1:] for trajectory in trajectories]),
-        task=flat_moves([np.repeat([trajectory.task for trajectory in trajectories], lengths)]),
-        trajectory=flat_moves([np.repeat(np.arange(len(lengths)), lengths)]),
-        tasks=tasks,
-    )
+    paths, actions, task = zip(*trajectories, strict=True)
+    lengths = [len(taken) for taken in actions]
+    states, next_states = flat_moves([path[:-1] for path in paths]), flat_moves([path[1:] for path in paths])
+    of_moves, number = (flat_moves([np.repeat(each, lengths)]) for each in (task, np.arange(len(lengths))))
+    return Demonstrations(states, flat_moves(actions), next_states, of_moves, number, tasks)
 
 
 def flat_moves(parts: Sequence[np.ndarray]) -> Int[Array, " moves"]:
