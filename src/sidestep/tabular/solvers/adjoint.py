@@ -33,7 +33,8 @@ def vjp_of_process(
 
     Args:
         exact: Whether the gradient is the backup's own, or that of the policy held fixed.
-        max_sweeps, max_region_sweeps: When to stop (see `GaussSeidel`).
+        max_sweeps: When to stop (see `GaussSeidel`).
+        max_region_sweeps: Likewise, where states were left out.
         into: The gradient, and the adjoint as a result.
         equation: The equation; its tolerance is the part of the cotangent's sum that may remain.
         start: The solution with its order, and an adjoint to start from.

@@ -86,8 +86,8 @@ class GaussSeidel(base.Solver):
         """Return the gradient by all that the values depend on; it takes a fraction of the time that they took."""
         arguments = (self._native_equation(equation), start, cotangent, region)
         shapes = (native.shapes_of(equation.inputs), _result_shapes(start.adjoint, start.order))
-        pull_back = partial(_pull_back, gradient == "exact", self.max_sweeps, self.max_region_sweeps)
-        return native.call_host(pull_back, arguments, shapes)
+        by_adjoint = partial(_pull_back, gradient == "exact", self.max_sweeps, self.max_region_sweeps)
+        return native.call_host(by_adjoint, arguments, shapes)
 
     def gather_rows(
         self, probabilities: Float[Array, "states actions outcomes"], visited: Int[Array, " visited"]

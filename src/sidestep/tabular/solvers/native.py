@@ -141,8 +141,8 @@ def call_host(function: Callable[..., None], arguments: tuple, shapes: Any) -> A
         def call_one(task: tuple[int, ...]) -> None:
             # the ellipsis keeps numbers arrays that can be written into
             result = jax.tree.unflatten(result_structure, [array[*task, ...] for array in into])
-            given = jax.tree.unflatten(argument_structure, [array[task] for array in arrays])
-            function(result, *eqx.combine(given, others))
+            inputs = jax.tree.unflatten(argument_structure, [array[task] for array in arrays])
+            function(result, *eqx.combine(inputs, others))
 
         _run_batch(call_one, list(np.ndindex(batch)))
         if sum(result.nbytes for result in into) >= _MIN_BYTES_TO_TRIM:
