@@ -160,8 +160,7 @@ class GaussianDynamics(Dynamics):
     @property
     def reparameterized(self) -> bool:
         """Whether there is a single outcome: the draw of one among several is not smooth in θ."""
-        example = jnp.zeros_like(self.noise)
-        return jax.eval_shape(self.outcomes, example, self.example_action()).means.shape[0] == 1
+        return jax.eval_shape(self.outcomes, jnp.zeros_like(self.noise), self.example_action()).means.shape[0] == 1
 
     def example_action(self) -> Float[Array, " inputs"]:
         """Return an action of the right shape; that of the state, unless a family differs."""

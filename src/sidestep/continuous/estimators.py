@@ -63,8 +63,7 @@ def with_control_variates(agent: Agent, rollouts: Rollout, critic: Critic) -> Ro
         action = agent.policy.action(choice)
         return task.discount * agent.dynamics.transition_control_variate(value, state, action, following)
 
-    left_after = rollouts.fraction_left - one_move
-    variates = rollouts.at_every_move(variate, rollouts.choices, rollouts.following, left_after)
+    variates = rollouts.at_every_move(variate, rollouts.choices, rollouts.following, rollouts.fraction_left - one_move)
     variates = jax.lax.stop_gradient(jnp.where(rollouts.acting, variates, 0.0)).astype(rollouts.rewards.dtype)
     return eqx.tree_at(lambda rollouts: rollouts.transition_control_variates, rollouts, variates)
 
@@ -94,8 +93,7 @@ def score_surrogate(agent: Agent, rollouts: Rollout, critic: Critic | None = Non
     References:
         Eq. 11 of the paper, with the differences that the module's docstring lists.
     """
-    baselines = rollouts.action_baselines(critic)
-    beyond = q_estimates(rollouts) + rollouts.transition_control_variates - baselines
+    beyond = q_estimates(rollouts) + rollouts.transition_control_variates - rollouts.action_baselines(critic)
     credit = rollouts.discount_powers(rollouts.acting.shape[-1]) * jnp.where(rollouts.acting, beyond, 0.0)
 
     def log_prob(_: ContinuousTask, state: Array, choice: Array, following: Array) -> Array:
@@ -119,8 +117,8 @@ def pathwise_surrogate(agent: Agent, rollouts: Rollout, critic: Critic | None = 
     q = q_estimates(rollouts)
     if agent.policy.reparameterized:
         return q[..., 0]
-    baselines = rollouts.action_baselines(critic)
-    credit = jax.lax.stop_gradient(rollouts.discount_powers(rollouts.acting.shape[-1]) * (q - baselines))
+    beyond = q - rollouts.action_baselines(critic)
+    credit = jax.lax.stop_gradient(rollouts.discount_powers(rollouts.acting.shape[-1]) * beyond)
     scores = jnp.where(rollouts.acting, rollouts.policy_log_probs(agent.policy) * credit, 0.0)
     return q[..., 0] + scores[..., 1:].sum(axis=-1)
 

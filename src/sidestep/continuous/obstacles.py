@@ -119,9 +119,8 @@ class NetworkField(Field):
         Args:
             place: The place, in the units of the state.
         """
-        network = eqx.combine(self.parameters, self.structure)
         center, scale = jax.lax.stop_gradient((self.center, self.scale))
-        return network((place - center) / scale) + self.offset
+        return eqx.combine(self.parameters, self.structure)((place - center) / scale) + self.offset
 
 
 def network_field(

@@ -193,8 +193,7 @@ class Planner(eqx.Module):
         adam = optax.adam(self.critic_rate)
         critic, critic_moments = fit_critic(critic, adam, state.critic_moments, rollouts, self.critic_steps)
         after = PlannerState(eqx.apply_updates(policy, step), critic, policy_moments, critic_moments)
-        mean_returns = discounted_returns(rollouts).mean(axis=-1)
-        expected_return = jnp.sum(probabilities * mean_returns, axis=1).mean()
+        expected_return = jnp.sum(probabilities * discounted_returns(rollouts).mean(axis=-1), axis=1).mean()
         tasks = jax.tree.map(lambda leaf: leaf[:, 0, 0], rollouts.task)
         entropy = jax.vmap(policy.entropy)(task_features(tasks, rollouts.states[:, 0, 0, 0])).mean()
         advantages = rollouts.policy_advantages(policy)[..., 0, 0]
@@ -306,8 +305,7 @@ def _plan_step(
     batch = jax.random.choice(start_key, count, (planner.batch_size,), replace=count < planner.batch_size)
     tasks, states = task_at(tasks, batch), states[batch]
     choices, probabilities = planner.candidate_actions(choice_key, agent.policy, tasks, states)
-    starts = Starts(tasks, states, choices)
-    rollouts = sample_rollouts(agent, starts, rollout_key, planner.horizon, planner.samples)
+    rollouts = sample_rollouts(agent, Starts(tasks, states, choices), rollout_key, planner.horizon, planner.samples)
     rollouts = with_control_variates(agent, rollouts, state.critic)
     return planner.update(state, agent.behavior, rollouts, probabilities)
 
@@ -374,8 +372,7 @@ def fit_critic(
 
     def step(carry: tuple[Tree, Tree], batch: tuple[Array, Array, Array, Array]) -> tuple[tuple, None]:
         learned, moments = carry
-        slope = jax.grad(loss)(learned, *batch)
-        change, moments = optimizer.update(slope, moments)
+        change, moments = optimizer.update(jax.grad(loss)(learned, *batch), moments)
         return (optax.apply_updates(learned, change), moments), None
 
     (learned, moments), _ = jax.lax.scan(step, (learned, moments), batches)

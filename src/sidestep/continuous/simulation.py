@@ -111,15 +111,11 @@ def gather_trajectories(trajectories: Sequence[Trajectory], tasks: Sequence[Cont
     for row, trajectory in enumerate(trajectories, start=1):
         _check_trajectory(trajectory, trajectories[0], len(tasks), row)
     states, actions, task = zip(*trajectories, strict=True)
+    parts = [each[:-1] for each in states], actions, [each[1:] for each in states]
+    moves = (jnp.asarray(np.concatenate(part)) for part in parts)
     lengths = [len(each) for each in actions]
-    demonstrations = Demonstrations(
-        states=jnp.asarray(np.concatenate([each[:-1] for each in states])),
-        actions=jnp.asarray(np.concatenate(actions)),
-        next_states=jnp.asarray(np.concatenate([each[1:] for each in states])),
-        task=jnp.asarray(np.repeat(task, lengths), dtype=jnp.int32),
-        trajectory=jnp.asarray(np.repeat(np.arange(len(lengths)), lengths), dtype=jnp.int32),
-        tasks=batched,
-    )
+    numbers = (jnp.asarray(np.repeat(each, lengths), jnp.int32) for each in (task, np.arange(len(lengths))))
+    demonstrations = Demonstrations(*moves, *numbers, batched)
     ended = has_ended(batched, demonstrations.task, demonstrations.states)
     row = int(demonstrations.trajectory[int(ended.argmax())]) + 1
     check(not ended.any(), "goes on after a terminal state of its task", source="trajectory", row=row)

@@ -76,8 +76,7 @@ class PendulumConfig(ContinuousConfig):
         shape = self.agents_per_goal, 2
         starts = [np.array([goal, 0.0]) + random.uniform(-spread, spread, shape) for goal in self.goals]
         lattice = sc.Lattice(jnp.array([-np.pi, -8.0]), jnp.array([np.pi, 8.0]), self.lattice_points, (True, False))
-        gravities = self.real_gravity, self.believed_gravity
-        real, believed = (sc.Pendulum(gravity, noise=self.noise) for gravity in gravities)
+        real, believed = (sc.Pendulum(each, noise=self.noise) for each in (self.real_gravity, self.believed_gravity))
         agent = sc.LatticePlanner(believed, self.actions, self.behavior, lattice)
         return sc.simulate_trajectories(jax.random.key(seed), agent, real, self.tasks, starts, self.moves)
 

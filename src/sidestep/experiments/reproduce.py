@@ -94,8 +94,7 @@ def reproduce(folder: Path, seed: int = 0, notify: Notify = quiet, config: Repro
             scores[world.name][name], panel = _learn(world, demonstrations, variant, config, title)
             panels[name].append(panel)
     for file, names in FIGURES.items():
-        drawn = [panel for name in names for panel in panels[name]]
-        save(figure_learned(drawn, columns=len(worlds)), folder / file)
+        save(figure_learned([panel for name in names for panel in panels[name]], columns=len(worlds)), folder / file)
     summary = {"settings": {**asdict(config), "worlds": list(config.worlds), "seed": seed}, "maps": scores}
     write_json(folder / "summary.json", summary)
     return summary

@@ -104,8 +104,7 @@ def _pieces(
     begin = np.concatenate([np.zeros(len(start)), *(fractions for _, fractions in crossed)])
     order = np.lexsort((begin, segment))
     segment, begin = segment[order], begin[order]
-    last = np.diff(segment, append=len(start)) != 0
-    return segment, begin, np.where(last, 1.0, np.append(begin[1:], 1.0))
+    return segment, begin, np.where(np.diff(segment, append=len(start)) != 0, 1.0, np.append(begin[1:], 1.0))
 
 
 def _crossings(start: Float[np.ndarray, " segments"], end: Float[np.ndarray, " segments"]) -> _Crossings:

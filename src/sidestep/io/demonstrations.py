@@ -55,9 +55,8 @@ def demonstrations_from_moves(
         InputError: If no move is left, or for a goal that known obstacles wall off.
     """
     region = connected_regions(grid)
-    connected = region[moves.states] == region[moves.goals[moves.walk]]
     message = "the goal cannot be reached from here: known obstacles wall it off"
-    check_rows(connected, message, moves.source, "goal_x", moves.rows)
+    check_rows(region[moves.states] == region[moves.goals[moves.walk]], message, moves.source, "goal_x", moves.rows)
     moves = moves.before_goal()
     check(len(moves), "every walk starts at its goal: expected moves towards one", source=moves.source)
     goals, task = np.unique(moves.goals[np.unique(moves.walk)], return_inverse=True)

@@ -201,7 +201,6 @@ def _goal_cells(walks: Walks, grid: Grid, visits: Visits, occupied: Occupied) ->
 def _check_inside(positions: Points, rows: Int[np.ndarray, " points"], prefix: str, walks: Walks, grid: Grid) -> None:
     """Raise `InputError` for the first position outside the map; its columns are x and y after the prefix."""
     inside, column = grid.contains(positions), grid.to_cell_units(positions)[:, 0]
-    first = np.argmin(np.where(inside, np.inf, rows))
-    field = prefix + ("y" if 0 <= column[first] <= grid.shape[1] else "x")
+    field = prefix + ("y" if 0 <= column[np.argmin(np.where(inside, np.inf, rows))] <= grid.shape[1] else "x")
     message = "expected a position on the map, by its `resolution` and `origin`, found ({}, {})"
     check_rows(inside, message, walks.source, field, rows, positions)

@@ -73,10 +73,9 @@ def from_gymnasium(env: Any, discount: float = 0.99) -> Environment:
         one, other, state = (float(each[*place]) for each in (known, beyond, successors))
         raise InputError(f"ending in state {state:g} pays {one:g} beyond one action and {other:g} beyond another")
     reward[terminal] = 0.0
-    possible = jnp.asarray(probabilities > 0)
     logits = jnp.log(jnp.asarray(np.where(probabilities > 0, probabilities, 1.0)))
     task = Task(jnp.asarray(reward), jnp.asarray(final / discount), jnp.asarray(terminal), jnp.asarray(float(discount)))
-    return Environment(TabularModel(graph(successors), logits, possible), task, ends)
+    return Environment(TabularModel(graph(successors), logits, jnp.asarray(probabilities > 0)), task, ends)
 
 
 def _outcomes(rows: Any) -> tuple[Any, ...]:

@@ -12,7 +12,7 @@ above 100 (`raw`) are unknown.
 import math
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,9 +20,6 @@ from jaxtyping import Bool, Float
 from sidestep._files import read_array, read_whole, write_whole
 from sidestep.errors import InputError, check
 from sidestep.tabular.grid import Cell, Connectivity, Grid
-
-if TYPE_CHECKING:
-    from PIL import Image
 
 MOST_PIXELS = 100_000_000
 """Images with more pixels are refused before they are decoded."""
@@ -290,19 +287,13 @@ def _gray(path: Path) -> tuple[Float[np.ndarray, "rows columns"], Bool[np.ndarra
             width, height = image.size
             if not 0 < width * height <= MOST_PIXELS:
                 raise ValueError(f"{width:,} by {height:,} pixels, but from 1 to {MOST_PIXELS:,} can be read")
-            return _gray_of_image(image)
+            if image.mode == "F":
+                raise ValueError("the pixels are fractions, as in PFM")
+            sixteen_bits = image.mode.startswith("I")
+            if not sixteen_bits and (image.mode not in ("1", "L") or "transparency" in image.info):
+                channels = np.asarray(image.convert("RGBA"))
+                return channels[..., :3].mean(axis=-1), channels[..., 3] == 0
+            gray = np.asarray(image if sixteen_bits else image.convert("L"), dtype=np.float64)
+            return gray * (255 / 65535) if sixteen_bits else gray, np.zeros(gray.shape, dtype=bool)
     except Exception as error:  # Decoders raise errors of any kind on broken files.
         raise InputError(f"expected an image in PGM or PNG format: {error}", source=path) from error
-
-
-def _gray_of_image(image: "Image.Image") -> tuple[Float[np.ndarray, "rows columns"], Bool[np.ndarray, "rows columns"]]:
-    if image.mode.startswith("I"):  # 16 bits a pixel
-        gray = np.asarray(image, dtype=np.float64) * (255 / 65535)
-    elif image.mode in ("1", "L") and "transparency" not in image.info:
-        gray = np.asarray(image.convert("L"), dtype=np.float64)
-    elif image.mode == "F":
-        raise ValueError("the pixels are fractions, as in PFM")
-    else:
-        channels = np.asarray(image.convert("RGBA"))
-        return channels[..., :3].mean(axis=-1), channels[..., 3] == 0
-    return gray, np.zeros(gray.shape, dtype=bool)

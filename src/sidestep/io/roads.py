@@ -158,9 +158,8 @@ def _read(path: str | Path, names: tuple[str, ...]) -> pa.Table:
 
 def _labels(table: pa.Table, name: str, path: object) -> list[str]:
     """Return a column without empty cells as text."""
-    cells = table[name].to_pylist()
     check_rows(table[name].is_valid().to_numpy(), "expected a label, found an empty cell", path, name)
-    return [str(cell) for cell in cells]
+    return [str(cell) for cell in table[name].to_pylist()]
 
 
 def _numbered(table: pa.Table, name: str, path: object, number: dict[str, int]) -> Int[np.ndarray, " rows"]:

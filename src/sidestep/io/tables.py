@@ -168,7 +168,7 @@ def _read_csv(path: Path) -> pa.Table:
         return "skip"
 
     try:
-        header = next(filter(None, csv.reader(io.StringIO(_decoded(content, path)))), [])
+        header = next(filter(None, csv.reader(io.StringIO(content.decode("utf-8-sig")))), [])
         table = pyarrow.csv.read_csv(
             pa.BufferReader(content),
             # Rows are numbered only by one thread.
@@ -178,6 +178,9 @@ def _read_csv(path: Path) -> pa.Table:
                 column_types={name: pa.string() for name in header}, null_values=[""], strings_can_be_null=True
             ),
         )
+    except UnicodeDecodeError as error:
+        row = content[: error.start].count(b"\n")
+        raise InputError("expected text in UTF-8", source=path, row=row or None) from error
     except (pa.ArrowException, csv.Error) as error:
         raise InputError(f"expected a table in CSV: {error}", source=path) from error
     if ragged:
@@ -185,15 +188,6 @@ def _read_csv(path: Path) -> pa.Table:
         message = f"expected {first.expected_columns} cells as in the header, found {first.actual_columns}"
         raise InputError(message, source=path, row=first.number - 1)
     return table
-
-
-def _decoded(content: bytes, path: Path) -> str:
-    """Return the text of a file without a byte order mark."""
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        row = content[: error.start].count(b"\n")
-        raise InputError("expected text in UTF-8", source=path, row=row or None) from error
 
 
 def _read_parquet(path: Path) -> pa.Table:

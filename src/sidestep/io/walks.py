@@ -210,8 +210,7 @@ def table_from_walks(walks: Walks) -> pa.Table:
     """
     lengths = np.diff(walks.offsets)
     goals = np.repeat(walks.goals, lengths, axis=0)
-    labels = pa.array(walks.labels).take(np.repeat(np.arange(len(walks)), lengths))
-    columns = {"walk": labels, "step": walks.steps}
+    columns = {"walk": pa.array(walks.labels).take(np.repeat(np.arange(len(walks)), lengths)), "step": walks.steps}
     columns |= position_columns("", walks.positions) | position_columns("goal_", goals)
     if not np.isnan(walks.failed_moves).all():
         failed = position_columns("failed_", walks.failed_moves)

@@ -246,8 +246,7 @@ def figure_fit(
     after.set_title("Learned")
     for axes in (before, after):
         draw_places(axes, (), goals, grid)
-    marker = "." if len(objective) < 30 else ""
-    progress.plot(np.arange(len(objective)), objective, color=palette.BLUE, marker=marker)
+    progress.plot(np.arange(len(objective)), objective, color=palette.BLUE, marker="." if len(objective) < 30 else "")
     progress.set(title="Objective", xlabel="iteration", ylabel="log posterior (nats)")
     progress.locator_params(axis="x", integer=True)
     progress.ticklabel_format(axis="y", useOffset=False)
@@ -336,9 +335,8 @@ def _draw_markers(axes: Axes, places: Marks, grid: Grid, marker: str, color: str
     if not len(places):
         return
     x, y = _metres(np.asarray(places), grid).T
-    size = scale * _width(grid, 7.0, 9.0)
     edge = {"markeredgecolor": "white", "markeredgewidth": 0.8}
-    axes.plot(x, y, marker, color=color, markersize=size, zorder=5, label=label, **edge)
+    axes.plot(x, y, marker, color=color, markersize=scale * _width(grid, 7.0, 9.0), zorder=5, label=label, **edge)
 
 
 def _metres(places: Places, grid: Grid) -> Float[np.ndarray, "places 2"]:

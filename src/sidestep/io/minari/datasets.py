@@ -99,8 +99,7 @@ def read_dataset(dataset: str | Path, check_spaces: Callable[[Any, Any], None]) 
         metadata = list(opened.storage.get_episode_metadata(opened.episode_indices))
         spaces, whole = (opened.observation_space, opened.action_space), opened.storage.metadata
     check(stored, "expected at least one episode, found none", source=dataset)
-    episodes = [_episode(dataset, each, own) for each, own in zip(stored, metadata, strict=True)]
-    return Dataset(*spaces, whole, episodes)
+    return Dataset(*spaces, whole, [_episode(dataset, each, own) for each, own in zip(stored, metadata, strict=True)])
 
 
 def write_dataset(dataset: str, content: Dataset) -> None:
