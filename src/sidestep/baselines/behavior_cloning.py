@@ -146,13 +146,9 @@ def _features(grid: Grid, states: _Index, goals: _Index) -> csr_array:
     down, right = np.sign(offset).T
     compass = 3 * (down + 1) + right + 1
     sector = 3 * compass + np.sign(np.abs(offset[:, 0]) - np.abs(offset[:, 1])) + 1
-    parts = [
-        csr_array(np.concatenate([offset / distance, 1 / distance], axis=-1)),
-        _one_hot(sector, _SECTORS),
-        _one_hot(states, grid.size),
-        _one_hot(_COMPASS * states + compass, _COMPASS * grid.size),
-    ]
-    return csr_array(hstack(parts))
+    direction = csr_array(np.concatenate([offset / distance, 1 / distance], axis=-1))
+    indices = (sector, _SECTORS), (states, grid.size), (_COMPASS * states + compass, _COMPASS * grid.size)
+    return csr_array(hstack([direction, *(_one_hot(index, size) for index, size in indices)]))
 
 
 def _one_hot(index: _Index, size: int) -> csr_array:

@@ -51,17 +51,14 @@ class Comparison:
 
     def summary(self) -> dict[str, Any]:
         """Return the content of `summary.json`."""
-        heldout = self.problem.heldout
+        learned_from, heldout = self.problem.demonstrations, self.problem.heldout
+        held = (heldout.trajectories, len(heldout)) if heldout else (0, 0)
+        data = {"walks": learned_from.trajectories, "moves": len(learned_from)}
         return {
             "settings": asdict(self.config),
             "connectivity": self.problem.grid.connectivity,
             "behavior": self.selection.summary() if self.selection else {},
-            "data": {
-                "walks": self.problem.demonstrations.trajectories,
-                "moves": len(self.problem.demonstrations),
-                "heldout_walks": heldout.trajectories if heldout else 0,
-                "heldout_moves": len(heldout) if heldout else 0,
-            },
+            "data": {**data, "heldout_walks": held[0], "heldout_moves": held[1]},
             "methods": self.method_scores(),
         }
 

@@ -30,6 +30,7 @@ class BaselineResult(MethodResult, Protocol):
     @property
     def heatmap(self) -> _Cells | None:
         """The ranking of cells from 0 to 1: P(blocked), if the method has it; None without a ranking."""
+        ...
 
 
 Method = Callable[[Grid, Demonstrations, MapConfig], BaselineResult]

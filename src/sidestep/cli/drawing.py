@@ -6,10 +6,10 @@ matplotlib already draws by itself, and so does the first one if the second fail
 
 import os
 import pickle
-import subprocess
 import sys
 from functools import cache
 from pathlib import Path
+from subprocess import DEVNULL, PIPE, Popen
 from typing import Any
 
 
@@ -45,10 +45,8 @@ def draw(name: str, path: Path, *arguments: Any) -> None:
 
 
 @cache
-def _worker() -> subprocess.Popen[bytes]:
+def _worker() -> Popen[bytes]:
     # -P: the present folder may hold a file with the name of a module
     command = [sys.executable, "-P", "-m", "sidestep.plotting.worker"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-    return subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment
-    )
+    return Popen(command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL, env=environment)

@@ -9,6 +9,10 @@ import typer
 from sidestep.cli.options import Folder, Seed
 
 Experiment = Literal["room", "pendulum", "representations", "motivation"]
+_EXPERIMENT_HELP = (
+    "room: a wall that no walk touches; pendulum: gravity from actions alone; representations: three models of the "
+    "room; motivation: costs of cells against a transition model, when the reward changes."
+)
 
 
 def demo(out: Folder = Path("sidestep-demo"), seed: Seed = 0) -> None:
@@ -34,13 +38,7 @@ def reproduce(out: Folder = Path("sidestep-reproduce"), seed: Seed = 0) -> None:
 
 
 def experiment(
-    name: Annotated[
-        Experiment,
-        typer.Argument(
-            help="room: a wall that no walk touches; pendulum: gravity from actions alone; representations: three "
-            "models of the room; motivation: costs of cells against a transition model, when the reward changes."
-        ),
-    ],
+    name: Annotated[Experiment, typer.Argument(help=_EXPERIMENT_HELP)],
     out: Annotated[Path | None, typer.Option("--out", help="The folder to write to.", metavar="DIR")] = None,
     seed: Seed = 0,
 ) -> None:

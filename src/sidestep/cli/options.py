@@ -80,14 +80,10 @@ class LearnOptions:
     def config(self) -> MapConfig:
         """Return the configuration."""
         learned = tuple(dict.fromkeys(self.learn or ()))
-        return MapConfig(
-            reward=self._part(Reward),
-            behavior=self._part(BehaviorConfig, learn=learned, select=self.select_behavior),
-            prior=PriorConfig(self.prior_mean, self.prior_variance, self.wall_prior),
-            fit=self._part(FitConfig, gradient=self.gradient.replace("-", "_")),
-            max_walks=self.max_walks,
-            seed=self.seed,
-        )
+        behavior = self._part(BehaviorConfig, learn=learned, select=self.select_behavior)
+        prior = PriorConfig(self.prior_mean, self.prior_variance, self.wall_prior)
+        fit = self._part(FitConfig, gradient=self.gradient.replace("-", "_"))
+        return MapConfig(self._part(Reward), behavior, prior, fit, max_walks=self.max_walks, seed=self.seed)
 
     def _part(self, record: type[_Config], **others: Any) -> _Config:
         """Return a record with the options that have the names of its fields."""

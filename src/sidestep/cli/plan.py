@@ -33,16 +33,9 @@ def plan(
     write_table(out / "path.csv", pa.table({"step": steps, "x": x, "y": y, "blocked": path.blocked}))
     draw("figure_plan", out / "path.png", learned.grid, learned.blocked, path.states)
     moves, likeliest = len(path.states) - 1, float(path.blocked.max())
-    summary = {
-        "command": "plan",
-        "start": first,
-        "goal": last,
-        "bump_cost": bump_cost,
-        "moves": moves,
-        "length_metres": path.length,
-        "max_probability_blocked": likeliest,
-        "probability_free": float(np.prod(1 - path.blocked)),
-    }
+    settings = {"command": "plan", "start": first, "goal": last, "bump_cost": bump_cost}
+    risk = {"max_probability_blocked": likeliest, "probability_free": float(np.prod(1 - path.blocked))}
+    summary = {**settings, "moves": moves, "length_metres": path.length, **risk}
     add_to_summary(folder, out, "plan", summary)
     print_lines(f"{moves} moves, {path.length:g} m; the likeliest obstacle on the way has P(blocked) = {likeliest:.3f}")
     print_lines(f"path in {out}")

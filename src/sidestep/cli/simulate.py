@@ -40,13 +40,8 @@ def simulate(
         trajectories, states = simulate_walks(grid, config)
         write_table(out, table_from_walks(walks_from_trajectories(trajectories, states, grid)))
     moves = sum(len(trajectory.actions) for trajectory in trajectories)
-    summary = {
-        "command": "simulate",
-        "map": str(map_file),
-        "walks": str(out),
-        "settings": {**asdict(config), "connectivity": grid.connectivity},
-        "moves": moves,
-        "goals": grid.centers(np.array(states)).tolist(),
-    }
-    write_json(out.with_suffix(".summary.json"), summary)
+    files = {"command": "simulate", "map": str(map_file), "walks": str(out)}
+    settings = {**asdict(config), "connectivity": grid.connectivity}
+    results = {"settings": settings, "moves": moves, "goals": grid.centers(np.array(states)).tolist()}
+    write_json(out.with_suffix(".summary.json"), files | results)
     print_lines(f"{walks} walks, {moves} moves, in {out}")

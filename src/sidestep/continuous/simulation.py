@@ -115,7 +115,7 @@ def gather_trajectories(trajectories: Sequence[Trajectory], tasks: Sequence[Cont
     moves = (jnp.asarray(np.concatenate(part)) for part in parts)
     lengths = [len(each) for each in actions]
     numbers = (jnp.asarray(np.repeat(each, lengths), jnp.int32) for each in (task, np.arange(len(lengths))))
-    demonstrations = Demonstrations(*moves, *numbers, batched)
+    demonstrations = Demonstrations(*moves, *numbers, tasks=batched)
     ended = has_ended(batched, demonstrations.task, demonstrations.states)
     row = int(demonstrations.trajectory[int(ended.argmax())]) + 1
     check(not ended.any(), "goes on after a terminal state of its task", source="trajectory", row=row)

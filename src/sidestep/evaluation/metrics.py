@@ -76,14 +76,10 @@ def score_map(blocked: Float[np.ndarray, "rows columns"], truth: Grid, scored: _
     check(np.isfinite(blocked).all(), "expected finite numbers", field="blocked")
     obstacle = scored & (truth.known == Cell.OCCUPIED)
     free = scored & (truth.known == Cell.FREE)
-    return MapScores(
-        *ranking_scores(blocked[obstacle], blocked[free]),
-        *ranking_scores(blocked[obstacle & relevant], blocked[free]),
-        recall=_mean(blocked[obstacle] >= 0.5),
-        mean_obstacle=_mean(blocked[obstacle]),
-        mean_free=_mean(blocked[free]),
-        max_probability=float(blocked[obstacle | free].max()) if (obstacle | free).any() else None,
-    )
+    on_obstacles, on_free = blocked[obstacle], blocked[free]
+    ranking = *ranking_scores(on_obstacles, on_free), *ranking_scores(blocked[obstacle & relevant], on_free)
+    highest = float(blocked[obstacle | free].max()) if (obstacle | free).any() else None
+    return MapScores(*ranking, _mean(on_obstacles >= 0.5), _mean(on_obstacles), _mean(on_free), highest)
 
 
 def ranking_scores(

@@ -22,14 +22,17 @@ class MethodResult(Protocol):
     @property
     def planner(self) -> Planner:
         """The robot's planner."""
+        ...
 
     @property
     def ranking(self) -> Float[np.ndarray, "rows columns"] | None:
         """A number for each cell, higher for obstacles; None if the method does not rank cells."""
+        ...
 
     @property
     def converged(self) -> bool:
         """Whether the method's optimization converged; True if it has none."""
+        ...
 
     def log_policies(self, demonstrations: Demonstrations) -> Float[np.ndarray, " moves"]:
         """Return log π(a | s) of every move in nats; NaN for all moves if the values of a task do not converge.
@@ -37,6 +40,7 @@ class MethodResult(Protocol):
         Args:
             demonstrations: Moves on the same map.
         """
+        ...
 
 
 Method = Callable[[Grid, Demonstrations], MethodResult]

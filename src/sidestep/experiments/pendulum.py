@@ -104,16 +104,10 @@ def run(folder: Path, seed: int = 0, notify: Notify = quiet, config: PendulumCon
     settings = {"prior": prior, "terms": ("actions",), "estimator": "pathwise"}
     fit = config.fit(dynamics, walks, config.actions, seed, notify, "learning gravity", seen.append, **settings)
     estimate = float(fit.dynamics.constant("gravity"))
-    results = {
-        "gravity_true": believed,
-        "gravity_estimate": estimate,
-        "gravity_real": real,
-        "relative_error": abs(estimate - believed) / believed,
-        "trajectories": len(trajectories),
-        "moves": len(walks),
-        "converged": fit.converged,
-        "message": fit.message,
-    }
+    gravity = {"gravity_true": believed, "gravity_estimate": estimate, "gravity_real": real}
+    counts = {"trajectories": len(trajectories), "moves": len(walks)}
+    fitted = {"converged": fit.converged, "message": fit.message}
+    results = {**gravity, "relative_error": abs(estimate - believed) / believed, **counts, **fitted}
     angles = [trajectory.states[:, 0] for trajectory in trajectories]
     estimates = np.asarray([float(each.constant("gravity")) for each in seen])
     figure = figure_belief(angles, dynamics.time_step, estimates, believed, real)

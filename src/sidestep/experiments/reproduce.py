@@ -121,15 +121,10 @@ def _learn(
     world: World, walks: ss.Demonstrations, variant: Variant, config: ReproduceConfig, title: str
 ) -> tuple[dict[str, Any], Panel]:
     """Return the scores of what a variant learns, and its panel."""
-    fit = ss.fit(
-        ss.ObstacleGrid(world.truth.forget(), config.prior_mean),
-        walks,
-        ss.Behavior(ss.BoltzmannAverage(), config.beta),
-        prior=ss.Normal(config.prior_mean, config.prior_variance),
-        terms=variant.terms,
-        options=ss.SolveOptions(gradient=variant.gradient),
-        optimizer=variant.optimizer,
-    )
+    model = ss.ObstacleGrid(world.truth.forget(), config.prior_mean)
+    behavior = ss.Behavior(ss.BoltzmannAverage(), config.beta)
+    prior, options = ss.Normal(config.prior_mean, config.prior_variance), ss.SolveOptions(gradient=variant.gradient)
+    fit = ss.fit(model, walks, behavior, prior=prior, terms=variant.terms, options=options, optimizer=variant.optimizer)
     planner = ModelPlanner(fit.model, partial(config.reward.reach, fit.model.blank))
     blocked = np.asarray(fit.model.blocked)
     everywhere, visited = np.ones(world.truth.shape, dtype=bool), walks.visited_state_goals()

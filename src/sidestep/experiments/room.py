@@ -139,17 +139,10 @@ def run(folder: Path, seed: int = 0, notify: Notify = quiet, config: RoomConfig 
         Panel("The learned wall, and new plans", cells, blocked, cells, planned, starts, goals),
         Panel("By transitions alone", cells, by_transitions, cells),
     ]
-    results = {
-        **score_map(blocked, world),
-        "transitions_only": score_map(by_transitions, world),
-        "walks": walks,
-        "moves": len(demonstrations),
-        "collisions_removed": collisions,
-        "planned_walks_arrived": arrived,
-        "planned_walks": len(planned),
-        "converged": fit.converged,
-        "message": fit.message,
-    }
+    scores = {**score_map(blocked, world), "transitions_only": score_map(by_transitions, world)}
+    counts = {"walks": walks, "moves": len(demonstrations), "collisions_removed": collisions}
+    plans = {"planned_walks_arrived": arrived, "planned_walks": len(planned)}
+    results = {**scores, **counts, **plans, "converged": fit.converged, "message": fit.message}
     return write_results(folder, "room", seed, started, figure_learned(panels), results)
 
 

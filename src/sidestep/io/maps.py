@@ -223,15 +223,9 @@ def write_map(path: str | Path, blocked: Float[np.ndarray, "rows columns"], grid
     check(blocked.shape == grid.shape, message, field="blocked")
     check(((blocked >= 0) & (blocked <= 1)).all(), "expected probabilities from 0 to 1 in every cell", field="blocked")
     image = path.with_suffix(".pgm")
-    settings = {
-        "image": image.name,
-        "mode": "scale",
-        "resolution": float(grid.resolution),
-        "origin": [float(number) for number in grid.origin],
-        "negate": 0,
-        "occupied_thresh": OCCUPIED_ABOVE,
-        "free_thresh": FREE_BELOW,
-    }
+    place = {"resolution": float(grid.resolution), "origin": [float(number) for number in grid.origin]}
+    meaning = {"negate": 0, "occupied_thresh": OCCUPIED_ABOVE, "free_thresh": FREE_BELOW}
+    settings = {"image": image.name, "mode": "scale", **place, **meaning}
     pixels = Image.fromarray(np.rint(255 * (1 - blocked)).astype(np.uint8))
     text = yaml.safe_dump(settings, sort_keys=False, allow_unicode=True)
     write_whole(image, lambda file: pixels.save(file, format="PPM"))

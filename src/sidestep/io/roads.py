@@ -173,8 +173,7 @@ def _numbered(table: pa.Table, name: str, path: object, number: dict[str, int]) 
 def _whole(table: pa.Table, name: str, path: object, most: int) -> Int[np.ndarray, " rows"]:
     """Return a column of whole numbers from 0."""
     values = finite_column(table, name, str(path))
-    valid = (values >= 0) & (values <= most) & (values % 1 == 0)
-    check_rows(valid, f"expected a whole number, 0…{most}", path, name)
+    check_rows((values >= 0) & (values <= most) & (values % 1 == 0), f"expected a whole number, 0…{most}", path, name)
     return values.astype(np.int64)
 
 

@@ -169,15 +169,11 @@ def _read_csv(path: Path) -> pa.Table:
 
     try:
         header = next(filter(None, csv.reader(io.StringIO(content.decode("utf-8-sig")))), [])
-        table = pyarrow.csv.read_csv(
-            pa.BufferReader(content),
-            # Rows are numbered only by one thread.
-            read_options=pyarrow.csv.ReadOptions(use_threads=False),
-            parse_options=pyarrow.csv.ParseOptions(newlines_in_values=True, invalid_row_handler=remember),
-            convert_options=pyarrow.csv.ConvertOptions(
-                column_types={name: pa.string() for name in header}, null_values=[""], strings_can_be_null=True
-            ),
-        )
+        one_thread = pyarrow.csv.ReadOptions(use_threads=False)  # Rows are numbered only by one thread.
+        parse = pyarrow.csv.ParseOptions(newlines_in_values=True, invalid_row_handler=remember)
+        types = {name: pa.string() for name in header}
+        convert = pyarrow.csv.ConvertOptions(column_types=types, null_values=[""], strings_can_be_null=True)
+        table = pyarrow.csv.read_csv(pa.BufferReader(content), one_thread, parse, convert)
     except UnicodeDecodeError as error:
         row = content[: error.start].count(b"\n")
         raise InputError("expected text in UTF-8", source=path, row=row or None) from error

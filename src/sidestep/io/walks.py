@@ -189,17 +189,10 @@ def walks_from_table(table: pa.Table, source: str = "walks") -> Walks:
         same = (column[1:] == column[:-1]) | (np.isnan(column[1:]) & np.isnan(column[:-1]))
         check_pairs(same, field, "expected the same goal in all rows of a walk")
     goals = goals[offsets[:-1]]
-    return Walks(
-        labels=labels,
-        offsets=offsets.astype(np.int64),
-        goals=np.where(np.isnan(goals), positions[offsets[1:] - 1], goals),
-        positions=positions,
-        failed_moves=_pair(table, "failed", source)[order],
-        steps=steps,
-        rows=rows,
-        metadata=table.drop_columns([name for name in table.column_names if name in _REQUIRED + _OPTIONAL]).take(order),
-        source=source,
-    )
+    goals = np.where(np.isnan(goals), positions[offsets[1:] - 1], goals)
+    failed_moves = _pair(table, "failed", source)[order]
+    metadata = table.drop_columns([name for name in table.column_names if name in _REQUIRED + _OPTIONAL]).take(order)
+    return Walks(labels, offsets.astype(np.int64), goals, positions, failed_moves, steps, rows, metadata, source)
 
 
 def table_from_walks(walks: Walks) -> pa.Table:

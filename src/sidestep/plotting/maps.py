@@ -327,8 +327,7 @@ def _borders(inside: Bool[np.ndarray, "rows columns"], grid: Grid) -> list[Float
 def _shifts(count: int) -> Float[np.ndarray, "walks 2"]:
     """Return shifts that fill a square of ±0.3 evenly, the first one 0 (the R₂ sequence of Roberts, 2018)."""
     plastic = 1.32471795724474602596
-    sequence = np.arange(count)[:, None] / np.array([plastic, plastic**2])
-    return ((sequence + 0.5) % 1.0 - 0.5) * 0.6
+    return ((np.arange(count)[:, None] / np.array([plastic, plastic**2]) + 0.5) % 1.0 - 0.5) * 0.6
 
 
 def _draw_markers(axes: Axes, places: Marks, grid: Grid, marker: str, color: str, label: str, scale: float = 1) -> None:

@@ -75,6 +75,7 @@ class Planner(Protocol):
 
     def goal_mask(self) -> Bool[np.ndarray, "rows columns"]:
         """Return the cells that can be goals: those not known to be blocked."""
+        ...
 
     def plan_to(self, goal: int) -> GoalPlan:
         """Return the plan to reach a state.
@@ -82,6 +83,7 @@ class Planner(Protocol):
         Args:
             goal: The goal state.
         """
+        ...
 
 
 @dataclass(frozen=True, eq=False)

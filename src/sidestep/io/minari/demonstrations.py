@@ -151,10 +151,9 @@ def _rewards(demonstrations: Demonstrations[Task], states: int, actions: int) ->
 def _trajectory(episode: Episode, task: int, states: int, actions: int, ends: Mapping[int, int]) -> Trajectory:
     moves = len(episode.rewards)
     path = _within(episode.observations, moves + 1, states, episode.source, "observations")
-    acted = _within(episode.actions, moves, actions, episode.source, "actions")
     if episode.terminated:
         path[-1] = ends.get(int(path[-1]), int(path[-1]))
-    return Trajectory(path, acted, task)
+    return Trajectory(path, _within(episode.actions, moves, actions, episode.source, "actions"), task)
 
 
 def _within(values: object, length: int, count: int, source: str, field: str) -> Int[np.ndarray, " length"]:
@@ -170,15 +169,10 @@ def _within(values: object, length: int, count: int, source: str, field: str) ->
 
 def _describe_tasks(tasks: Task) -> list[dict[str, Any]]:
     """Return stacked tasks as plain values, one entry per task."""
-    return [
-        {
-            "discount": float(tasks.discount[index]),
-            "terminal": np.flatnonzero(tasks.terminal[index]).tolist(),
-            "terminal_reward": np.asarray(tasks.terminal_reward[index], dtype=np.float64).tolist(),
-            "reward": np.asarray(tasks.reward[index], dtype=np.float64).tolist(),
-        }
-        for index in range(len(tasks.discount))
-    ]
+    names = ("discount", "terminal_reward", "reward")
+    columns = {name: np.asarray(getattr(tasks, name), dtype=np.float64).tolist() for name in names}
+    columns["terminal"] = [np.flatnonzero(terminal).tolist() for terminal in np.asarray(tasks.terminal)]
+    return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
 
 def _best_terminal_states(entry: Mapping[str, Any]) -> list[int]:
