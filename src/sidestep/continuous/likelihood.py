@@ -10,7 +10,7 @@ importance weights exp(βQ)/π_λ: it is then that of the agent under the curren
 """
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -108,7 +108,7 @@ class Schedule(eqx.Module):
 class FitProblem(eqx.Module):
     """Data and settings of a fit; the agent has the initial dynamics and policy."""
 
-    agent: Agent
+    agent: Agent[Any]
     demonstrations: Demonstrations
     prior: Prior
     planner: Planner
@@ -116,7 +116,7 @@ class FitProblem(eqx.Module):
     terms: tuple[Term, ...] = eqx.field(static=True)
     estimator: Estimator = eqx.field(static=True)
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         agent, demos = self.agent, self.demonstrations
         _check_choices(demos, agent.policy)
         message = f"expected one or both of {ALL_TERMS}, found {self.terms}"
@@ -138,7 +138,7 @@ class FitProblem(eqx.Module):
         message = f"expected a density above 0 for every transition, found the logarithm {densities[move]}"
         check(not wrong.any(), message, source=f"trajectory {int(demos.trajectory[move]) + 1}", field="log_prob")
 
-    def improve_policy(self, parameters: Tree, state: PlannerState, key: PRNGKeyArray) -> PlannerState:
+    def improve_policy(self, parameters: Tree, state: PlannerState[Any], key: PRNGKeyArray) -> PlannerState[Any]:
         """Make a step of the policy and its critic by rollouts from a batch of moves; the model stays the same.
 
         Args:
@@ -153,8 +153,8 @@ class FitProblem(eqx.Module):
         return self._action_terms(parameters, state, self._draw_moves(batch_key), rollout_key)[0]
 
     def objective_gradient(
-        self, parameters: Tree, state: PlannerState, key: PRNGKeyArray
-    ) -> tuple[PlannerState, Tree, FitProgress]:
+        self, parameters: Tree, state: PlannerState[Any], key: PRNGKeyArray
+    ) -> tuple[PlannerState[Any], Tree, FitProgress]:
         """Estimate the gradient of minus the objective from one batch of moves.
 
         Args:
@@ -201,8 +201,8 @@ class FitProblem(eqx.Module):
         return slope, transitions, prior
 
     def _action_terms(
-        self, parameters: Tree, state: PlannerState, moves: _Moves, key: PRNGKeyArray
-    ) -> tuple[PlannerState, Tree, Array, PlanProgress]:
+        self, parameters: Tree, state: PlannerState[Any], moves: _Moves, key: PRNGKeyArray
+    ) -> tuple[PlannerState[Any], Tree, Array, PlanProgress]:
         """Estimate the actions' term by rollouts from the states of a batch of moves.
 
         Returns:

@@ -45,7 +45,7 @@ class ContinuousConfig:
         title: str,
         observe: Callable[[Any], object] = lambda _: None,
         **settings: Any,
-    ) -> sc.ContinuousFit:
+    ) -> sc.ContinuousFit[Any, Any]:
         """Fit dynamics to walks.
 
         Args:

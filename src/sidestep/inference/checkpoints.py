@@ -69,7 +69,8 @@ class Saver:
     """
 
     def __init__(self, checkpoint: str | Path | Checkpoint | None, key: str):
-        self.checkpoint = Checkpoint(checkpoint) if isinstance(checkpoint, str | Path) else checkpoint
+        checkpoint = Checkpoint(checkpoint) if isinstance(checkpoint, str | Path) else checkpoint
+        self.checkpoint: Checkpoint | None = checkpoint
         self.key, self.next = key, 0.0
 
     def load(self, like: Tree, optional: Tree = ()) -> tuple[Tree, History, Tree]:
@@ -126,6 +127,5 @@ class Saver:
             return
         started = time.monotonic()
         write_whole(Path(self.checkpoint.path), write)
-        ended = time.monotonic()
-        pause = (ended - started) * (1 / self.checkpoint.max_fraction - 1)
-        self.next = ended + max(self.checkpoint.min_interval, pause)
+        pause = (time.monotonic() - started) * (1 / self.checkpoint.max_fraction - 1)
+        self.next = time.monotonic() + max(self.checkpoint.min_interval, pause)

@@ -249,7 +249,7 @@ def maximize(
     saver: Saver | None = None,
     report: Callable[[Progress], None] | None = None,
     resume: bool = False,
-) -> Fit:
+) -> Fit[Any]:
     """Maximize an objective from the parameters of its problem.
 
     Args:

@@ -192,19 +192,18 @@ class Objective:
 
     def __init__(self, problem: Problem, plan: BatchPlan | None = None, mesh: Mesh | None = None):
         self.problem, self.mesh = problem, mesh
-        self.plan = plan or plan_batches(problem.model, problem.solver, len(problem.demonstrations.tasks.terminal))
+        terminal, uses_actions = problem.demonstrations.tasks.terminal, "actions" in problem.terms
+        self.plan: BatchPlan = plan or plan_batches(problem.model, problem.solver, len(terminal))
         if jax.process_count() > 1:  # copies tell whether all processes have the same problem
             _replicate(np.frombuffer(bytes.fromhex(fingerprint(problem)), np.uint8), mesh)
-        uses_actions = "actions" in problem.terms
         batches = make_batches(problem.demonstrations, problem.behavior, self.plan.size) if uses_actions else []
-        self.batches = [_shard(batch, mesh) for batch in batches]
-        self.arrivals = arrivals_of(problem.demonstrations) if "transitions" in problem.terms else None
+        self.batches: list[Batch] = [_shard(batch, mesh) for batch in batches]
+        self.arrivals: Arrivals | None = arrivals_of(problem.demonstrations) if "transitions" in problem.terms else None
         # batches and arrivals replace the demonstrations
         problem = eqx.tree_at(lambda each: each.demonstrations, problem, None)
-        self.constants = eqx.tree_at(
-            lambda each: each.behavior.person, problem, None, is_leaf=lambda leaf: leaf is None
-        )
-        self.replicated = _replicate(self.constants, mesh)
+        person, is_none = lambda each: each.behavior.person, lambda leaf: leaf is None
+        self.constants: Problem = eqx.tree_at(person, problem, None, is_leaf=is_none)
+        self.replicated: Problem = _replicate(self.constants, mesh)
 
     @property
     def processes(self) -> list[int]:

@@ -113,7 +113,7 @@ def inverse_permutation(order: Int[np.ndarray, " states"]) -> Int[np.ndarray, " 
 # Calls from JAX
 
 
-def call_host(function: Callable[..., None], arguments: tuple, shapes: Any) -> Any:
+def call_host(function: Callable[..., None], arguments: tuple[Any, ...], shapes: Any) -> Any:
     """Return the arrays that a NumPy function fills in, called from JAX without a copy.
 
     Args:

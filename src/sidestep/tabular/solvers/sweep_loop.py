@@ -84,9 +84,9 @@ class SweepLoop:
 
     def __post_init__(self) -> None:
         marks = np.zeros((2, len(self.values)), np.int32)
-        self.history = SweepHistory(self.values.copy(), self.greedy_successor, *marks)
+        self.history: SweepHistory = SweepHistory(self.values.copy(), self.greedy_successor, *marks)
         size = max(_SMALLEST_BLOCK, int(_BLOCK_FACTOR * len(self.positions) ** 0.5))
-        self.blocks = np.split(self.positions, range(size, len(self.positions), size))
+        self.blocks: list[np.ndarray] = np.split(self.positions, range(size, len(self.positions), size))
         self.number = self.round_first = self.rounds = self.solved = 0
 
     def run(self) -> native.SolveInfo:
