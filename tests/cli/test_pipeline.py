@@ -13,7 +13,6 @@ from PIL import Image
 
 from helpers.office import BLANK, WALL, call, simulated, summary, write_office, written
 from sidestep.cli import display
-from sidestep.inference.checkpoints import Saver
 from sidestep.io.maps import read_map
 from sidestep.io.walks import read_walks, write_walks
 from sidestep.maps.config import BehaviorConfig, FitConfig, MapConfig, PriorConfig
@@ -192,7 +191,6 @@ def test_sample_walks_and_simulate_walks_repeat_by_seed():
 
 
 def test_learn_resumes_after_an_interruption(office, learned, tmp_path, monkeypatch, capsys):
-    """`Saver.pause` is patched because the command line saves a checkpoint only every few seconds."""
     command = ("learn", office / "walks.csv", "--map", office / "half.yaml", "--out", tmp_path)
     iterations = []
 
@@ -208,7 +206,6 @@ def test_learn_resumes_after_an_interruption(office, learned, tmp_path, monkeypa
     def recording(_):
         yield (lambda progress: iterations.append(progress.iteration)), print
 
-    monkeypatch.setattr(Saver, "pause", lambda *_: 0.0)
     monkeypatch.setattr(display, "fit_progress", interrupting)
     assert call(*command) == 1
     assert written(tmp_path) == ["fit.checkpoint"]
@@ -220,6 +217,6 @@ def test_learn_resumes_after_an_interruption(office, learned, tmp_path, monkeypa
     assert call(*command, "--beta", 9, "--resume") == 1  # not the same fit
     assert "other settings" in capsys.readouterr().err
     assert call(*command, "--resume") == 0
-    assert iterations[0] == 4
+    assert 0 < iterations[0] <= 4  # saved at the first iteration, and then every few seconds
     assert written(tmp_path) == LEARNED
     np.testing.assert_array_equal(np.load(tmp_path / "blocked.npy"), np.load(learned / "blocked.npy"))

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache, partial
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -16,7 +17,6 @@ import sidestep.continuous as sc
 from helpers.families import Drift, Gusts, LaplaceDrift, vector
 from sidestep.continuous.fit import problem_fingerprint
 from sidestep.continuous.policies import ScaledNetwork
-from sidestep.inference.checkpoints import Saver
 
 pytestmark = pytest.mark.usefixtures("unoptimised")
 
@@ -234,10 +234,9 @@ def test_fit_dynamics_repeats_by_seed():
 
 
 @pytest.fixture
-def checkpoint(tmp_path, monkeypatch):
+def checkpoint(tmp_path):
     """A file that is saved at every iteration."""
-    monkeypatch.setattr(Saver, "pause", lambda *_: 0.0)
-    return tmp_path / "fit.checkpoint"
+    return ss.Checkpoint(tmp_path / "fit.checkpoint", min_interval=0.0, max_fraction=1.0)
 
 
 def interrupted_at(iteration):
@@ -256,7 +255,7 @@ def leaves(result):
 def test_fit_dynamics_resumed_is_identical(checkpoint):
     whole = partial(BOTH, schedule=replace(SHORT, policy_warmup=2), checkpoint=checkpoint)
     expected = whole()
-    checkpoint.unlink()
+    Path(checkpoint.path).unlink()
     for iteration in (2, 3, 9):
         with pytest.raises(KeyboardInterrupt):
             whole(report=interrupted_at(iteration), resume=True)
@@ -281,7 +280,7 @@ def test_fit_dynamics_without_resume_starts_again(checkpoint):
 def test_fit_dynamics_checkpoint_of_another_problem_is_refused(checkpoint):
     with pytest.raises(KeyboardInterrupt):
         BOTH(report=interrupted_at(2), checkpoint=checkpoint)
-    before = checkpoint.read_bytes()
+    before = Path(checkpoint.path).read_bytes()
     others = {
         "seed": partial(BOTH, seed=1),
         "prior": partial(BOTH, prior=ss.Normal(0.0, 2.0)),
@@ -291,7 +290,7 @@ def test_fit_dynamics_checkpoint_of_another_problem_is_refused(checkpoint):
     for other in others.values():
         with pytest.raises(ss.InputError, match="belongs to a fit of other data or with other settings"):
             other(checkpoint=checkpoint, resume=True)
-    assert checkpoint.read_bytes() == before
+    assert Path(checkpoint.path).read_bytes() == before
     with pytest.raises(ss.InputError, match="'resume': expected a checkpoint to resume from"):
         BOTH(resume=True)
 

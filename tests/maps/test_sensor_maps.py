@@ -113,7 +113,7 @@ def test_learn_with_a_sensor_map_of_other_geometry_names_file_and_field(office, 
     seen = ("--sensor-map", office / "seen.yaml", "--sensor-variance")
     for options, expected in (
         (("--sensor-map", tmp_path / "none.yaml"), "none.yaml: cannot be read"),
-        (("--sensor-map", tmp_path / "small.yaml"), "small.yaml, field 'image'"),
+        (("--sensor-map", tmp_path / "small.yaml"), "small.yaml, field 'resolution'"),
         (("--sensor-map", tmp_path / "far.yaml"), "far.yaml, field 'origin'"),
         ((*seen, tmp_path / "none.npy"), "none.npy: cannot be read"),
         ((*seen, tmp_path / "small.npy"), "small.npy, field 'sensor variance'"),

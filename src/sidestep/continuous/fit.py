@@ -28,7 +28,7 @@ from sidestep.continuous.planner import Planner, PlannerState, plan_policy
 from sidestep.continuous.policies import Agent, SomePolicy
 from sidestep.continuous.tasks import task_at
 from sidestep.errors import NotConverged
-from sidestep.inference.checkpoints import Saver, fingerprint
+from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
 from sidestep.inference.priors import Normal, Prior
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.demonstrations import Demonstrations
@@ -85,7 +85,7 @@ def fit_dynamics(
     schedule: Schedule | None = None,
     seed: int = 0,
     report: Callable[[FitProgress, Family], None] | None = None,
-    checkpoint: str | Path | None = None,
+    checkpoint: str | Path | Checkpoint | None = None,
     resume: bool = False,
 ) -> ContinuousFit[Family, SomePolicy]:
     """Find the parameters of a family of dynamics that maximize the posterior of demonstrations.
