@@ -87,7 +87,7 @@ def run_process() -> int:
     """Run the command line as a process of its own; return its exit code.
 
     A search for garbage visits all that the imported libraries hold, and finds nothing there. So there are fewer
-    searches, and none at the end (`gc.freeze`): that saves about a third of the time that JAX takes to import.
+    searches, and none at the end (`gc.freeze`). `python -m benchmarks startup` shows the time of whole processes.
     """
     gc.set_threshold(50_000)
     code = main()

@@ -288,7 +288,7 @@ def save(figure: Figure, path: str | Path) -> None:
     Raises:
         InputError: For a path that the file system refuses.
     """
-    # a file a quarter larger is written in half the time
+    # a person waits for the picture, and a somewhat larger file is written sooner
     options = {"compress_level": 1}
     write_whole(path, lambda file: figure.savefig(file, format="png", dpi=DOTS_PER_INCH, pil_kwargs=options))
 
