@@ -10,7 +10,7 @@ from rich.console import Console
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from sidestep.inference.fit import Progress as FitProgress
+    from sidestep.inference.maximize import Progress as FitProgress
 
     FitCallback = Callable[[FitProgress], None]
 

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sidestep.inference.fit import Fit, Progress, fit
+from sidestep.inference.fit import Fit, fit
+from sidestep.inference.maximize import Progress
 from sidestep.inference.optimizers import LBFGS, Adam, Optimizer, Rprop
 from sidestep.inference.priors import FreeCellEvidence, Normal, WallPrior
 from sidestep.io.demonstrations import demonstrations_from_moves

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sidestep.errors import check
-from sidestep.inference.fit import Fit, Progress
+from sidestep.inference.fit import Fit
 from sidestep.inference.goals import GoalFit, fit_goals
+from sidestep.inference.maximize import Progress
 from sidestep.inference.priors import Normal
 from sidestep.io.demonstrations import connected_regions
 from sidestep.io.gridding import Moves

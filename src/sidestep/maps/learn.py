@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from sidestep.errors import check
-from sidestep.inference.fit import Fit, Progress
+from sidestep.inference.fit import Fit
+from sidestep.inference.maximize import Progress
 from sidestep.io.gridding import Moves, grid_walks
 from sidestep.io.walks import Walks
 from sidestep.maps.annotations import NO_ANNOTATIONS, WalkAnnotations, persons_of

@@ -1,0 +1,310 @@
+"""The loop of every fit: evaluate the objective, stop or take a step of the optimizer.
+
+Two devices save work on large maps:
+
+- Solves are loose at first. Where the optimizer has converged, or finds no better point, it continues from there with
+  exact solves. It ends only with exact solves.
+- An optimizer may ask for an approximate loss at a trial point (see `Optimizer.approximates`). It reuses the
+  contributions of tasks that have hardly changed, and of tasks that have changed little it solves only the states that
+  mattered (see `Objective.evaluate`).
+"""
+
+import enum
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from sidestep._typing import Tree
+from sidestep.errors import InputError, NotConverged
+from sidestep.inference.batching import LARGE_MAP
+from sidestep.inference.checkpoints import Saver
+from sidestep.inference.objective import Contribution, Objective, Parameters, Problem, SolveSummary, joined
+from sidestep.inference.optimizers import Optimizer, Vector
+from sidestep.tabular.likelihood import choices_of, transition_probabilities
+from sidestep.tabular.solvers.base import WarmStart
+
+
+class Progress(NamedTuple):
+    """The state of a fit after an iteration.
+
+    Attributes:
+        iteration: 0 before the first step.
+        objective: log L(θ) + log p(θ), in nats.
+        actions, transitions, prior: Its parts.
+        gradient: The largest component of its gradient.
+
+    Example:
+        >>> Progress(0, objective=-3.0, actions=-2.0, transitions=-0.5, prior=-0.5, gradient=1.0).objective
+        -3.0
+    """
+
+    iteration: int
+    objective: float
+    actions: float
+    transitions: float
+    prior: float
+    gradient: float
+
+
+class Status(enum.Enum):
+    """Why an optimization stopped; the values are the readable form.
+
+    Example:
+        >>> Status.MAX_ITERATIONS.advice
+        'a larger max_iterations of the optimizer lets it continue'
+    """
+
+    CONVERGED = "converged"
+    MAX_ITERATIONS = "stopped at max_iterations"
+    NO_ASCENT_STEP = "stopped, no step increases the objective"
+    PRECISION_LIMIT = "stopped, no step increases the objective in 32-bit numbers"
+
+    @property
+    def advice(self) -> str:
+        """What may help; nothing after convergence."""
+        return _ADVICE.get(self, "")
+
+
+_ADVICE = {
+    Status.MAX_ITERATIONS: "a larger max_iterations of the optimizer lets it continue",
+    Status.NO_ASCENT_STEP: (
+        "the objective has a kink here (as with HardMax), or the solver's tolerance does not resolve smaller changes"
+    ),
+    Status.PRECISION_LIMIT: (
+        "32-bit numbers cannot resolve smaller changes of the objective; set jax.config.update('jax_enable_x64', True) "
+        "before the model is made"
+    ),
+}
+
+
+class Maximum(NamedTuple):
+    """The end of an optimization.
+
+    Attributes:
+        parameters: θ.
+        history: The progress before the first and after every iteration.
+        status: Why the optimizer stopped.
+        message: The status with its measure and advice.
+        solves: The solves of each batch's tasks at θ.
+    """
+
+    parameters: Parameters
+    history: tuple[Progress, ...]
+    status: Status
+    message: str
+    solves: list[SolveSummary]
+
+
+_REUSE = 2e-5
+"""The largest change of all contributions together that an approximate evaluation reuses (a fraction of the objective).
+"""
+_PARTIAL = 0.01
+"""The largest change of a contribution, as a fraction of it, for which only the states that mattered are solved."""
+
+
+def maximize(
+    objective: Objective,
+    optimizer: Optimizer,
+    *,
+    tolerances: Sequence[float | None] = (None,),
+    saver: Saver | None = None,
+    report: Callable[[Progress], None] | None = None,
+    resume: bool = False,
+) -> Maximum:
+    """Maximize an objective from the parameters of its problem.
+
+    Args:
+        objective: The objective.
+        optimizer: `LBFGS`, `Adam` or `Rprop`.
+        tolerances: Those of the solves, one after the other (see `solve_tolerances`); None for the solver's own.
+        saver: Keeps a checkpoint up to date.
+        report: Called with the progress before the first step and after each step.
+        resume: Continue from the saver's checkpoint.
+
+    Returns:
+        The parameters, the progress, and why the optimization stopped.
+
+    Raises:
+        NotConverged: If values do not converge at the start, or stop converging on the way.
+        InputError: If a visited state cannot reach its goal, and as `Saver.load` does.
+    """
+    saver = saver or Saver(None, "")
+    evaluator = _Evaluator(objective, tolerances)
+    x, state, history = evaluator.start, optimizer.init(evaluator.start), []
+    if resume:
+        x, state, history = evaluator.load(saver, x, state)
+    while True:
+        point = evaluator.evaluate(x)
+        progress = Progress(len(history), *point.terms.tolist(), gradient=float(np.abs(point.gradient).max()))
+        if progress.iteration == 0:
+            _check_start(objective.problem, progress, evaluator.solves)
+        if not np.isfinite(progress).all():
+            raise NotConverged(
+                f"the values or their gradient stopped converging at iteration {progress.iteration}: a smaller β, "
+                "a smaller learning rate or more sweeps may help"
+            )
+        evaluator.scale = abs(progress.objective)
+        history.append(progress)
+        if report:
+            report(progress)
+        status, update = None, None
+        if optimizer.terminate(point.gradient, state):
+            status = Status.CONVERGED
+        elif progress.iteration >= optimizer.max_iterations:
+            status = Status.MAX_ITERATIONS
+        else:
+            update = optimizer.step(evaluator.loss, x, -progress.objective, point.gradient, state)
+        if update is not None:
+            x, state = update
+            if jax.process_index() == objective.processes[0]:
+                dependencies, starts = evaluator.dependencies(x, state)
+                saver.save(dependencies, history, starts)
+        elif evaluator.tighten():
+            history.pop()
+        else:
+            status = status or (Status.NO_ASCENT_STEP if x.dtype == np.float64 else Status.PRECISION_LIMIT)
+            measure = optimizer.measure.format(optimizer.convergence(point.gradient, state))
+            message = "; ".join(filter(None, (f"{status.value}: {measure}", status.advice)))
+            return Maximum(evaluator.parameters(x), tuple(history), status, message, evaluator.solves_at(x))
+
+
+def solve_tolerances(problem: Problem, optimizer: Optimizer, large_map: int = LARGE_MAP) -> list[float | None]:
+    """Return the tolerances of the solves for `maximize`: loose ones first on large maps in 64-bit numbers.
+
+    Args:
+        problem: The problem.
+        optimizer: The optimizer, which has the first tolerance.
+        large_map: The number of states from which a map is large.
+    """
+    dtype = jax.eval_shape(problem.model.probabilities).dtype
+    if problem.solver.tolerance is not None or dtype != np.float64 or problem.model.graph.states < large_map:
+        return [None]
+    return [optimizer.solve_tolerance, float(problem.solver.tolerance_for(dtype))]
+
+
+class _Point(NamedTuple):
+    """The objective and its parts, and the gradient of the loss, at x."""
+
+    x: np.ndarray
+    terms: np.ndarray
+    gradient: np.ndarray
+
+
+class _Evaluator:
+    """Evaluates an objective at vectors, each time from the warm starts of the last time.
+
+    It keeps the last exact point, because line searches ask for it twice.
+    """
+
+    def __init__(self, objective: Objective, tolerances: Sequence[float | None]):
+        self.objective, self.tolerances = objective, list(tolerances)
+        self.start, self.unravel = _ravel(objective.problem.parameters)
+        self.warm_starts = objective.cold_starts()
+        self.last = _Point(np.full_like(self.start, np.nan), np.zeros(4), np.zeros_like(self.start))
+        self.solves: list[SolveSummary] = []
+        self.contributions: list[Contribution] = []
+        self.scale = 0.0
+
+    def parameters(self, x: Vector) -> Parameters:
+        return jax.tree.map(jax.device_put, self.unravel(x))
+
+    def evaluate(self, x: Vector, approximate: bool = False) -> _Point:
+        if np.array_equal(x, self.last.x):
+            return self.last
+        approximate = approximate and bool(self.contributions)
+        evaluation, self.warm_starts = self.objective.evaluate(
+            self.parameters(x),
+            self.warm_starts,
+            tolerance=self.tolerances[0],
+            known=self.contributions,
+            reuse_below=_REUSE * self.scale / max(1, len(self.objective.batches)) if approximate else 0.0,
+            partial_below=_PARTIAL if approximate and len(self.tolerances) > 1 else 0.0,
+        )
+        point = _Point(x, np.array(evaluation[:4]), _ravel(evaluation.gradient)[0])
+        self.contributions = evaluation.contributions
+        if not approximate:
+            self.last, self.solves = point, evaluation.solves
+        return point
+
+    def loss(self, x: Vector, *, approximate: bool = False) -> tuple[float, Vector]:
+        """Return minus the objective and its gradient; infinity where a solve failed, so that no search ends there."""
+        point = self.evaluate(x, approximate)
+        usable = np.isfinite(point.terms[0]) and np.isfinite(point.gradient).all()
+        return -float(point.terms[0]) if usable else np.inf, point.gradient
+
+    def tighten(self) -> bool:
+        """Continue with the next tolerance; return whether there is one."""
+        if len(self.tolerances) == 1:
+            return False
+        self.tolerances = self.tolerances[1:]
+        self._forget()
+        return True
+
+    def solves_at(self, x: Vector) -> list[SolveSummary]:
+        """Return the solves at x; after an interruption or elsewhere, evaluate them once more."""
+        if not self.solves:
+            self._forget()
+        self.evaluate(x)
+        return self.solves
+
+    def _forget(self) -> None:
+        self.last, self.contributions = self.last._replace(x=np.full_like(self.start, np.nan)), []
+
+    def dependencies(self, x: Vector, state: Tree) -> tuple[Tree, list[WarmStart]]:
+        """Return what the rest of the optimization depends on.
+
+        Warm starts that never change or are spread over processes are left out.
+        """
+        keep = self.objective.plan.keeps_warm_starts and len(self.objective.processes) == 1
+        return (x, state, self.last, np.asarray(len(self.tolerances))), self.warm_starts if keep else []
+
+    def load(self, saver: Saver, x: Vector, state: Tree) -> tuple[Vector, Tree, list[Progress]]:
+        """Return the point, the optimizer's state and the history of a checkpoint."""
+        saved, starts = self.dependencies(x, state)
+        (x, state, self.last, remaining), rows, starts = saver.load(saved, starts)
+        if starts:
+            self.warm_starts = self.objective.place(starts)
+        self.tolerances = self.tolerances[len(self.tolerances) - int(remaining) :]
+        return x, state, [Progress(int(row[0]), *row[1:]) for row in rows]
+
+
+def _ravel(tree: Tree) -> tuple[Vector, Callable[[Vector], Tree]]:
+    """Return the leaves of a tree as one vector, and the inverse: `ravel_pytree` without compiled code."""
+    leaves, structure = jax.tree.flatten(jax.tree.map(np.asarray, tree))
+    ends = np.cumsum([leaf.size for leaf in leaves])[:-1]
+
+    def unravel(x: Vector) -> Tree:
+        parts = zip(np.split(x, ends), leaves, strict=True)
+        return jax.tree.unflatten(structure, [part.reshape(leaf.shape).astype(leaf.dtype) for part, leaf in parts])
+
+    return np.concatenate([leaf.ravel() for leaf in leaves]), unravel
+
+
+def _check_start(problem: Problem, progress: Progress, solves: list[SolveSummary]) -> None:
+    """Raise unless all moves are possible, values converge, and every visited state can reach its goal."""
+    demos = problem.demonstrations
+    if progress.transitions == -np.inf:
+        move = np.flatnonzero(np.asarray(transition_probabilities(problem.model, demos)) == 0)[0]
+        raise InputError(
+            f"action {int(demos.actions[move])} in state {int(demos.states[move])} led to state "
+            f"{int(demos.next_states[move])}, to which the model gives probability 0 (on a map: a known obstacle)",
+            source=f"trajectory {int(demos.trajectory[move]) + 1}",
+        )
+    if not solves:
+        return
+    _, residual, converged, unreachable = joined(solves)
+    if not converged.all():
+        raise NotConverged(
+            f"values did not converge for task(s) {np.flatnonzero(~converged).tolist()} (residual up to "
+            f"{residual.max():.2g}): a smaller β, more sweeps or another backup may help"
+        )
+    if unreachable.any():
+        task, choice = np.argwhere(unreachable)[0]
+        state = choices_of(demos).states[task, choice]
+        move = np.flatnonzero((np.asarray(demos.task) == task) & (np.asarray(demos.states) == state))[0]
+        raise InputError(
+            f"state {int(state)} is visited, but the goal cannot be reached from it",
+            source=f"trajectory {int(demos.trajectory[move]) + 1}",
+        )
