@@ -5,9 +5,9 @@ before it can look its code up. For a fit of a small map that takes longer than 
 executable (`jax.experimental.serialize_executable`); `python -m benchmarks startup` shows the time of whole processes.
 
 An entry belongs to the files of this package, to the versions of JAX and of the other traced libraries, and to the
-types of all arguments. A function that calls back into Python cannot be stored; where there are several devices, no
-program is. An entry that is damaged, or that XLA refuses because it was made for another kind of processor, is
-replaced.
+types of all arguments. A function that calls back into Python cannot be stored; where there are several devices, or JAX
+is set to optimize little, no program is. An entry that is damaged, or that XLA refuses because it was made for another
+kind of processor, is replaced.
 """
 
 import hashlib
@@ -42,7 +42,7 @@ def keep_program(function: _Function) -> _Function:
         import jax
 
         folder = _cache.kept_in()
-        if folder is None or jax.device_count() > 1:
+        if folder is None or jax.device_count() > 1 or jax.config.read("jax_disable_most_optimizations"):
             return compiled(*arguments)
         import numpy as np
         from jax.core import Tracer

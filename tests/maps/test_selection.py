@@ -11,26 +11,29 @@ from sidestep.errors import ImproperTask, InputError
 from sidestep.io.demonstrations import walks_from_trajectories
 from sidestep.io.gridding import grid_walks
 from sidestep.io.walks import write_walks
-from sidestep.maps.config import BehaviorConfig, MapConfig, PriorConfig, SimulationConfig
+from sidestep.maps.config import BehaviorConfig, FitConfig, MapConfig, PriorConfig, SimulationConfig
 from sidestep.maps.learn import learn_map
 from sidestep.maps.selection import Trial, select_behavior
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.reward import Reward
 from sidestep.worlds.walks import simulate_walks
 
+pytestmark = pytest.mark.usefixtures("unoptimised")
+SHORT = FitConfig(max_iterations=10)
+"""Ten iterations take a map close enough to compare rewards; a test takes a tenth of the time."""
 WIDER = replace(BLANK, known=np.full((5, 8), Cell.UNKNOWN))
 """The office, and three more columns to the right."""
 
 
 def select(walks, config=MapConfig(), grid=BLANK):  # noqa: B008
-    return select_behavior(grid, grid_walks(walks, grid), config)
+    return select_behavior(grid, grid_walks(walks, grid), replace(config, fit=SHORT))
 
 
 def test_learn_with_selection_of_optimal_walks_raises_beta(tmp_path, capsys):
     write_office(tmp_path)
     write_walks(tmp_path / "walks.csv", simulated(walks=60, goals=5))
     command = ("learn", tmp_path / "walks.csv", "--map", tmp_path / "blank.yaml", "--out", tmp_path)
-    assert call(*command, "--select-behavior") == 0
+    assert call(*command, "--select-behavior", "--max-iterations", 10) == 0
     result = summary(tmp_path)
     settings, behavior = result["settings"], result["behavior"]
     assert behavior["beta"] == settings["behavior"]["beta"] >= 14
@@ -44,7 +47,7 @@ def test_learn_with_selection_of_optimal_walks_raises_beta(tmp_path, capsys):
 
 def test_select_behavior_of_agents_with_different_beta_tempers_their_actions():
     """An agent with a small β has it in every move of the walk, so moves are not independent."""
-    random, sharp = (simulate_walks(OFFICE, SimulationConfig(60, 2, beta, seed=3)) for beta in (0.5, 60.0))
+    random, sharp = (simulate_walks(OFFICE, SimulationConfig(30, 2, beta, seed=3)) for beta in (0.5, 60.0))
     walks = walks_from_trajectories([*random[0], *sharp[0]], random[1], OFFICE)
     selection = select(walks, MapConfig(behavior=BehaviorConfig(beta=10.0)))
     assert selection.config.behavior.tempering == selection.trials[0].ratio < 0.6
