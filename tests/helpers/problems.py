@@ -63,7 +63,8 @@ def plain_backup(name, q, beta):
     best = jax.lax.stop_gradient(q.max(axis=-1))
     total = jnp.exp(beta * (q - best[..., None])).sum(axis=-1)
     values = {
-        "hard max": q.max(axis=-1),
+        # not `max`, which has no gradient where a compiler rounds its argument twice and none equals the best
+        "hard max": jnp.take_along_axis(q, q.argmax(axis=-1)[..., None], axis=-1)[..., 0],
         "Boltzmann": (plain_policy(q, beta) * q).sum(axis=-1),
         "log-sum-exp": best + jnp.log(total) / beta,
         "mellowmax": best + jnp.log(total / q.shape[-1]) / beta,

@@ -9,7 +9,6 @@ import numpy as np
 from sidestep.baselines import BASELINES
 from sidestep.baselines.interface import Method, ModelResult, model_result
 from sidestep.errors import ImproperTask, NotConverged, check
-from sidestep.evaluation import study
 from sidestep.evaluation.study import Problem, Record, run_method
 from sidestep.inference.goals import goal_posterior
 from sidestep.io.gridding import Moves, grid_walks
@@ -128,13 +127,9 @@ def compare_methods(
         records = [replace(own, seconds=learning.seconds)]
     else:
         records = [Record(problem.name, "behavior", failure=failure)]
-    for name, baseline in baselines.items():
-        records.append(run_method(problem, name, _configured(baseline, config), seed=config.seed, notify=notify))
+    methods = {name: (lambda *walks, method=method: method(*walks, config)) for name, method in baselines.items()}
+    records += [run_method(problem, name, method, seed=config.seed, notify=notify) for name, method in methods.items()]
     return Comparison(problem, config, records, learned)
-
-
-def _configured(baseline: Method, config: MapConfig) -> study.Method:
-    return lambda grid, demonstrations: baseline(grid, demonstrations, config)
 
 
 def _split(walks: Walks, hold_out: float, seed: int) -> tuple[Walks, Walks]:

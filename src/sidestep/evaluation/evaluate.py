@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import csr_array
 
 from sidestep.evaluation.metrics import MapScores, PathScores, path_lengths, score_lengths, score_map, shortest_lengths
 from sidestep.evaluation.relevance import relevant_obstacles
@@ -126,7 +125,11 @@ def evaluate(
     random, sample = np.random.default_rng(seed), sample or sample_sizes(truth.size)
     graph = walkable_graph(truth)
     starts, ends = _draw(free, sample.starts, random), free if goals is None else np.intersect1d(free, goals)
-    starts, goals, shortest = _connected_pairs(starts, _draw(ends, sample.goals, random), graph)
+    ends = _draw(ends, sample.goals, random)
+    starts, goals = np.tile(starts, len(ends)), np.repeat(ends, len(starts))
+    shortest = shortest_lengths(graph, starts, goals)
+    connected = np.isfinite(shortest) & (starts != goals)
+    starts, goals, shortest = starts[connected], goals[connected], shortest[connected]
     lengths = np.zeros(len(goals))
     for own, plan in _plans(planner, goals, "planned paths", callback):
         lengths[own] = path_lengths(graph, plan.paths_from(starts[own]), goals[own])
@@ -180,16 +183,6 @@ def plan_paths(
 
 def _draw(states: Int[np.ndarray, " states"], most: int, random: np.random.Generator) -> Int[np.ndarray, " drawn"]:
     return np.sort(random.choice(states, most, replace=False)) if len(states) > most else states
-
-
-def _connected_pairs(
-    starts: Int[np.ndarray, " starts"], goals: Int[np.ndarray, " goals"], graph: csr_array
-) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"], Float[np.ndarray, " pairs"]]:
-    """Return the start and the goal of all pairs of different states that a path connects, and its least length."""
-    all_starts, all_goals = np.tile(starts, len(goals)), np.repeat(goals, len(starts))
-    shortest = shortest_lengths(graph, all_starts, all_goals)
-    kept = np.isfinite(shortest) & (all_starts != all_goals)
-    return all_starts[kept], all_goals[kept], shortest[kept]
 
 
 def _plans(

@@ -168,16 +168,10 @@ def fit(
     objective, tolerances = Objective(problem, plan, mesh), solve_tolerances(problem, optimizer, large_map)
     saver = Saver(checkpoint, fingerprint((problem, optimizer.key)) if checkpoint is not None else "")
     best = maximize(objective, optimizer, tolerances=tolerances, saver=saver, report=report, resume=resume)
+    learned = model.with_parameters(best.parameters.model), behavior.with_parameters(best.parameters.behavior)
     solves = _of_all_tasks(best.solves, count)
-    return Fit(
-        model.with_parameters(best.parameters.model),
-        behavior.with_parameters(best.parameters.behavior),
-        best.history,
-        *solves,
-        best.status,
-        best.status is Status.CONVERGED and bool(np.asarray(solves[-1]).all()),
-        best.message,
-    )
+    converged = best.status is Status.CONVERGED and bool(np.asarray(solves[-1]).all())
+    return Fit(*learned, best.history, *solves, best.status, converged, best.message)
 
 
 def _of_all_tasks(batches: list[SolveSummary], tasks: int) -> list[Array]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
 from sidestep.inference.fit import Fit, fit
 from sidestep.inference.maximize import Progress
@@ -109,7 +109,10 @@ def fit_map(
     if config.prior.wall_prior:
         prior = WallPrior(prior, model.known, config.prior.wall_prior)
     if config.fit.terms != "actions":
-        prior = FreeCellEvidence(prior, to_jax(_first_cells(model, demonstrations, weights)))
+        # of each unknown cell, the walks that begin there, by their weights
+        first, unknown = demonstrations.first_moves(), np.asarray(model.known).ravel() == Cell.UNKNOWN
+        counts = np.bincount(np.asarray(demonstrations.states)[first], weights[first], minlength=len(unknown))
+        prior = FreeCellEvidence(prior, to_jax(np.where(unknown, counts, 0.0)))
     optimizer = optimizer_for(config.fit, model.graph.states, round(float(weights.sum())))
     if initialize and config.fit.terms == "both":
         model = fit(model, demonstrations, behavior, prior=prior, terms=("transitions",)).model
@@ -158,15 +161,6 @@ def max_iterations(config: FitConfig) -> int:
         config: The configuration of the fit.
     """
     return max(optimizer_for(config, cells, moves=1).max_iterations for cells in (0, config.large_map))
-
-
-def _first_cells(
-    model: ObstacleGrid, demonstrations: Demonstrations, weights: Float[np.ndarray, " moves"]
-) -> Float[np.ndarray, " cells"]:
-    """Count the walks that begin in each unknown cell, by their weights."""
-    first = demonstrations.first_moves()
-    counts = np.bincount(np.asarray(demonstrations.states)[first], weights[first], minlength=model.graph.states)
-    return np.where(np.asarray(model.known).ravel() == Cell.UNKNOWN, counts, 0.0)
 
 
 def _block_unvisited(

@@ -129,18 +129,14 @@ def _add_rooms(cells: np.ndarray, rows: slice, door_row: int, crossings: list[in
     # a crossing corridor has a wall on either side, and the rooms end there
     ends = [0, *(column for left in crossings for column in (left - 1, left + 2)), cells.shape[1] - 1]
     for left, right in zip(ends[::2], ends[1::2], strict=True):
-        walls = _room_walls(left, right, random)
+        # the walls of a row of rooms, 3 to 8 columns of floor between them if possible
+        walls = [left]
+        while right - walls[-1] > 9:
+            walls.append(walls[-1] + int(random.integers(4, min(9, right - walls[-1] - 4) + 1)))
+        walls.append(right)
         for west, east in pairwise(walls):
             cells[rows, west + 1 : east] = Cell.FREE
             cells[door_row, random.integers(west + 1, east)] = Cell.FREE
         for wall in walls[1:-1]:
             if random.random() < 0.3:
                 cells[random.integers(rows.start, rows.stop), wall] = Cell.FREE
-
-
-def _room_walls(left: int, right: int, random: Generator) -> list[int]:
-    """Return the columns of the walls of a row of rooms, 3 to 8 columns of floor between them if possible."""
-    walls = [left]
-    while right - walls[-1] > 9:
-        walls.append(walls[-1] + int(random.integers(4, min(9, right - walls[-1] - 4) + 1)))
-    return [*walls, right]

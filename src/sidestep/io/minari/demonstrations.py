@@ -56,7 +56,10 @@ def write_demonstrations(
     message = f"expected demonstrations in a world of {states} states and {actions} actions"
     message += f", found {own_states} states and action {last_action}"
     check(own_states == states and last_action < actions, message, field="demonstrations")
-    tasks = _describe_tasks(demonstrations.tasks)
+    names = ("discount", "terminal_reward", "reward")
+    columns = {name: np.asarray(getattr(demonstrations.tasks, name), dtype=np.float64).tolist() for name in names}
+    columns["terminal"] = [np.flatnonzero(ends).tolist() for ends in np.asarray(demonstrations.tasks.terminal)]
+    tasks = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
     episodes = list(_episodes(demonstrations, tasks, (states, actions), ends))
     write_dataset(dataset, Dataset(Discrete(states - len(ends)), Discrete(actions), {"tasks": tasks}, episodes))
 
@@ -165,14 +168,6 @@ def _within(values: object, length: int, count: int, source: str, field: str) ->
     message = f"expected a whole number in 0…{count - 1}, found {numbers[step]} at step {step}"
     check(0 <= numbers[step] < count, message, source=source, field=field)
     return numbers.astype(np.int64)
-
-
-def _describe_tasks(tasks: Task) -> list[dict[str, Any]]:
-    """Return stacked tasks as plain values, one entry per task."""
-    names = ("discount", "terminal_reward", "reward")
-    columns = {name: np.asarray(getattr(tasks, name), dtype=np.float64).tolist() for name in names}
-    columns["terminal"] = [np.flatnonzero(terminal).tolist() for terminal in np.asarray(tasks.terminal)]
-    return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
 
 def _best_terminal_states(entry: Mapping[str, Any]) -> list[int]:

@@ -46,8 +46,9 @@ def solve_values(
         start: Values and an order.
         region: The states that have to be solved.
     """
-    values, order = np.asarray(start.values), np.asarray(start.order)
-    if _has_nan(equation):
+    values, order, process = np.asarray(start.values), np.asarray(start.order), equation.process
+    numbers = (process.probabilities, process.reward, process.terminal_reward, process.discount)
+    if any(np.isnan(np.min(part)) for part in (*numbers, equation.backup.beta, equation.tolerance)):
         into.values[:] = np.nan
         write_info(into, order, SolveInfo(0, np.nan, False))
         return
@@ -56,7 +57,7 @@ def solve_values(
         """Solve from values and an order, or a new one if that does not serve; write the values and the order."""
         begun = _begin(start, equation, bound)
         if begun is None or begun.out_of_order > _OUT_OF_ORDER * len(order):
-            begun = _begin(start._replace(order=order_by_distance(equation.process)), equation, bound)
+            begun = _begin(start._replace(order=order_by_distance(process)), equation, bound)
             assert begun is not None
         positions = np.arange(len(order), dtype=np.int32)
         if not region.all():
@@ -81,12 +82,6 @@ def solve_values(
         again = solve_from(cold, np.ones_like(region), left, left)
         info = again._replace(sweeps=info.sweeps + again.sweeps)
     write_info(into, into.order, info)
-
-
-def _has_nan(equation: NativeEquation) -> bool:
-    process = equation.process
-    numbers = (process.probabilities, process.reward, process.terminal_reward, process.discount)
-    return any(np.isnan(np.min(part)) for part in (*numbers, equation.backup.beta, equation.tolerance))
 
 
 class _Begun(NamedTuple):
