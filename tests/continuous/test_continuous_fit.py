@@ -1,6 +1,5 @@
 """Fits in continuous worlds: closed forms, checkpoints, and refusals."""
 
-from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -53,7 +52,8 @@ STATES, CHOICES, FOLLOWING = walks()
 DEMONSTRATIONS = demonstrations_of(STATES, CHOICES, FOLLOWING)
 AGENTS = BEHAVIOR, POLICY, PLANNER
 learn = partial(sc.fit_dynamics, INITIAL, DEMONSTRATIONS, *AGENTS, prior=PRIOR)
-SHORT = sc.Schedule(iterations=16, policy_warmup=0, batch_size=30, learning_rate=0.2)
+SHORT = sc.Schedule(iterations=16, policy_warmup=2, batch_size=30, learning_rate=0.2)
+LONG = sc.Schedule(iterations=100, policy_warmup=0, batch_size=MOVES, learning_rate=0.1)
 BOTH = partial(learn, estimator="pathwise", schedule=SHORT)
 
 
@@ -92,8 +92,7 @@ def test_fit_dynamics_actions_alone_give_the_maximum_likelihood():
     def loss(drift):
         return -log_policy(drift, STATES)[np.arange(MOVES), CHOICES].sum() + drift**2 / 100
 
-    schedule = sc.Schedule(iterations=100, policy_warmup=0, batch_size=MOVES, learning_rate=0.1)
-    result = learn(terms=("actions",), schedule=schedule)
+    result = learn(terms=("actions",), schedule=LONG)
     learned, best = float(result.dynamics.parameters[0]), minimize_scalar(loss)
     assert learned == pytest.approx(best.x, abs=0.1)  # pyright: ignore[reportAttributeAccessIssue]
     assert abs(learned - TRUTH) < 0.25
@@ -133,10 +132,8 @@ def test_fit_dynamics_vector_actions_give_the_true_drift():
 @pytest.mark.slow
 def test_fit_dynamics_policy_warmup_plans_for_the_first_model():
     """Without the actions' term there is no policy to plan."""
-    schedule = sc.Schedule(iterations=2, policy_warmup=3, batch_size=30, learning_rate=0.1)
-    by_actions = learn(terms=("actions",), schedule=schedule)
-    by_transitions = learn(terms=("transitions",), schedule=schedule)
-    assert by_actions.planner_state.policy_moments[0].count == 3 + 2
+    by_both, by_transitions = fitted()[0], BOTH(terms=("transitions",))
+    assert by_both.planner_state.policy_moments[0].count == 2 + 16
     assert by_transitions.planner_state.policy_moments[0].count == 0
 
 
@@ -199,7 +196,8 @@ def test_fit_dynamics_large_policy_gap_is_not_converged():
 def test_fit_dynamics_noisy_policy_gap_is_not_converged():
     """At this β the noise of two rollouts exceeds the gap that it is subtracted from."""
     sharp = ss.Behavior(ss.BoltzmannAverage(), 40.0)
-    result = sc.fit_dynamics(INITIAL, DEMONSTRATIONS, sharp, POLICY, PLANNER, prior=PRIOR, schedule=SHORT)
+    data = INITIAL, DEMONSTRATIONS, sharp, POLICY, PLANNER
+    result = sc.fit_dynamics(*data, prior=PRIOR, estimator="pathwise", schedule=SHORT)
     assert abs(result.policy_gap) > 0.1
     assert not result.converged
 
@@ -253,7 +251,7 @@ def leaves(result):
 
 @pytest.mark.slow
 def test_fit_dynamics_resumed_is_identical(checkpoint):
-    whole = partial(BOTH, schedule=replace(SHORT, policy_warmup=2), checkpoint=checkpoint)
+    whole = partial(BOTH, checkpoint=checkpoint)
     expected = whole()
     Path(checkpoint.path).unlink()
     for iteration in (2, 3, 9):
@@ -406,4 +404,4 @@ def test_fit_dynamics_no_moves_are_refused():
 def test_fit_dynamics_infinite_rewards_raise():
     demos = with_tasks(eqx.tree_at(lambda task: task.state_cost, NEAR, 1e308 * jnp.eye(1)))
     with pytest.raises(ss.NotConverged, match="the figures ceased to be finite at iteration 0: dynamics or rewards"):
-        sc.fit_dynamics(INITIAL, demos, *AGENTS, prior=PRIOR, estimator="pathwise", schedule=SHORT)
+        sc.fit_dynamics(INITIAL, demos, *AGENTS, prior=PRIOR, terms=("actions",), schedule=LONG)
