@@ -63,6 +63,7 @@ def with_logits(logits) -> FinitePolicy:
     return eqx.tree_at(lambda policy: policy.network.network.weight, blank, logits.reshape(-1, ACTIONS).T)
 
 
+@eqx.filter_jit
 def policy_table(policy: FinitePolicy):
     """π[task, state, action]."""
     log_probs = jax.vmap(policy.log_probs)(jnp.eye(TASKS * STATES))
@@ -87,12 +88,13 @@ def exact_values(world: Table, parameters, pi, horizon, bonus: jax.Array | float
     states, actions = np.arange(STATES)[:, None, None], np.arange(ACTIONS)[:, None]
     transitions = jnp.zeros((STATES, ACTIONS, STATES))
     transitions = transitions.at[states, actions, model.graph.successors].add(model.probabilities())
+
+    def back_up(_, carry):
+        q = tasks.reward + tasks.discount[:, None, None] * jnp.einsum("sat,kt->ksa", transitions, carry[0])
+        return jnp.where(tasks.terminal, tasks.terminal_reward, (pi * q).sum(axis=-1) + bonus), q
+
     values = jnp.where(tasks.terminal, tasks.terminal_reward, 0.0)
-    q = jnp.zeros_like(pi)
-    for _ in range(horizon):
-        q = tasks.reward + tasks.discount[:, None, None] * jnp.einsum("sat,kt->ksa", transitions, values)
-        values = jnp.where(tasks.terminal, tasks.terminal_reward, (pi * q).sum(axis=-1) + bonus)
-    return values, q
+    return jax.lax.fori_loop(0, horizon, back_up, (values, jnp.zeros_like(tasks.reward)))
 
 
 GAIN, OFFSET, SPREAD = jnp.asarray([[-0.4, -0.6]]), jnp.asarray([0.1]), 0.3
