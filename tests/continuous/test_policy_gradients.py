@@ -220,9 +220,9 @@ def test_plan_policy_refuses_bad_starts():
     with pytest.raises(ss.InputError, match=r"task.*0…1"):
         planned_from(PLACES[:2], jnp.asarray([0, 2]))
     with pytest.raises(ss.InputError, match=r"states.*row 2.*has not ended"):
-        planned_from(jnp.asarray([0, 4]), jnp.zeros(2, int))
+        planned_from(PLACES.at[1].set(4), jnp.zeros_like(WHICH))
     with pytest.raises(ss.InputError, match="has not ended"):
-        PLANNER.initialize(jax.random.key(0), agent, sc.task_at(tasks, jnp.zeros(2, int)), jnp.asarray([4, 4]))
+        PLANNER.initialize(jax.random.key(0), agent, sc.task_at(tasks, 0 * WHICH), jnp.full_like(PLACES, 4))
 
 
 def test_minibatches_hold_every_move_and_are_disjoint():
@@ -236,9 +236,9 @@ def test_minibatches_hold_every_move_and_are_disjoint():
     assert minibatches(jnp.ones((1, 1, 2, 1)), count=8).shape == (2, 1)
 
 
-def test_fit_critic_with_horizon_1_keeps_the_critic():
+def test_fit_critic_with_horizon_1_keeps_the_critic(initial):
     planner = sc.Planner(horizon=1, batch_size=HERE, samples=2, critic_width=8)
-    result = planned(SOFT, planner=planner, steps=3)
+    result = planned(SOFT, planner=planner, warm_start=initial, steps=3)
     assert result.planner_state.critic_moments[0].count == 0
     assert result.planner_state.policy_moments[0].count == 3
 
