@@ -64,7 +64,7 @@ def assert_agrees(sample, exact, precision, uncertain=0.0):
 
 
 def assert_falls_as_root(sample, exact):
-    """The root-mean-square error of means over N rollouts falls as 1/√N, for N over three decades."""
+    """The root-mean-square error of means over N rollouts falls as 1/√N, for N over almost three decades."""
     errors = []
     for count in COUNTS:
         means = sample.reshape(-1, count // EACH, sample.shape[-1]).mean(axis=1)
