@@ -5,9 +5,9 @@ before it can look its code up. For a fit of a small map that takes longer than 
 executable (`jax.experimental.serialize_executable`); `python -m benchmarks startup` shows the time of whole processes.
 
 An entry belongs to the files of this package, to the versions of JAX and of the other traced libraries, and to the
-types of all arguments. A function that calls back into Python cannot be stored; where there are several devices, or JAX
-is set to optimize little, no program is. An entry that is damaged, or that XLA refuses because it was made for another
-kind of processor, is replaced.
+types of all arguments. A function that calls back into Python cannot be stored; where there are several devices, no
+program is. An entry that is damaged, or that XLA refuses because it was made for another kind of processor, is
+replaced.
 """
 
 import hashlib
@@ -42,7 +42,7 @@ def keep_program(function: _Function) -> _Function:
         import jax
 
         folder = _cache.kept_in()
-        if folder is None or jax.device_count() > 1 or jax.config.read("jax_disable_most_optimizations"):
+        if folder is None or jax.device_count() > 1:
             return compiled(*arguments)
         import numpy as np
         from jax.core import Tracer
@@ -124,5 +124,6 @@ def _package() -> str:
     specs = [find_spec(name) for name in _TRACED_LIBRARIES]
     files += [Path(spec.origin) for spec in specs if spec is not None and spec.origin is not None]
     stats = [(str(file), stat.st_size, stat.st_mtime_ns) for file in files for stat in [file.stat()]]
-    settings = jax.config.read("jax_enable_x64"), jax.default_backend(), jax.device_count(), os.environ.get("XLA_FLAGS")
-    return f"{settings} {hashlib.sha256(str(stats).encode()).hexdigest()}"
+    settings = jax.config.read("jax_enable_x64"), jax.config.read("jax_disable_most_optimizations")
+    machine = jax.default_backend(), jax.device_count(), os.environ.get("XLA_FLAGS")
+    return f"{settings} {machine} {hashlib.sha256(str(stats).encode()).hexdigest()}"

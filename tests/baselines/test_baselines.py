@@ -22,7 +22,6 @@ from sidestep.tabular.reward import Reward
 from sidestep.tabular.simulation import simulate
 from sidestep.tabular.tasks import reach, with_state_costs
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
 WALL = np.zeros((5, 5), int)
 WALL[:4, 2] = 1
 TRUTH, BLANK = Grid(WALL), Grid.unknown(5, 5)

@@ -13,7 +13,6 @@ from sidestep.errors import InputError
 from sidestep.io.maps import write_map
 from sidestep.tabular.grid import Grid
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
 # ---------------------------------------------------------------------------------------------------- buildings
 
 BUILDING = np.zeros((9, 13))

@@ -157,8 +157,6 @@ def test_compare_takes_every_option_of_learn(capsys):
     assert options[0] <= options[1]
 
 
-# the fixture `unoptimised` lasts to the end of the file, so tests that run for longer come before these
-@pytest.mark.usefixtures("unoptimised")
 def test_compare_methods_with_a_method_without_values_scores_the_others(data):
     """With a step cost below log(4)/β a log-sum-exp agent gains by walking on, so the costs have no values."""
     config = MapConfig(Reward(1.0, 1.0), BehaviorConfig(beta=0.5), fit=FitConfig(max_iterations=3))

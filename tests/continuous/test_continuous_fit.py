@@ -17,8 +17,6 @@ from helpers.families import Drift, Gusts, LaplaceDrift, vector
 from sidestep.continuous.fit import problem_fingerprint
 from sidestep.continuous.policies import ScaledNetwork
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
-
 # Agents on a line move by −1, 0 or 1 and look two moves ahead, to stay near 0: R(s, a) = −s². With the Boltzmann
 # average, Q(s, a) = −s² − γ E(s + a + θ + noise)², for every later choice.
 WAYS, DISCOUNT, NOISE, TRUTH, MOVES = np.array([-1.0, 0.0, 1.0]), 0.9, 0.4, 0.6, 90

@@ -17,8 +17,6 @@ import sidestep.continuous as sc
 from helpers import families
 from helpers.families import EVERY, GAUSSIAN, HIGH, LINEAR, LOW, NOISE, PLACE, STEP, TABLE, WALLS, vector
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
-
 outcomes = eqx.filter_jit(lambda dynamics, state, action: dynamics.outcomes(state, action))
 log_prob = eqx.filter_jit(lambda dynamics, *move: dynamics.log_prob(*move))
 

@@ -17,7 +17,7 @@ from helpers.small_worlds import ACTIONS, GAIN, OFFSET, PLACES, SPREAD, STATES, 
 from sidestep.continuous.estimators import check_estimator, with_control_variates
 from sidestep.continuous.policies import ScaledNetwork
 
-pytestmark = [pytest.mark.usefixtures("unoptimised"), pytest.mark.slow]
+pytestmark = pytest.mark.slow
 
 BETA, HORIZON = 2.0, 5
 TABLE, LINEAR = small_worlds.table(), small_worlds.linear()

@@ -12,8 +12,6 @@ import sidestep as ss
 import sidestep.continuous as sc
 from sidestep.tabular import solve as solver
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
-
 RANDOM, SOFT = np.random.default_rng(0), ss.Behavior(ss.LogSumExp(), 2.0)
 BOX = sc.Lattice(jnp.asarray([-1.0, 2.0]), jnp.asarray([2.0, 4.0]), (4, 3))
 RING = sc.Lattice(jnp.asarray([-np.pi]), jnp.asarray([np.pi]), (8,), (True,))

@@ -10,8 +10,6 @@ from scipy import stats
 import sidestep as ss
 import sidestep.continuous as sc
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
-
 KEY = jax.random.key(0)
 EXAMPLES = jnp.asarray(np.random.default_rng(0).normal([5, -3, 1], [2, 0.1, 0], (30, 3)))
 ACTIONS = jnp.asarray([[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0], [2.0, 0.5]])

@@ -16,7 +16,7 @@ from helpers import small_worlds
 from helpers.small_worlds import ACTIONS, PLACES, STATES, TASKS, WHICH, entropies, exact_values, policy_table
 from sidestep.continuous.planner import minibatches
 
-pytestmark = [pytest.mark.usefixtures("unoptimised"), pytest.mark.slow]
+pytestmark = pytest.mark.slow
 
 WORLD, BETA = small_worlds.table(), 1.5
 SOFT, OPTIMAL = ss.Behavior(ss.LogSumExp(), BETA), ss.Behavior(ss.HardMax(), BETA)

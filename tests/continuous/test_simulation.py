@@ -8,8 +8,6 @@ import pytest
 import sidestep as ss
 import sidestep.continuous as sc
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
-
 KEY = jax.random.key(0)
 LOW, HIGH = jnp.zeros(2), jnp.full(2, 6.0)
 WALL = sc.Walls(low=jnp.asarray([[2.4, 0.0]]), high=jnp.asarray([[3.6, 4.0]]))

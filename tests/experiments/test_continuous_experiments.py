@@ -12,7 +12,6 @@ from sidestep.experiments import pendulum, representations, room
 from sidestep.worlds import continuous_room
 from sidestep.worlds.continuous_room import without_moves
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
 QUICK = {
     "planner": sc.Planner(horizon=3, batch_size=4, samples=2, critic_width=4),
     "schedule": sc.Schedule(iterations=2, policy_warmup=0, batch_size=4),

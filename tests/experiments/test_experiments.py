@@ -13,7 +13,6 @@ from sidestep.maps.config import SimulationConfig
 from sidestep.tabular.graph import walkable_graph
 from sidestep.worlds.grids import block
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
 SCORES = {
     "auc", "average_precision", "auc_relevant", "mean_obstacle", "mean_free", "max_probability", "legal_fraction",
     "excess_length",

@@ -12,7 +12,6 @@ from sidestep.experiments import motivation
 from sidestep.experiments.motivation import COLUMNS, FORMS, ROWS, Form, run_trial, task_at_stakes, true_result
 from sidestep.maps.fit import behavior_of
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
 BLANK = ss.Grid.unknown(ROWS, COLUMNS)
 GOAL = 8 * COLUMNS + 12
 """The lower right corner, beyond the wall and below the mud."""

@@ -13,7 +13,6 @@ import pytest
 
 from helpers.spread import CASES, GOALS, measured
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
 PROGRAM = Path(__file__).parents[1] / "helpers" / "spread.py"
 LIMIT = 240
 """The time limit of child processes in seconds; on idle cores they take a tenth of it."""

@@ -25,7 +25,6 @@ from sidestep.tabular.tasks import reach
 from sidestep.worlds.offices import office
 from sidestep.worlds.walks import simulate_walks
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
 LOOSE = Rprop.solve_tolerance
 
 

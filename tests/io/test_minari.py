@@ -32,7 +32,7 @@ from sidestep.tabular.grid import Grid
 from sidestep.tabular.planning import plan
 from sidestep.tabular.tasks import Task, reach, stack_tasks
 
-pytestmark = pytest.mark.usefixtures("datasets", "unoptimised")
+pytestmark = pytest.mark.usefixtures("datasets")
 
 DISCOUNT = 0.97
 SPACES = Discrete(6), Discrete(4)

@@ -20,7 +20,6 @@ from sidestep.tabular.reward import Reward
 from sidestep.worlds.offices import office
 from sidestep.worlds.walks import simulate_walks
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
 TRUTH = office(20, 24, seed=0)
 UNKNOWN = TRUTH.forget()
 SMALL = MapConfig(Reward(1.0, 1.0), BehaviorConfig("logsumexp", 5.0), PriorConfig(0.5, 4.0, wall_prior=0.0))

@@ -18,7 +18,6 @@ from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.reward import Reward
 from sidestep.worlds.walks import simulate_walks
 
-pytestmark = pytest.mark.usefixtures("unoptimised")
 SHORT = FitConfig(max_iterations=10)
 """Ten iterations take a map close enough to compare rewards; a test takes a tenth of the time."""
 WIDER = replace(BLANK, known=np.full((5, 8), Cell.UNKNOWN))
