@@ -8,6 +8,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 
+from sidestep._version import __version__
 from sidestep.maps.learned_map import LearnedMap
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.reward import Reward
@@ -35,6 +36,7 @@ def output(process):
 
 @pytest.mark.parametrize(("program", "arguments", "expected", "libraries"), [
     (COMMAND + MODULES, ["--help"], "Usage", {"jax", "matplotlib", "sklearn"}),
+    (COMMAND + MODULES, ["--version"], __version__, {"jax", "matplotlib", "sklearn"}),
     ("import sys, sidestep" + MODULES, [], "", {"matplotlib", "sklearn", "pyarrow", "numba", "scipy"}),
 ])  # fmt: skip
 def test_import_loads_no_library_before_it_is_needed(program, arguments, expected, libraries):
