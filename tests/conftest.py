@@ -1,4 +1,4 @@
-"""All tests run in 64-bit numbers; `sidestep` itself never changes JAX's configuration.
+"""All tests run in 64-bit numbers; the library never changes JAX's configuration, and the command line does.
 
 Import nothing of `sidestep` above `pytest_configure`: jaxtyping's checks must be switched on first.
 Compiled code is kept from run to run, in the folder that the environment variable `SIDESTEP_CACHE` names.
@@ -24,7 +24,8 @@ settings.load_profile("sidestep")
 def pytest_configure():
     """Keep what JAX compiles from run to run; numba's code is kept anyway.
 
-    Not by `keep_compiled_code`, which also keeps traces: tests trace the code that they test.
+    Not by `keep_compiled_code`, which also keeps programs of `keep_program`: they are not traced again, and so not
+    checked again by beartype. A test that runs a command turns this on for the tests after it in its process.
     """
     from sidestep._cache import cache_folder
 

@@ -55,7 +55,7 @@ def keep_program(function: _Function) -> _Function:
         types = tuple((leaf.shape, leaf.dtype, bool(getattr(leaf, "weak_type", False))) for leaf in leaves)
         key = structure, tuple(others), static_structure, types
         if key not in programs:
-            text = f"{_package()} {function.__qualname__} {key}"
+            text = f"{_package()} {function.__module__}.{function.__qualname__} {key}"
             if " at 0x" in text:  # an address is another one in every process
                 return compiled(*arguments)
             path = folder / "programs" / f"{function.__qualname__}-{hashlib.sha256(text.encode()).hexdigest()}"
@@ -124,6 +124,6 @@ def _package() -> str:
     specs = [find_spec(name) for name in _TRACED_LIBRARIES]
     files += [Path(spec.origin) for spec in specs if spec is not None and spec.origin is not None]
     stats = [(str(file), stat.st_size, stat.st_mtime_ns) for file in files for stat in [file.stat()]]
-    settings = jax.config.read("jax_enable_x64"), jax.config.read("jax_disable_most_optimizations")
-    machine = jax.default_backend(), jax.device_count(), os.environ.get("XLA_FLAGS")
-    return f"{settings} {machine} {hashlib.sha256(str(stats).encode()).hexdigest()}"
+    variables = sorted(item for item in os.environ.items() if item[0].startswith(("JAX_", "XLA_")))
+    settings = jax.config.read("jax_enable_x64"), jax.default_backend(), jax.device_count(), variables
+    return f"{settings} {hashlib.sha256(str(stats).encode()).hexdigest()}"

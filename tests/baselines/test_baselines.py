@@ -16,10 +16,12 @@ from sidestep.maps.config import BehaviorConfig, MapConfig, PriorConfig
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
 from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.likelihood import log_policies
 from sidestep.tabular.models import ObstacleGrid, true_model
 from sidestep.tabular.planning import plan
 from sidestep.tabular.reward import Reward
 from sidestep.tabular.simulation import simulate
+from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.tasks import reach, with_state_costs
 
 WALL = np.zeros((5, 5), int)
@@ -170,6 +172,17 @@ def test_behavior_cloning_depends_on_the_state():
     learned = behavior_cloning(BLANK, shown, MapConfig())
     assert learned.planner.plan_to(9).paths_from(np.array([5]))[0].tolist() == straight.states.tolist()
     assert learned.planner.plan_to(19).paths_from(np.array([15]))[0].tolist() == around.states.tolist()
+
+
+def test_log_policies_of_agents_with_a_horizon_are_those_of_their_horizon(walks):
+    config = MapConfig(behavior=BehaviorConfig(horizon=2))
+    result = model_result(true_model(TRUTH), walks, config)
+    two, all_ = (
+        log_policies(result.model, walks, result.behavior, options=SolveOptions(horizon=horizon))
+        for horizon in (2, None)
+    )
+    assert not np.allclose(two, all_)
+    np.testing.assert_allclose(result.log_policies(walks), two)
 
 
 def test_behavior_cloning_log_policies_equal_its_policy(walks):

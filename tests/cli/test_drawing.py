@@ -5,12 +5,14 @@ import sys
 
 PROGRAM = """
 from pathlib import Path
+import sys
 import numpy as np
 from sidestep.cli.drawing import draw, prepare_drawing
 from sidestep.tabular.grid import Grid
 
 prepare_drawing()
 draw("figure_plan", Path("plan.png"), Grid.unknown(2, 2), np.full((2, 2), 0.5), np.array([0, 1]))
+assert "matplotlib" not in sys.modules  # the second process has drawn
 """
 
 

@@ -81,6 +81,20 @@ def test_fit_goals_learns_goals_and_the_wall_from_truncated_paths():
     assert blocked[WALL.ravel() == 1].min() > blocked[WALL.ravel() == 0].max()
 
 
+def test_fit_goals_of_one_round_has_not_converged_though_its_fit_has():
+    fits = []
+
+    def learn(model, demos):
+        fits.append(fit(model, demos, BEHAVIOR))
+        return fits[-1]
+
+    result = fit_goals(ObstacleGrid(BLANK, -1.0), trajectories(cut=1), TASKS, BEHAVIOR, learn, rounds=1)
+    assert fits[-1].converged
+    assert not result.converged
+    assert not result.fit.converged
+    assert result.fit.message.startswith("the goals still changed by up to")
+
+
 def test_goal_posterior_of_a_path_past_all_candidates_raises():
     states = np.array([1, 0, 1])
     walk = Trajectory(states, np.array([2, 3]), 0)

@@ -84,7 +84,7 @@ def test_learn_map_with_selection_of_an_own_reward_without_values_raises():
 
 def test_summary_of_walks_without_variation_has_no_ratio():
     none = np.zeros(3)
-    trial = Trial(MapConfig(), none, none, moves=5, ratio=np.inf, lapse=0.0)
+    trial = Trial(MapConfig(), none, none, moves=5, ratio=np.inf, lapse=0.0, converged=0)
     assert json.loads(json.dumps(trial.summary(), allow_nan=False))["effective_sample_ratio"] is None
 
 

@@ -126,10 +126,10 @@ def _fit_policy(
     features, all_actions = _features(grid, states, goals), np.arange(grid.connectivity)
     no_features = csr_array((len(all_actions), _DIRECTION + (1 + _COMPASS) * grid.size))
     regression = LogisticRegression(C=variance, max_iter=max_iterations)
-    with warnings.catch_warnings(record=True, category=ConvergenceWarning) as not_converged:
-        warnings.simplefilter("always", ConvergenceWarning)
+    with warnings.catch_warnings(action="ignore", category=ConvergenceWarning):
         regression.fit(vstack([features, no_features], format="csr"), np.append(actions, all_actions))
-    return ClonedPolicy(grid, regression.coef_, np.asarray(regression.intercept_), converged=not not_converged)
+    converged = bool((regression.n_iter_ < max_iterations).all())
+    return ClonedPolicy(grid, regression.coef_, np.asarray(regression.intercept_), converged)
 
 
 def _moves(demonstrations: Demonstrations) -> tuple[Int[np.ndarray, " moves"], ...]:

@@ -109,7 +109,7 @@ def compare_methods(
             raise  # the baselines need the selected behavior too
         failure = str(error)
     learning = learned.learning if learned else None
-    moves = learning.goals.moves if learning and learning.goals else grid_walks(train, grid)
+    moves = learning.goals.moves if learning and learning.goals else grid_walks(annotations.without_goals(train), grid)
     config = learning.config if learning else config
     demonstrations, heldout = demonstrations_of(moves, grid, config), None
     if len(test):
@@ -124,7 +124,7 @@ def compare_methods(
             persons, person = persons_of(test, grid_walks(test, grid), annotations.person_column)
             mean = _by_person(result, learning, heldout, [str(persons[each]) for each in person])
             own = replace(own, heldout_log_likelihood=mean)
-        records = [replace(own, seconds=learning.seconds)]
+        records = [own if own.failure else replace(own, seconds=learning.seconds)]
     else:
         records = [Record(problem.name, "behavior", failure=failure)]
     methods = {name: (lambda *walks, method=method: method(*walks, config)) for name, method in baselines.items()}
@@ -155,7 +155,7 @@ def _result_of(learned: LearnedMap, demonstrations: Demonstrations) -> ModelResu
     )
 
 
-def _by_person(result: ModelResult, learning: Learning, heldout: Demonstrations, names: list[str]) -> float:
+def _by_person(result: ModelResult, learning: Learning, heldout: Demonstrations, names: list[str]) -> float | None:
     """Return the mean log π of held-out moves by the behavior of each trajectory's person; new persons are typical."""
     learned, of_moves = list(learning.persons), np.array(names)[np.asarray(heldout.trajectory)]
     log_policies = np.zeros(len(heldout))
@@ -163,7 +163,7 @@ def _by_person(result: ModelResult, learning: Learning, heldout: Demonstrations,
         behavior = learning.fit.behavior.behavior_of(learned.index(name) if name in learned else None)
         own = of_moves == name
         log_policies[own] = result._replace(behavior=behavior).log_policies(heldout)[own]
-    return float(log_policies.mean())
+    return float(log_policies.mean()) if np.isfinite(log_policies).all() else None
 
 
 def _with_probable_goals(moves: Moves, learned: LearnedMap | None) -> Moves:

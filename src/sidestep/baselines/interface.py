@@ -18,6 +18,7 @@ from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import log_policies
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.reward import Reward
+from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.tasks import stack_tasks
 
 _Cells = Float[np.ndarray, "rows columns"]
@@ -47,6 +48,7 @@ class ModelResult(NamedTuple):
         ranking: P(blocked) of each cell, or other numbers that are higher for obstacles.
         planner: The robot's planner.
         converged: Whether the method's optimization converged.
+        options: How values are computed, such as with the horizon of agents.
     """
 
     model: ObstacleGrid
@@ -55,6 +57,7 @@ class ModelResult(NamedTuple):
     ranking: _Cells
     planner: Planner
     converged: bool
+    options: SolveOptions = SolveOptions()
 
     @property
     def heatmap(self) -> _Cells:
@@ -73,7 +76,7 @@ class ModelResult(NamedTuple):
         goals = np.asarray(demonstrations.tasks.terminal).argmax(axis=-1)
         tasks = stack_tasks([self.reward.reach(self.model.blank, int(goal)) for goal in goals])
         moves = eqx.tree_at(lambda moves: moves.tasks, demonstrations, tasks)
-        return np.asarray(log_policies(self.model, moves, self.behavior))
+        return np.asarray(log_policies(self.model, moves, self.behavior, options=self.options))
 
 
 def model_result(
@@ -89,4 +92,5 @@ def model_result(
     """
     ranking = np.asarray(model.blocked, dtype=np.float64) if ranking is None else ranking
     planner = risk_averse_robot(model, np.concatenate(demonstrations.paths()))
-    return ModelResult(model, config.reward, behavior_of(config.behavior), ranking, planner, converged=True)
+    behavior, options = behavior_of(config.behavior), SolveOptions(horizon=config.behavior.horizon)
+    return ModelResult(model, config.reward, behavior, ranking, planner, converged=True, options=options)

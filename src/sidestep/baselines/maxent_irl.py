@@ -48,6 +48,7 @@ from sidestep.tabular.graph import Graph, grid_graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid, true_model
 from sidestep.tabular.reward import Reward
+from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.tasks import Task, with_state_costs
 
 _ITERATIONS = 5000
@@ -91,14 +92,14 @@ def maxent_irl(grid: Grid, demonstrations: Demonstrations, config: MapConfig) ->
         NotConverged: Where the costs do not converge.
     """
     model, agents = true_model(grid.passable()), cost_behavior_model(grid, config)
-    optimizer = LBFGS(max_iterations=_ITERATIONS, tolerance=_TOLERANCE)
-    result = fit(model, demonstrations, agents, terms=("actions",), optimizer=optimizer)
+    optimizer, options = LBFGS(_ITERATIONS, _TOLERANCE), SolveOptions(horizon=config.behavior.horizon)
+    result = fit(model, demonstrations, agents, terms=("actions",), optimizer=optimizer, options=options)
     if not result.converged:
         raise NotConverged(f"the costs of cells did not converge: {result.message}")
     costs = np.asarray(result.behavior.costs)
     reward = CostlyReward(config.reward.discount, config.reward.step_cost, costs=costs)
     planner = ModelPlanner(model, partial(reward.reach, model.blank))
-    return ModelResult(model, reward, result.behavior.behavior_of(), costs.reshape(grid.shape), planner, True)
+    return ModelResult(model, reward, result.behavior.behavior_of(), costs.reshape(grid.shape), planner, True, options)
 
 
 def cost_behavior_model(grid: Grid, config: MapConfig) -> BehaviorModel:

@@ -42,7 +42,7 @@ _INTERRUPTED = 130
 
 
 def _prepared(command: Callable[..., None]) -> Callable[..., None]:
-    """Compute in 64 bits and keep compiled code, for as long as a command runs."""
+    """Let the process compute in 64 bits and keep compiled code before a command runs, and from then on."""
 
     @wraps(command)
     def run(**values: Any) -> None:
@@ -111,7 +111,7 @@ def main(arguments: list[str] | None = None) -> int:
     except SystemExit as stop:
         if stop.code != _INTERRUPTED:
             return stop.code if isinstance(stop.code, int) else 1
-        message = "interrupted (`sidestep learn … --resume` continues a fit from its last checkpoint)"
+        message = "interrupted (`learn` and `compare` continue with --resume where there is a checkpoint)"
     except SidestepError as error:
         message = f"error: {error}"
     except Exception as error:

@@ -33,7 +33,7 @@ def draw(name: str, path: Path, *arguments: Any) -> None:
     if "matplotlib" not in sys.modules:
         worker = _worker()
         _worker.cache_clear()
-        answer, _ = worker.communicate(pickle.dumps((name, path, arguments)))
+        answer, _ = worker.communicate(pickle.dumps((name, path.absolute(), arguments)))
         if worker.returncode == 0:
             error = pickle.loads(answer)
             if error is not None:

@@ -18,8 +18,7 @@ def learn(walks: Walks, map_file: MapFile, out: Folder, options: LearnOptions) -
     from sidestep.maps.fit import max_iterations
     from sidestep.maps.learn import learn_map
 
-    config, checkpoint = options.config(), out / "fit.checkpoint"
-    grid = options.grid(map_file)
+    config, grid, checkpoint = options.config(), options.grid(map_file), out / "fit.checkpoint"
     with fit_progress(max_iterations(config.fit)) as (callback, notify):
         table, inputs = read_walks(walks), options.more_inputs(grid, checkpoint)
         learned = learn_map(grid, table, config, callback=callback, notify=notify, **inputs)

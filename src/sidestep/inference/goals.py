@@ -15,6 +15,7 @@ trajectory that continues after a candidate's terminal state did not have this g
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Generic
 
 import equinox as eqx
@@ -36,7 +37,7 @@ class GoalFit(eqx.Module, Generic[Model]):
     """A model learned from trajectories with unknown goals.
 
     Attributes:
-        fit: The last fit.
+        fit: The last fit; it has converged only if the goals have too.
         posterior: P(g | trajectory).
         goal_probabilities: p_g.
         log_likelihoods: The actions' log-likelihood, before each round and at the end.
@@ -173,8 +174,10 @@ def fit_goals(
         history.append(log_likelihood)
         change = float(np.abs(posterior - before).max())
         if change < tolerance or len(history) > rounds:
-            converged = result.converged and change < tolerance
-            return GoalFit(result, posterior, goal_probabilities, tuple(history), converged)
+            if change >= tolerance:
+                message = f"the goals still changed by up to {change:.2g} in the last of {rounds} rounds"
+                result = replace(result, converged=False, message=message)
+            return GoalFit(result, posterior, goal_probabilities, tuple(history), result.converged)
 
 
 def weighted_demonstrations(

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 
 from sidestep.inference.fit import Fit, fit
 from sidestep.inference.maximize import Progress
@@ -104,20 +104,26 @@ def fit_map(
         InputError: For settings or demonstrations that do not fit, as `sidestep.fit` does.
     """
     behavior = behavior or behavior_model_of(config)
-    weights = np.asarray(demonstrations.weights)
+    weights, unknown = np.asarray(demonstrations.weights), np.asarray(model.known).ravel() == Cell.UNKNOWN
     prior = cell_prior or Normal(config.prior.mean, config.prior.variance)
     if config.prior.wall_prior:
         prior = WallPrior(prior, model.known, config.prior.wall_prior)
     if config.fit.terms != "actions":
         # of each unknown cell, the walks that begin there, by their weights
-        first, unknown = demonstrations.first_moves(), np.asarray(model.known).ravel() == Cell.UNKNOWN
+        first = demonstrations.first_moves()
         counts = np.bincount(np.asarray(demonstrations.states)[first], weights[first], minlength=len(unknown))
         prior = FreeCellEvidence(prior, to_jax(np.where(unknown, counts, 0.0)))
     optimizer = optimizer_for(config.fit, model.graph.states, round(float(weights.sum())))
     if initialize and config.fit.terms == "both":
         model = fit(model, demonstrations, behavior, prior=prior, terms=("transitions",)).model
     if initialize and isinstance(optimizer, Rprop):
-        model = _block_unvisited(model, demonstrations, weights > 0)
+        # With every unvisited cell almost surely blocked, no other path is possible at first. The prior lowers cells
+        # until another path would be taken. The ascent from below takes long: of all gaps in a wall, the likelihood
+        # sees only the one that agents would take next.
+        visited = np.zeros(model.graph.states, dtype=bool)
+        for states in (demonstrations.states, demonstrations.next_states):
+            visited[np.asarray(states)[weights > 0]] = True
+        model = model.with_parameters(jnp.where(jnp.asarray(~visited & unknown), _BLOCKED_LOGIT, model.parameters))
     return fit(
         model,
         demonstrations,
@@ -161,18 +167,3 @@ def max_iterations(config: FitConfig) -> int:
         config: The configuration of the fit.
     """
     return max(optimizer_for(config, cells, moves=1).max_iterations for cells in (0, config.large_map))
-
-
-def _block_unvisited(
-    model: ObstacleGrid, demonstrations: Demonstrations, counts: Bool[np.ndarray, " moves"]
-) -> ObstacleGrid:
-    """Return the model with every unknown cell that no counting move visits almost surely blocked.
-
-    Then no other path is possible at first, and the prior lowers cells until another path would be taken. The ascent
-    from below takes long: of all gaps in a wall, the likelihood sees only the one that agents would take next.
-    """
-    visited = np.zeros(model.graph.states, dtype=bool)
-    for states in (demonstrations.states, demonstrations.next_states):
-        visited[np.asarray(states)[counts]] = True
-    unvisited = jnp.asarray(~visited & (np.asarray(model.known).ravel() == Cell.UNKNOWN))
-    return model.with_parameters(jnp.where(unvisited, _BLOCKED_LOGIT, model.parameters))

@@ -62,6 +62,7 @@ class Trial:
         moves: The number of moves.
         ratio: κ; infinite where the walks do not vary.
         lapse: The learned probability of a random action, averaged over folds.
+        converged: The number of folds with a fit that converged.
     """
 
     config: MapConfig
@@ -70,6 +71,7 @@ class Trial:
     moves: int
     ratio: float
     lapse: float
+    converged: int
 
     @property
     def log_likelihood(self) -> Float[np.ndarray, " walks"]:
@@ -87,6 +89,7 @@ class Trial:
             "heldout_transitions": float(self.transitions.sum() / self.moves),
             "effective_sample_ratio": self.ratio if np.isfinite(self.ratio) else None,
             "lapse": self.lapse,
+            "converged_folds": self.converged,
         }
 
 
@@ -150,16 +153,16 @@ def select_behavior(
         [*attempt(kind), *attempt(_with_beta(kind, _BETA_FACTOR * kind.behavior.beta))]
         for kind in (config, _other_reward(config))
     )
-    trial, gains = own[0], None
+    trial, gains, least = own[0], None, 0.0
     if other:
         gains = _best(other).log_likelihood - _best(own).log_likelihood
-        is_worth_it = gains.sum() > max(_STANDARD_ERRORS * _standard_error(gains), _WORTH * trial.moves)
-        trial = other[0] if is_worth_it else trial
+        least = max(_STANDARD_ERRORS * _standard_error(gains), _WORTH * trial.moves)
+        trial = other[0] if gains.sum() > least else trial
     trial = _raise_beta(trial, attempt)
     below = dispersion(trial.ratio, len(trial.log_likelihood), _STANDARD_ERRORS) is Dispersion.OVERDISPERSED
     behavior = replace(trial.config.behavior, tempering=trial.ratio if below else 1.0)
     selected = replace(trial.config, behavior=behavior)
-    return Selection(selected, [*_reasons(selected, trial, gains, config), *passed_over], trials)
+    return Selection(selected, [*_reasons(selected, trial, gains, least, config), *passed_over], trials)
 
 
 def _with_beta(config: MapConfig, beta: float) -> MapConfig:
@@ -200,7 +203,7 @@ def _cross_validate(
     count = demonstrations.trajectories
     check(count >= 2, f"expected at least 2 walks to select by, found {count}", field="select_behavior")
     fold_of = np.random.default_rng(config.seed).permutation(count) % min(FOLDS, count)
-    actions, transitions, statistics, lapse_values = np.zeros(count), np.zeros(count), [], []
+    actions, transitions, statistics, lapse_values, converged = np.zeros(count), np.zeros(count), [], [], 0
     for fold in range(fold_of.max() + 1):
         if notify:
             kind, beta = "goal reward" if config.reward.step_cost is None else "step cost", config.behavior.beta
@@ -209,13 +212,14 @@ def _cross_validate(
         held_out, behavior = demonstrations.with_only(fold_of == fold), fit.behavior.behavior_of()
         of_fold = score_statistics(fit.model, held_out, behavior, options=SolveOptions(horizon=config.behavior.horizon))
         statistics.append(of_fold)
+        converged += fit.converged
         lapse_values.append(0.0 if behavior.lapse is None else float(behavior.lapse))
         weights = np.asarray(held_out.weights)
         log_transitions = np.log(np.asarray(transition_probabilities(fit.model, held_out)))[weights > 0]
         actions += np.bincount(of_fold.trajectory, of_fold.log_policy, minlength=count)
         transitions += np.bincount(of_fold.trajectory, log_transitions, minlength=count)
     ratio, moves = effective_sample_ratio(statistics), len(demonstrations)
-    return Trial(config, actions, transitions, moves, ratio, float(np.mean(lapse_values)))
+    return Trial(config, actions, transitions, moves, ratio, float(np.mean(lapse_values)), converged)
 
 
 def _reward_name(reward: Reward) -> str:
@@ -223,15 +227,15 @@ def _reward_name(reward: Reward) -> str:
 
 
 def _reasons(
-    selected: MapConfig, trial: Trial, gains: Float[np.ndarray, " walks"] | None, configured: MapConfig
+    selected: MapConfig, trial: Trial, gains: Float[np.ndarray, " walks"] | None, least: float, configured: MapConfig
 ) -> list[str]:
-    """Say what was selected and why; `gains` are those of the other kind of reward, if it has values."""
+    """Say what was selected and why; `gains` are those of the other kind of reward, which counts above `least`."""
     kind, other = _reward_name(selected.reward), _reward_name(_other_reward(configured).reward)
     against = (
         f"{other} has no values"
         if gains is None
         else f"with {other} the log-probability of a held-out move is higher by {gains.sum() / trial.moves:.2g} ± "
-        f"{_standard_error(gains) / trial.moves:.1g}; it would be selected from {_WORTH:g} on"
+        f"{_standard_error(gains) / trial.moves:.1g}; it would be selected from {least / trial.moves:.2g} on"
     )
     beta, tempering = selected.behavior.beta, selected.behavior.tempering
     reasons = [

@@ -77,7 +77,11 @@ class Jacobi(base.Solver):
 
         def sweep(values: Values) -> tuple[Values, Values]:
             after = values[exits.successors]
-            probs = _probs_so_far(exits, values, after)
+            # γP of the outcomes that leave a state, 0 where they lead to states without a value yet; once no further
+            # state gets a value, those without one cannot reach a terminal state, nor can what leads there
+            known = base.is_reachable(after)
+            frontier = ~base.is_reachable(values) & jnp.any(known & (exits.discounted_probs > 0), axis=(0, 1))
+            probs = jnp.where(known | ~frontier.any(), exits.discounted_probs, 0)
             exit_values = reward + jnp.sum(probs * after, axis=1)
             exit_weights = exits.one_minus_discount + probs.sum(axis=1)
             solved = process.with_terminal_rewards(_solve_states(backup, beta, exit_values, exit_weights, values))
@@ -205,18 +209,6 @@ def _exits(process: base.DecisionProcess) -> _Exits:
     is_self_loop = successors == jnp.arange(len(process.successors))
     leaving = jnp.where(is_self_loop, 0, probabilities)
     return _Exits(successors, process.discount * leaving, 1 - process.discount)
-
-
-def _probs_so_far(
-    exits: _Exits, values: Float[Array, " states"], after: Float[Array, "actions outcomes states"]
-) -> Float[Array, "actions outcomes states"]:
-    """Return γP of the outcomes that leave a state, 0 where they lead to states without a value yet.
-
-    Once no further state gets a value, those without one cannot reach a terminal state, nor can what leads there.
-    """
-    known = base.is_reachable(after)
-    frontier = ~base.is_reachable(values) & jnp.any(known & (exits.discounted_probs > 0), axis=(0, 1))
-    return jnp.where(known | ~frontier.any(), exits.discounted_probs, 0)
 
 
 def _solve_states(
