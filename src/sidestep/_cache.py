@@ -64,7 +64,8 @@ def kept_entry(path: Path) -> bytes | None:
 def keep_compiled_code() -> None:
     """Make JAX keep compiled code in `cache_folder`, for the command line; a library leaves JAX's settings alone.
 
-    JAX recompiles a damaged entry but does not replace it. So its warning removes the entry, and JAX writes it anew.
+    JAX recompiles a damaged entry but does not replace it. So the handler of its warning removes the entry, and JAX
+    writes it anew.
     """
     global _folder  # noqa: PLW0603
     _folder = folder = cache_folder()

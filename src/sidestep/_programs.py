@@ -114,7 +114,7 @@ def _compile(path: Path, function: Callable[..., Any], leaves: list[Any], struct
 
 @cache
 def _package() -> str:
-    """Return what every entry belongs to: settings of JAX, the files of this package, and those of other libraries.
+    """Return a text of the settings, files and devices for which programs are compiled.
 
     The first file of a library stands for its version, which takes longer to read.
     """

@@ -29,7 +29,7 @@ def behavior_aware(grid: Grid, demonstrations: Demonstrations, config: MapConfig
         config: The configuration of the fit.
 
     Returns:
-        The learned map.
+        The learned model and behavior, P(blocked) of each cell, and whether the fit converged.
 
     Raises:
         InputError: As `fit_map` does.
@@ -48,7 +48,7 @@ def transitions_only(grid: Grid, demonstrations: Demonstrations, config: MapConf
         config: The configuration of the fit.
 
     Returns:
-        The learned map.
+        The learned model and P(blocked) of each cell, and whether the fit converged.
     """
     return behavior_aware(grid, demonstrations, replace(config, fit=replace(config.fit, terms="transitions")))
 

@@ -68,7 +68,7 @@ class Dynamics(eqx.Module):
             action: The action a.
 
         Returns:
-            A draw.
+            A next state, shaped as `state`.
         """
 
     @abc.abstractmethod
@@ -79,9 +79,6 @@ class Dynamics(eqx.Module):
             state: The state s.
             action: The action a.
             next_state: The next state s′.
-
-        Returns:
-            A logarithm, in nats.
         """
 
     def transition_control_variate(self, value: ValueFunction, state: State, action: Action, next_state: State) -> Real:
@@ -94,9 +91,6 @@ class Dynamics(eqx.Module):
             state: The state s.
             action: The action a.
             next_state: The next state s′.
-
-        Returns:
-            A number in units of reward.
         """
         return jnp.zeros((), jnp.result_type(float))
 
@@ -105,9 +99,6 @@ class Dynamics(eqx.Module):
 
         Args:
             parameters: θ, shaped as the present parameters.
-
-        Returns:
-            The dynamics.
         """
         return eqx.tree_at(lambda dynamics: dynamics.parameters, self, parameters)
 
@@ -154,7 +145,7 @@ class GaussianDynamics(Dynamics):
             action: The action a.
 
         Returns:
-            The outcomes.
+            ln p_k and the mean next state of each outcome k.
         """
 
     @property
@@ -175,7 +166,7 @@ class GaussianDynamics(Dynamics):
             action: The action a.
 
         Returns:
-            A draw.
+            A next state, shaped as `state`.
         """
         outcome_key, noise_key = jax.random.split(key)
         log_probabilities, means = self.outcomes(state, action)
@@ -191,7 +182,7 @@ class GaussianDynamics(Dynamics):
             next_state: The next state s′.
 
         Returns:
-            A logarithm, in nats.
+            ln T_θ(s, a, s′), in nats.
         """
         return jax.nn.logsumexp(self._joint_log_probs(self.outcomes(state, action), next_state))
 
@@ -205,9 +196,6 @@ class GaussianDynamics(Dynamics):
             state: The state s.
             action: The action a.
             next_state: The next state s′.
-
-        Returns:
-            A number in units of reward.
         """
         outcomes = self.outcomes(state, action)
         values, slopes = jax.vmap(jax.value_and_grad(value))(outcomes.means)
@@ -261,9 +249,6 @@ class LinearGaussian(GaussianDynamics):
         Args:
             state: The state s.
             action: The action a.
-
-        Returns:
-            The outcomes.
         """
         return Outcomes.single(self.parameters["state"] @ state + self.parameters["action"] @ action)
 
@@ -304,7 +289,7 @@ class TableDynamics(Dynamics):
             action: The action a.
 
         Returns:
-            A draw.
+            The index of the next state, in the data type of `state`.
         """
         outcome = jax.random.categorical(key, jnp.log(self._probabilities(state, action)))
         return self.model.graph.successors[state, action, outcome].astype(state.dtype)
@@ -318,7 +303,7 @@ class TableDynamics(Dynamics):
             next_state: The next state s′.
 
         Returns:
-            A logarithm, in nats.
+            ln T_θ(s, a, s′), in nats; −∞ for an impossible next state.
         """
         same = self.model.graph.successors[state, action] == next_state
         probability = jnp.sum(jnp.where(same, self._probabilities(state, action), 0.0))
@@ -334,9 +319,6 @@ class TableDynamics(Dynamics):
             state: The state s.
             action: The action a.
             next_state: The next state s′.
-
-        Returns:
-            A number in units of reward.
         """
         successors = self.model.graph.successors[state, action].astype(next_state.dtype)
         return value(next_state) - self._probabilities(state, action) @ jax.vmap(value)(successors)
@@ -350,7 +332,7 @@ def checked_noise(noise: Float[Array, " _"] | np.ndarray, dimensions: int) -> Ve
         dimensions: How many there should be.
 
     Returns:
-        The standard deviations.
+        As many numbers as `dimensions`, in the units of the state.
 
     Raises:
         InputError: For another number of them, or any not finite and above 0.

@@ -100,7 +100,7 @@ class Lattice(eqx.Module):
             place: The place, in the units of the state.
 
         Returns:
-            The value.
+            A number in the units of `values`.
         """
         points, weights = self.interpolation_weights(place)
         return values[points] @ weights
@@ -145,7 +145,7 @@ class LatticePlanner(eqx.Module):
             task: The task.
 
         Returns:
-            The task.
+            A task with one state for each point, in the order of `points`.
         """
         points = self.lattice.points()
         reward = jax.vmap(jax.vmap(task.reward, (None, 0)), (0, None))(points, self.actions)

@@ -77,7 +77,7 @@ def radial_field(low: Vector, high: Vector, counts: Sequence[int], logit: float 
         logit: The logit everywhere at the beginning.
 
     Returns:
-        The field.
+        A field with one weight for each center.
 
     Raises:
         InputError: For corners out of order, or fewer than two centers along a side.
@@ -137,7 +137,7 @@ def network_field(
         logit: The offset of the output.
 
     Returns:
-        The field.
+        A field with the network's weights as parameters.
 
     Raises:
         InputError: For corners out of order.
@@ -177,9 +177,6 @@ class Walls(Field):
 
         Args:
             place: The place, in the units of the state.
-
-        Returns:
-            A truth value for each place.
         """
         return ((place >= self.low) & (place <= self.high)).all(axis=-1).any()
 
@@ -236,7 +233,7 @@ class ObstacleMotion(GaussianDynamics):
             action: The action a.
 
         Returns:
-            The outcomes.
+            One or two places, and the logarithm of the probability of each.
         """
         low, high = jax.lax.stop_gradient((self.low, self.high))
         target = jnp.clip(state + action, low, high)

@@ -92,7 +92,7 @@ class Pendulum(GaussianDynamics):
             action: The action a.
 
         Returns:
-            The outcomes.
+            A single outcome: the angle from upright and the angular speed.
         """
         gravity, mass, length = (self.constant(name) for name in PENDULUM_CONSTANTS)
         angle, speed = state
@@ -153,7 +153,7 @@ class PointMass(GaussianDynamics):
             action: The action a.
 
         Returns:
-            The outcomes.
+            A single outcome: the place (two numbers) and the velocity (two numbers).
         """
         place, speed = state[:2], state[2:]
         friction = jnp.exp(self.parameters["friction"])

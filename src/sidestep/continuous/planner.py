@@ -412,7 +412,7 @@ def policy_gap(behavior: Behavior, advantages: PerCandidate, q: PerSample, proba
         probabilities: Those of the candidates, which add up to 1 for each start.
 
     Returns:
-        The gap, a single number.
+        A single number, in nats or units of reward.
     """
     half = q.shape[-1] // 2
     halves = q[..., :half].mean(axis=-1), q[..., -half:].mean(axis=-1)

@@ -53,9 +53,6 @@ def scaled_network(key: PRNGKeyArray, examples: Examples, outputs: int, width: i
         width: The units in each hidden layer.
         depth: The number of hidden layers.
 
-    Returns:
-        The network.
-
     Raises:
         InputError: For no examples, or any that are not finite.
     """
@@ -86,7 +83,7 @@ class Policy(eqx.Module):
             x: The features of the state.
 
         Returns:
-            A draw.
+            An index or a vector, as the policy has it.
         """
 
     @abc.abstractmethod
@@ -96,9 +93,6 @@ class Policy(eqx.Module):
         Args:
             x: The features of the state.
             choice: The choice c: an index or a vector.
-
-        Returns:
-            A logarithm, in nats.
         """
 
     @abc.abstractmethod
@@ -200,7 +194,7 @@ class FinitePolicy(Policy):
             x: The features of the state.
 
         Returns:
-            A draw.
+            A whole number from 0 to the number of actions less 1.
         """
         return jax.random.categorical(key, self.network(x))
 
@@ -212,7 +206,7 @@ class FinitePolicy(Policy):
             choice: The choice c: an index or a vector.
 
         Returns:
-            A logarithm, in nats.
+            A number in nats, at most 0.
         """
         return self.log_probs(x)[choice]
 
@@ -254,7 +248,7 @@ class GaussianPolicy(Policy):
             x: The features of the state.
 
         Returns:
-            A draw.
+            A vector, with one number for each component of an action.
         """
         noise = jax.random.normal(key, self.log_spread.shape, self.log_spread.dtype)
         return self.network(x) + jnp.exp(self.log_spread) * noise
@@ -267,7 +261,7 @@ class GaussianPolicy(Policy):
             choice: The choice c: an index or a vector.
 
         Returns:
-            A logarithm, in nats.
+            A number in nats.
         """
         return norm.logpdf(choice, self.network(x), jnp.exp(self.log_spread)).sum()
 
@@ -300,9 +294,6 @@ def finite_policy(
         width: Units in each hidden layer.
         depth: Hidden layers.
 
-    Returns:
-        The policy.
-
     Raises:
         InputError: For fewer than two actions, or actions or examples that are not finite.
 
@@ -329,9 +320,6 @@ def gaussian_policy(
         width: Units in each hidden layer.
         depth: Hidden layers; with 0 the mean is linear in the features.
 
-    Returns:
-        The policy.
-
     Raises:
         InputError: For a spread not above 0, or examples that are not finite.
 
@@ -356,9 +344,6 @@ def make_critic(
         returns: The returns-to-go from there, in units of reward.
         width: Units in each hidden layer.
         depth: Hidden layers.
-
-    Returns:
-        The critic.
 
     Raises:
         InputError: For no examples, or any that are not finite.

@@ -131,9 +131,6 @@ def reach_region(
         discount: γ in (0, 1]; below 1 without a step cost.
         step_cost: The cost of an action, above 0. Without it the goal pays 1.
 
-    Returns:
-        The task.
-
     Raises:
         InputError: For a goal that is not finite, a radius or step cost not above 0, or a discount outside its range.
 
@@ -287,9 +284,6 @@ def batch_tasks(tasks: Sequence[_Task]) -> _Task:
     Args:
         tasks: The tasks, all of one kind.
 
-    Returns:
-        The batch.
-
     Raises:
         InputError: For no task, or tasks of different kinds or shapes.
 
@@ -308,9 +302,6 @@ def task_at(tasks: _Task, index: Array | int) -> _Task:
     Args:
         tasks: The tasks as a batch.
         index: The index of a task, or an array of them.
-
-    Returns:
-        The task or tasks.
     """
     return jax.tree.map(lambda leaf: leaf[index], tasks)
 
@@ -321,9 +312,6 @@ def task_features(tasks: ContinuousTask, states: States) -> Float[Array, "states
     Args:
         tasks: The task of each state.
         states: The states, one a task or an index.
-
-    Returns:
-        Features of shape (states, features).
     """
     return jax.vmap(lambda task, state: task.features(state))(tasks, states)
 
@@ -335,9 +323,6 @@ def has_ended(tasks: ContinuousTask, task: Int[Array, " states"], states: States
         tasks: The tasks as a batch.
         task: The index of the task of each state.
         states: The states, one a task or an index.
-
-    Returns:
-        A truth value for each state.
     """
     return np.asarray(jax.vmap(lambda task, state: task.terminal(state))(task_at(tasks, task), states))
 

@@ -101,7 +101,7 @@ def evaluate(
         sample: The sample sizes; by default `sample_sizes` of the map.
 
     Returns:
-        The scores.
+        All scores; those of cells are None without `ranking`, those of paths without `planner`.
 
     Raises:
         InputError: For arrays that do not fit the map.

@@ -66,7 +66,7 @@ def score_map(blocked: Float[np.ndarray, "rows columns"], truth: Grid, scored: _
         relevant: The relevant obstacles (`relevant_obstacles`).
 
     Returns:
-        The scores.
+        Scores in [0, 1] if `blocked` has probabilities; None where a mean or a ranking has no cells.
 
     Raises:
         InputError: For arrays of another shape than the map and for numbers that are not finite.
@@ -119,7 +119,7 @@ def score_paths(
         truth: The true map.
 
     Returns:
-        The scores.
+        A fraction in [0, 1] and a length in cell sides; None where a mean has no paths.
 
     Raises:
         InputError: For a path without states, for a number of goals that differs from that of paths, and for states
@@ -153,7 +153,7 @@ def score_lengths(lengths: Float[np.ndarray, " paths"], shortest: Float[np.ndarr
         shortest: The length of the shortest path in its place; infinite if there is none.
 
     Returns:
-        The scores.
+        A fraction in [0, 1] and a length in cell sides; None where a mean has no paths.
     """
     possible = np.isfinite(shortest)
     legal = possible & np.isfinite(lengths)

@@ -59,7 +59,7 @@ class ContinuousConfig:
             settings: Other settings of `fit_dynamics`.
 
         Returns:
-            The fit.
+            The learned dynamics and policy, the progress of every iteration, and whether the fit converged.
         """
         features = sc.task_features(sc.task_at(walks.tasks, walks.task), walks.states)
         policy = sc.finite_policy(jax.random.key(seed), actions, features, width=self.width)

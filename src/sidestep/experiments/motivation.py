@@ -162,7 +162,7 @@ def simulate_walks(form: Form, config: MotivationConfig, seed: int) -> ss.Demons
         seed: Draws everything random.
 
     Returns:
-        The walks.
+        The moves of `config.walks_per_goal` walks to each of `config.goals`.
     """
     world, random = true_world(), np.random.default_rng(seed)
     goals, dry = [_state(goal) for goal in config.goals], np.flatnonzero(np.asarray(world.known) == ss.Cell.FREE)
@@ -176,9 +176,6 @@ def true_result(form: Form) -> ModelResult:
 
     Args:
         form: The form of the reward.
-
-    Returns:
-        The result.
     """
     world, behavior = true_world(), behavior_of(form.config.behavior)
     ranking, robot = np.asarray(world.blocked), ss.risk_averse_robot(world, [])
@@ -195,9 +192,6 @@ def task_at_stakes(result: ModelResult, form: Form, goal: int, stakes: float) ->
         form: The form of the reward.
         goal: The state to reach.
         stakes: The factor k of the reward, above 0.
-
-    Returns:
-        The task.
     """
     learned, base = (reward.reach(BLANK, goal) for reward in (result.reward, form.config.reward))
     pay = jnp.full((1,), stakes * form.worth)

@@ -70,7 +70,7 @@ class PendulumConfig(ContinuousConfig):
             seed: Draws everything random.
 
         Returns:
-            The trajectories.
+            One trajectory for each agent, those of the first goal first.
         """
         random, spread = np.random.default_rng(seed), np.array(self.start_spread)
         shape = self.agents_per_goal, 2

@@ -109,7 +109,7 @@ def simulate_walks(world: World, config: ReproduceConfig, seed: int) -> ss.Demon
         seed: Draws the agents' choices among optimal actions.
 
     Returns:
-        The walks.
+        The moves of `config.walks_per_pair` walks from each start to each other goal.
     """
     tasks = [config.reward.reach(world.truth.forget(), goal) for goal in world.goals]
     others = ([start for start in world.starts if start != goal] for goal in world.goals)

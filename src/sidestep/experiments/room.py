@@ -60,7 +60,7 @@ class RoomConfig(ContinuousConfig):
             world: The room.
 
         Returns:
-            The field.
+            A field with `centers`² weights.
         """
         return sc.radial_field(world.dynamics.low, world.dynamics.high, (self.centers, self.centers), self.prior_mean)
 
@@ -70,9 +70,6 @@ class RoomConfig(ContinuousConfig):
         Args:
             world: The room.
             seed: Draws everything random.
-
-        Returns:
-            The moves, and the number removed.
         """
         return walks_without_collisions(jax.random.key(seed), world, self.behavior, self.agents_per_goal, seed)
 

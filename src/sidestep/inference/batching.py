@@ -83,7 +83,7 @@ def plan_batches(
         large_map: The number of states from which a map is large.
 
     Returns:
-        The plan.
+        The number of tasks of a batch, and whether warm starts and contributions are stored between evaluations.
     """
     probabilities, parameters = jax.eval_shape(model.probabilities), jax.eval_shape(lambda: model.parameters)
     states, item = model.graph.states, probabilities.dtype.itemsize

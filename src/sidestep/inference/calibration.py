@@ -1,9 +1,9 @@
 """Calibrate the actions' likelihood: how many independent steps the steps of a trajectory are worth.
 
 The likelihood treats the steps of a trajectory as independent. They are not: after a wrong turn an agent takes many
-steps of a long path. If each counts as a decision of its own, the map is bent until it explains them all: a large β
-predicts actions better, and puts walls where there are none. Trajectories that the model was not learned from show it.
-With
+steps of a long path. If each counts as a decision of its own, the fit changes the map to explain all of them: a large
+β predicts actions better, and puts walls where there are none. Trajectories that the model was not learned from show
+it. With
 
     u_t = ∂ log π(a_t | s_t) / ∂ log β  (at fixed Q),       I = Σ_t Σ_a π(a | s_t) u(s_t, a)²,
 
@@ -151,9 +151,6 @@ def dispersion(ratio: float, trajectories: int, standard_errors: float) -> Dispe
         ratio: κ (see `effective_sample_ratio`).
         trajectories: The number of trajectories that it was estimated from.
         standard_errors: The number of standard errors that count as significant.
-
-    Returns:
-        How κ differs from 1.
 
     Example:
         >>> dispersion(0.2, trajectories=100, standard_errors=3.0)

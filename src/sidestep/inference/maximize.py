@@ -1,6 +1,6 @@
 """The loop of every fit: evaluate the objective, stop or take a step of the optimizer.
 
-Two devices save work on large maps:
+Two methods save work on large maps:
 
 - Solves are loose at first. Where the optimizer has converged, or finds no better point, it continues from there with
   exact solves. It ends only with exact solves.

@@ -124,8 +124,6 @@ class BatchResult(NamedTuple):
 class Contribution(NamedTuple):
     """What a batch contributes to the objective at some parameters.
 
-    `all_states` is false if only the states that mattered before were solved.
-
     Attributes:
         parameters: Where it was computed.
         actions: The actions' log-likelihood, in nats.
@@ -155,8 +153,6 @@ class Contribution(NamedTuple):
 
 class Evaluation(NamedTuple):
     """The objective at some parameters.
-
-    `contributions` are those of the batches, for the next evaluation to reuse; none where the plan does not reuse.
 
     Attributes:
         objective: The sum of the three parts, in nats.

@@ -77,7 +77,7 @@ def read_goal_candidates(path: str | Path) -> GoalCandidates:
         path: A CSV or Parquet file.
 
     Returns:
-        The candidates.
+        Two positions or more, in the order of the rows.
 
     Raises:
         InputError: For columns that are missing or not finite, and fewer than two rows.

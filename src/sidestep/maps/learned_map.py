@@ -98,9 +98,6 @@ class LearnedMap:
 
         Args:
             bump_cost: The cost of the first bump at a place in cell sides, at least 0.
-
-        Returns:
-            The robot's planner.
         """
         return risk_averse_robot(self.model, self.visited[:, 0], bump_cost)
 
@@ -113,7 +110,7 @@ class LearnedMap:
             bump_cost: As for `robot`.
 
         Returns:
-            The path.
+            The states, positions and P(blocked) along the path, and its length in metres.
 
         Raises:
             InputError: For positions outside the map or in known obstacles, and where there is no path.

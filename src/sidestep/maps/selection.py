@@ -5,13 +5,16 @@ Maps are learned from two thirds of the walks at a time and scored by the others
 1. **Reward.** Two kinds are compared: a goal that pays 1 with the discount of the configuration, and a cost of 1 a cell
    without one. Each has its own first β or four times that, whichever is better. A kind without values is passed over,
    unless it is the configuration's own. The configured reward stays unless the other makes held-out actions and
-   transitions more probable by a fifth of a nat a move: better prediction of actions does not always find walls better.
-2. **Inverse temperature.** β is doubled while agents are more regular than the model expects (κ above 1, see
-   `sidestep.inference.calibration`) and held-out walks become more probable.
+   transitions more probable, by more than .2 nats a move and by more than three standard errors (over walks) of the
+   gain: better prediction of actions does not always find walls better.
+2. **Inverse temperature.** β starts at the first β of the selected kind. It is doubled while agents are more regular
+   than the model expects (κ above 1, see `sidestep.inference.calibration`) and held-out walks become more probable, by
+   any gain; at most six times. A β without values ends the doubling.
 3. **Tempering.** Where actions say less than independent ones would (κ below 1), their likelihood is raised to the
    power κ. Walls then do not explain errors that the walks have in common.
 
-A difference counts beyond three standard errors. Lapses are learned with every map.
+κ counts as above or below 1 where |ln κ| is more than three standard errors, 3 √(2/n) for n walks. Lapses are learned
+with every map.
 """
 
 from collections.abc import Callable
@@ -129,6 +132,8 @@ def select_behavior(
 
     Raises:
         InputError: For fewer than two walks, for settings that are selected here and set too, and as a fit does.
+        ImproperTask: If the tasks of the given configuration have no values.
+        NotConverged: If the values of the given configuration do not converge.
     """
     for field, is_set in (("learn", config.behavior.learn), ("tempering", config.behavior.tempering != 1)):
         check(not is_set, "cannot be set where the behavior is selected by held-out walks", field=field)

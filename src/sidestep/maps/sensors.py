@@ -52,7 +52,7 @@ def read_sensor(map_file: str | Path, grid: Grid, variance: float | str | Path =
         variance: The variance of each logit, above 0, or a `.npy` file with one number a cell.
 
     Returns:
-        What the sensors saw.
+        P(occupied) of each cell, NaN where the sensors saw nothing, and the variance of the logits.
 
     Raises:
         InputError: For files that do not fit the grid.

@@ -17,7 +17,7 @@ def figure_comparison(comparison: Comparison) -> Figure:
         comparison: The walks and what each method learned from them.
 
     Returns:
-        The figure.
+        A figure with at most three maps in a row.
     """
     problem = comparison.problem
     paths = problem.demonstrations.paths()

@@ -38,9 +38,6 @@ def new_figure(count: int, columns: int) -> tuple[Figure, list[Axes]]:
     Args:
         count: The number of axes, 1 or more.
         columns: The number of axes in a row.
-
-    Returns:
-        The figure and its axes.
     """
     figure = Figure(dpi=DOTS_PER_INCH)
     return figure, [figure.add_subplot(-(-count // columns), columns, index + 1) for index in range(count)]

@@ -72,9 +72,6 @@ def draw_cells(
         grid: The geometry of the map.
         colors: The color map.
         limits: The values of the first and the last color.
-
-    Returns:
-        The image.
     """
     rows, columns = grid.shape
     x, y, yaw = grid.origin
@@ -94,9 +91,6 @@ def draw_map(axes: Axes, grid: Grid) -> AxesImage:
     Args:
         axes: The axes to draw on.
         grid: The map.
-
-    Returns:
-        The image.
     """
     limits = float(Cell.UNKNOWN), float(Cell.OCCUPIED)
     return draw_cells(axes, grid.known, grid, ListedColormap(palette.KNOWN), limits)
@@ -110,9 +104,6 @@ def draw_blocked(axes: Axes, blocked: Values, grid: Grid, truth: Grid | None = N
         blocked: P(blocked) of each cell, in [0, 1].
         grid: The map.
         truth: The true map, or None.
-
-    Returns:
-        The image.
     """
     image = draw_cells(axes, blocked, grid, palette.BLOCKED, (0.0, 1.0))
     if truth is not None:
@@ -186,9 +177,6 @@ def figure_environments(worlds: Sequence[World]) -> Figure:
 
     Args:
         worlds: The worlds.
-
-    Returns:
-        The figure.
     """
     return figure_learned([Panel(world.name, world.truth, starts=world.starts, goals=world.goals) for world in worlds])
 
@@ -200,9 +188,6 @@ def figure_learned(panels: Sequence[Panel], columns: int | None = None, label: s
         panels: The maps.
         columns: How many maps a row has; by default all maps are in one row.
         label: What the colors of learned maps mean.
-
-    Returns:
-        The figure.
     """
     columns = min(columns or len(panels), len(panels))
     figure, axes = new_figure(len(panels), columns)
@@ -230,9 +215,6 @@ def figure_fit(
         objective: The log posterior (nats) before the first iteration and after each.
         seen: P(blocked) of each cell in the map of a sensor, NaN where it has none.
         goals: The goals of the walks.
-
-    Returns:
-        The figure.
     """
     width, height = _size(grid, _FIT)
     height = max(height, 2.2)
@@ -265,9 +247,6 @@ def figure_plan(grid: Grid, blocked: Values, path: Integer[np.ndarray, " steps"]
         grid: The map.
         blocked: The learned P(blocked) of each cell, in [0, 1].
         path: The states along the path.
-
-    Returns:
-        The figure.
     """
     width, height = _size(grid, _PLAN)
     figure, (axes,) = new_figure(1, 1)

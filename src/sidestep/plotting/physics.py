@@ -24,9 +24,6 @@ def figure_belief(
         estimates: The gravity (m/s²) after each iteration.
         believed: The gravity that the agents believe in, a dashed line.
         true: The gravity of the pendulums, a dotted line.
-
-    Returns:
-        The figure.
     """
     figure = Figure(figsize=(9.5, 3.6), layout="constrained")
     swings, learned = figure.subplots(1, 2)

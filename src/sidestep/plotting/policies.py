@@ -64,9 +64,6 @@ def figure_policies(panels: Sequence[PolicyPanel], curves: Sequence[Curves]) -> 
     Args:
         panels: The maps.
         curves: The sets of curves.
-
-    Returns:
-        The figure.
     """
     figure = Figure(figsize=(2.9 * len(panels), 2.7 + 2.5 * len(curves)), layout="constrained")
     rows = figure.add_gridspec(1 + len(curves), 1, height_ratios=[2.7, *[2.5] * len(curves)])

@@ -12,9 +12,6 @@ def to_jax(array: Shaped[ArrayLike, "..."], dtype: type | np.dtype | None = None
     Args:
         array: Anything that NumPy makes an array of, or a JAX array; do not change it afterwards, memory may be shared.
         dtype: The type of its numbers, by default that of `array` (32-bit unless `jax_enable_x64` is set).
-
-    Returns:
-        The JAX array.
     """
     if isinstance(array, jax.Array):
         return jnp.asarray(array, dtype)

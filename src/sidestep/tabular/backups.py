@@ -52,7 +52,7 @@ class Backup(eqx.Module):
             beta: The inverse temperature β, above 0.
 
         Returns:
-            V of each state.
+            V of each state, in units of reward.
         """
 
     @abc.abstractmethod

@@ -88,9 +88,6 @@ class BehaviorModel(eqx.Module):
 
         Args:
             parameters: With None for the same numbers.
-
-        Returns:
-            The model.
         """
         return eqx.tree_at(lambda model: model.parameters, self, parameters, is_leaf=lambda leaf: leaf is None)
 

@@ -54,9 +54,6 @@ def graph(successors: Int[np.ndarray, "states actions outcomes"]) -> Graph:
     Args:
         successors: The state that each outcome of each action leads to.
 
-    Returns:
-        The graph.
-
     Raises:
         InputError: For an empty table or a successor that is not a state.
 

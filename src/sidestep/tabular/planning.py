@@ -54,9 +54,6 @@ class Plan(eqx.Module):
         Args:
             start: A state.
 
-        Returns:
-            The states of the path.
-
         Raises:
             InputError: For a start that is not a state or, at discount 1, from which no terminal state can be reached.
         """
@@ -108,7 +105,7 @@ def plan(
         options: How values are computed; by default `SolveOptions()`.
 
     Returns:
-        The plan.
+        The probabilities of actions and the intended next state of every state, with the values.
 
     Raises:
         ImproperTask: For a task that has no values.

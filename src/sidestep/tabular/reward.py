@@ -37,9 +37,6 @@ class Reward:
             world: A grid, or the graph of any discrete world.
             goal: A state; on a grid also a position (x, y) in metres.
 
-        Returns:
-            The task.
-
         Raises:
             InputError: As `reach` does.
         """

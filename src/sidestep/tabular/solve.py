@@ -78,9 +78,6 @@ class SolveOptions(eqx.Module):
         Args:
             backup: Of the behavior.
             states: Their number.
-
-        Returns:
-            The solver.
         """
         return self.solver or default_solver(backup, states)
 

@@ -51,9 +51,6 @@ def task(
         discount: γ in (0, 1].
         terminal: Whether the task ends in each state.
 
-    Returns:
-        The task.
-
     Raises:
         InputError: For a reward that is not finite or has another shape, and for a discount outside (0, 1].
 
@@ -114,9 +111,6 @@ def stack_tasks(tasks: Sequence[Task]) -> Task:
 
     Args:
         tasks: At least one, all in the same world.
-
-    Returns:
-        The tasks.
 
     Raises:
         InputError: For no tasks.
@@ -181,7 +175,7 @@ def state_at(world: Grid | Graph, place: int | tuple[float, float], field: str) 
         field: What it is, for error messages.
 
     Returns:
-        The state.
+        A number from 0 to the number of states less 1.
 
     Raises:
         InputError: For a place that is outside the world or in a known obstacle.

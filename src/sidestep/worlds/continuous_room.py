@@ -45,9 +45,6 @@ class Room(NamedTuple):
 
         Args:
             field: The logit of P(blocked) at each place.
-
-        Returns:
-            The dynamics.
         """
         return sc.ObstacleMotion(field, self.dynamics.low, self.dynamics.high, self.dynamics.noise)
 
@@ -56,9 +53,6 @@ class Room(NamedTuple):
 
         Args:
             places: Positions in meters, of shape (places, 2).
-
-        Returns:
-            A truth value for each place.
         """
         return np.all((places >= WALL_LOW) & (places <= WALL_HIGH), axis=1)
 
@@ -68,9 +62,6 @@ def room(lattice_points: int = 41) -> Room:
 
     Args:
         lattice_points: The number of points, 2 or more.
-
-    Returns:
-        The room.
     """
     walls = sc.Walls(low=jnp.asarray([WALL_LOW]), high=jnp.asarray([WALL_HIGH]))
     low, high = jnp.zeros(2), jnp.full(2, SIDE)
@@ -133,9 +124,6 @@ def without_moves(trajectory: ss.Trajectory, removed: Bool[np.ndarray, " moves"]
     Args:
         trajectory: The trajectory.
         removed: Whether each move is removed.
-
-    Returns:
-        The pieces in order.
     """
     pieces, begin = [], 0
     for end in (*np.flatnonzero(removed), len(removed)):

@@ -41,9 +41,6 @@ class Farm(NamedTuple):
         Args:
             logits: A logit for each terrain and machine, or one for all.
 
-        Returns:
-            The model.
-
         Raises:
             InputError: For maps of different shapes, or without terrain or machines.
         """
@@ -66,9 +63,6 @@ class Farm(NamedTuple):
 
         Args:
             enters: Whether each machine enters each terrain.
-
-        Returns:
-            The model.
         """
         return self.model(np.where(enters, -_CERTAIN_LOGIT, _CERTAIN_LOGIT))
 
@@ -77,8 +71,5 @@ class Farm(NamedTuple):
 
         Args:
             model: A model from `model`.
-
-        Returns:
-            Probabilities of shape (terrains, machines).
         """
         return jax.nn.sigmoid(model.parameters).reshape(-1, self.machines)

@@ -37,9 +37,6 @@ class Gravity(NamedTuple):
         Args:
             logits: A logit for each color and direction, or one for all.
 
-        Returns:
-            The model.
-
         Raises:
             InputError: For a map without colors.
         """
@@ -61,9 +58,6 @@ class Gravity(NamedTuple):
 
         Args:
             rule: The index of the direction of each color.
-
-        Returns:
-            The model.
         """
         return self.model(_CERTAIN_LOGIT * np.eye(4)[np.asarray(rule)])
 

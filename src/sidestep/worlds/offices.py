@@ -31,7 +31,7 @@ def office(rows: int, columns: int, seed: int, connectivity: Connectivity = 4) -
         connectivity: The number of moves, 4 or 8.
 
     Returns:
-        The map.
+        A map of shape (rows, columns) without unknown cells.
 
     Raises:
         InputError: For too few rows or columns.

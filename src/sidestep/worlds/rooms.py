@@ -16,7 +16,7 @@ def rooms_in_a_row(rows: int, columns: int, doors: tuple[int, ...], connectivity
         connectivity: The number of directions, 4 or 8.
 
     Returns:
-        The map.
+        A map of shape (rows, columns) without unknown cells.
 
     Raises:
         InputError: For too few columns or rows, or a door outside its wall.

@@ -42,8 +42,5 @@ class TransitionModel(eqx.Module):
 
         Args:
             parameters: θ, of the same structure.
-
-        Returns:
-            The model.
         """
         return eqx.tree_at(lambda model: model.parameters, self, parameters)

@@ -45,7 +45,7 @@ _MIN_BYTES_TO_TRIM = 2**22
 """The size of the results from which on free memory is given back to the system."""
 
 
-# What crosses the bridge
+# Arguments and results of host functions
 
 
 class HostProcess(NamedTuple):
