@@ -169,9 +169,9 @@ def fit(
     saver = Saver(checkpoint, fingerprint((problem, optimizer.key)) if checkpoint is not None else "")
     best = maximize(objective, optimizer, tolerances=tolerances, saver=saver, report=report, resume=resume)
     learned = model.with_parameters(best.parameters.model), behavior.with_parameters(best.parameters.behavior)
-    solves = _of_all_tasks(best.solves, count)
-    converged = best.status is Status.CONVERGED and bool(np.asarray(solves[-1]).all())
-    return Fit(*learned, best.history, *solves, best.status, converged, best.message)
+    sweeps, residual, task_converged = _of_all_tasks(best.solves, count)
+    converged = best.status is Status.CONVERGED and bool(np.asarray(task_converged).all())
+    return Fit(*learned, best.history, sweeps, residual, task_converged, best.status, converged, best.message)
 
 
 def _of_all_tasks(batches: list[SolveSummary], tasks: int) -> list[Array]:
