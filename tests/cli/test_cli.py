@@ -13,7 +13,9 @@ from sidestep.cli import display
 from sidestep.cli.app import main
 from sidestep.cli.options import present_spelling
 from sidestep.io.maps import write_map
+from sidestep.maps.learned_map import LearnedMap
 from sidestep.tabular.grid import Grid
+from sidestep.tabular.reward import Reward
 
 COMMANDS = ("demo", "reproduce", "learn", "plan", "evaluate", "simulate")
 WALKS = """walk,step,x,y,goal_x,goal_y
@@ -235,3 +237,11 @@ def test_main_with_version_prints_the_version(capsys):
 ])  # fmt: skip
 def test_present_spelling_of_version_0_1_options_returns_those_of_today(old, present):
     assert present_spelling(old.split()) == present.split()
+
+
+def test_evaluate_against_a_map_without_obstacles_says_that_there_is_no_ranking(here, capsys):
+    grid = Grid.unknown(2, 3)
+    LearnedMap(grid, np.full((2, 3), 0.2), np.array([[0, 5]]), Reward()).save(here / "learned")
+    write_map("free.yaml", np.zeros((2, 3)), grid)
+    assert run("evaluate learned --true-map free.yaml") == 0
+    assert "there is no ranking" in " ".join(capsys.readouterr().err.split())

@@ -97,6 +97,14 @@ def test_fit_of_discount_in_a_known_room_recovers_it():
     np.testing.assert_allclose(result.behavior.tasks_of(demos.tasks).discount, 0.9, atol=0.01)
 
 
+def test_fit_with_a_person_for_each_trajectory_instead_of_each_task_is_refused():
+    agent = Behavior(BoltzmannAverage(), 60.0)
+    demos = walks(agent, count=2)
+    behavior = behavior_model(agent, person=np.arange(demos.trajectories))
+    with pytest.raises(InputError, match=r"field 'person': expected the person of each of the \d tasks \(see split_by"):
+        fit(OPEN, demos, behavior)
+
+
 def test_fit_with_persons_pools_their_betas():
     """Two persons have a hundred walks to each goal; the β of a third, with one walk a goal, is drawn to theirs."""
     trajectories = []

@@ -16,7 +16,7 @@ def evaluate(
     bump_cost: BumpCost = BUMP_COST,
 ) -> None:
     """Score a learned map: AUC, average precision, recall, and the legality and length of planned paths."""
-    from sidestep.cli.display import print_scores, stage_progress
+    from sidestep.cli.display import print_notes, print_scores, stage_progress
     from sidestep.evaluation.evaluate import sample_sizes
     from sidestep.io.maps import read_map_like
     from sidestep.maps.learned_map import add_to_summary, load_map
@@ -28,3 +28,5 @@ def evaluate(
     limits = {"planned_at_most": sample_sizes(truth.size)._asdict(), "bump_cost": bump_cost}
     add_to_summary(folder, out or folder, None, {"true_map": str(true_map), **limits, **scores})
     print_scores({str(folder): scores})
+    if scores["auc"] is None:
+        print_notes("note: of the cells to score, the true map has no obstacle or no free one, so there is no ranking")

@@ -183,21 +183,16 @@ def _of_all_tasks(batches: list[SolveSummary], tasks: int) -> list[Array]:
 def _check_problem(problem: Problem, optimizer: Optimizer) -> None:
     terms, tempering, options, behavior = problem.terms, float(problem.tempering), problem.options, problem.behavior
     graph, demos = problem.model.graph, problem.demonstrations
-    known = terms and set(terms) <= set(ALL_TERMS)
-    check(known, f"expected one or both of {ALL_TERMS}, found {terms}", field="terms")
+    check(terms and set(terms) <= set(ALL_TERMS), f"expected one or both of {ALL_TERMS}, found {terms}", field="terms")
     check(0 < tempering <= 1, f"expected a number above 0 and at most 1, found {tempering}", field="tempering")
     has_objective = options.gradient == "exact" or not isinstance(behavior.behavior.backup, BoltzmannAverage)
-    check(
-        has_objective or isinstance(optimizer, Adam),
-        "the fixed-policy gradient of the Boltzmann average is not the gradient of any function, so a line search is "
-        "impossible: expected Adam() as the optimizer, or SolveOptions('exact')",
-        field="gradient",
-    )
-    states, actions = demos.tasks.terminal.shape[-1], int(np.asarray(demos.actions).max())
-    check(
-        states == graph.states and actions < graph.actions,
-        f"expected demonstrations in the model's {graph.states} states with its {graph.actions} actions, found "
-        f"{states} states and actions up to {actions}",
-        field="demonstrations",
-    )
+    message = "the fixed-policy gradient of the Boltzmann average is that of no function: expected Adam(), or 'exact'"
+    check(has_objective or isinstance(optimizer, Adam), message, field="gradient")
+    (tasks, states), actions = demos.tasks.terminal.shape, int(np.asarray(demos.actions).max())
+    message = f"expected the model's {graph.states} states and {graph.actions} actions, found {states} states and "
+    valid = states == graph.states and actions < graph.actions
+    check(valid, f"{message}actions up to {actions}", field="demonstrations")
+    persons = tasks if behavior.person is None else len(behavior.person)
+    message = f"expected the person of each of the {tasks} tasks (see split_by_person), found {persons} persons"
+    check(persons == tasks, message, field="person")
     check_proper(behavior.tasks_of(demos.tasks), behavior.behavior_of(), graph.actions, options.horizon)

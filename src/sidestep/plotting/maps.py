@@ -229,7 +229,7 @@ def figure_fit(
     for axes in (before, after):
         draw_places(axes, (), goals, grid)
     progress.plot(np.arange(len(objective)), objective, color=palette.BLUE, marker="." if len(objective) < 30 else "")
-    progress.set(title="Objective", xlabel="iteration", ylabel="log posterior (nats)")
+    progress.set(title="Objective", xlabel="iteration", ylabel="log posterior + constant (nats)")
     progress.locator_params(axis="x", integer=True)
     progress.ticklabel_format(axis="y", useOffset=False)
     low, high = progress.get_ylim()

@@ -71,7 +71,7 @@ def simulate(
         if not arrived.all():
             raise InputError(
                 f"an agent from state {int(own[np.argmin(arrived)])} had not arrived after {max_moves} moves: "
-                "expected a goal in reach, a larger β, or more moves",
+                "expected a goal in reach, a larger β, a step cost with discount 1 for long ways, or more moves",
                 source=f"task {index}",
             )
         for own_states, own_actions in zip(states[:agents], actions[:agents], strict=True):
