@@ -74,6 +74,7 @@ def test_learn_writes_a_map_and_a_picture(learned):
         assert min(picture.size) > 100
 
 
+@pytest.mark.slow
 def test_learn_reads_walks_from_minari_datasets(office, tmp_path, datasets, capsys):
     write_walks("minari:office/walks-v0", read_walks(office / "walks.csv"))
     options = ("--map", office / "half.yaml", "--out", tmp_path, "--terms", "transitions")
@@ -190,6 +191,7 @@ def test_sample_walks_and_simulate_walks_repeat_by_seed():
     assert one == same != other
 
 
+@pytest.mark.slow
 def test_learn_resumes_after_an_interruption(office, learned, tmp_path, monkeypatch, capsys):
     command = ("learn", office / "walks.csv", "--map", office / "half.yaml", "--out", tmp_path)
     iterations = []

@@ -91,6 +91,7 @@ def around(dynamics, state, action):
 # What holds for every family
 
 
+@pytest.mark.slow
 @gaussian
 def test_log_prob_integrates_to_one_and_samples_have_its_moments(name):
     """Sums over a lattice as wide as the noise are exact to 1e-7 for Gaussians."""

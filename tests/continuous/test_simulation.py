@@ -43,6 +43,7 @@ def walks():
     return simulate(ROOM, SHARP, tasks=2)
 
 
+@pytest.mark.slow
 def test_simulate_trajectories_start_as_asked_and_arrive(walks):
     assert [walk.task for walk in walks] == [0] * COUNT + [1] * COUNT
     np.testing.assert_array_equal([walk.states[0] for walk in walks], np.concatenate(STARTS))

@@ -68,6 +68,7 @@ def relevant_by_force(truth, visited, goals):
     return relevant.reshape(truth.shape)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("connectivity", [4, 8])
 @pytest.mark.parametrize("obstacles", [0.15, 0.35, 0.6])
 def test_relevant_obstacles_on_random_maps_equal_those_by_force(connectivity, obstacles):

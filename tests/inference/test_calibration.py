@@ -31,6 +31,7 @@ def demonstrations():
     return gather(simulate(jax.random.key(0), WORLD, [TASK], [starts], BEHAVIOR), [TASK])
 
 
+@pytest.mark.slow
 def test_score_statistics_equal_central_differences_by_log_beta(demonstrations):
     statistics = score_statistics(WORLD, demonstrations, BEHAVIOR)
     q = plan(WORLD, TASK, BEHAVIOR).solution.action_values[demonstrations.states]

@@ -68,6 +68,7 @@ def test_weighted_demonstrations_count_as_copies():
         assert float(getattr(weighted, term)) == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_fit_goals_learns_goals_and_the_wall_from_truncated_paths():
     seen = trajectories(cut=1)
     result = fit_goals(

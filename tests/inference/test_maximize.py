@@ -108,6 +108,7 @@ def test_fit_in_32_bits_advises_64_bits():
     assert "jax.config.update('jax_enable_x64', True)" in result.message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("backup", "optimizer", "status", "advice"), [
     (BoltzmannAverage(), LBFGS(), Status.CONVERGED, ""),
     (BoltzmannAverage(), Adam(max_iterations=3), Status.MAX_ITERATIONS, "a larger max_iterations"),

@@ -73,6 +73,7 @@ def directly(problem, parameters):
     return np.array(parts), np.asarray(gradient)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "memory"), [
     ("jacobi", MEMORY),
     ("jacobi", 46 * ONE_TASK),
@@ -269,6 +270,7 @@ def test_objective_of_transitions_alone_has_no_batches():
     assert result.objective == result.transitions + result.prior
 
 
+@pytest.mark.slow
 def test_evaluate_in_32_bits_stays_in_32_bits():
     model = ObstacleGrid(BLANK, jnp.full(STATES, -2.0, jnp.float32))
     objective = Objective(problem_of(model=model))

@@ -40,6 +40,7 @@ def interrupted_at(iteration):
     return report
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "settings"), [*((name, {}) for name in OPTIMIZERS), ("Rprop", LARGE)])
 def test_fit_resumed_equals_fit_uninterrupted(checkpoint, name, settings):
     expected = fit_with(name, **settings)

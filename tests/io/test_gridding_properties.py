@@ -3,6 +3,7 @@
 from itertools import pairwise
 
 import numpy as np
+import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
@@ -135,6 +136,7 @@ def test_grid_walks_8_connected_only_leaves_out_cells(line):
     assert len(full.states) <= 2 * len(fewer.states)
 
 
+@pytest.mark.slow
 def test_grid_walks_of_a_million_positions_takes_seconds():
     noise = np.random.default_rng(0).normal(0, 0.3, (1_000_000, 2))
     line = np.abs((np.cumsum(noise, axis=0) + 500) % 2000 - 1000)

@@ -116,6 +116,7 @@ def test_read_map_of_a_wrong_value_names_it(tmp_path, key, value, expected):
         read_map(make_map(tmp_path, gray(0), **{key: value}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -66,6 +66,7 @@ def pursuits(states, actions, tasks, walks, seed):
     return complete(states, actions), gather(walked, wanted)
 
 
+@pytest.mark.slow
 @given(sizes)
 def test_write_demonstrations_is_read_back_bit_by_bit(size):
     world, demonstrations = pursuits(*size)
@@ -74,6 +75,7 @@ def test_write_demonstrations_is_read_back_bit_by_bit(size):
     assert eqx.tree_equal(read_demonstrations(dataset, world), demonstrations)
 
 
+@pytest.mark.slow
 @given(sizes)
 def test_write_demonstrations_returns_are_those_of_the_tasks(size):
     """Σ γ^t r_t of an episode: R of every move, and the final reward one move after the last."""
@@ -174,6 +176,7 @@ def test_read_demonstrations_of_collected_episodes_keeps_rewards():
     assert told["goal"] == 15  # the present, though holes end the task too
 
 
+@pytest.mark.slow
 def test_read_demonstrations_maps_separate_ends():
     name = max(name for name in gymnasium.registry if name.startswith("Taxi-"))
     env = gymnasium.make(name)

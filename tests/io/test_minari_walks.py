@@ -24,6 +24,7 @@ MAZE = Dict({"observation": Box(-np.inf, np.inf, (4,)), "achieved_goal": PLANE, 
 LINE = np.array([[0.5, 0.5], [1.5, 0.5], [1.5, 1.5]])
 
 
+@pytest.mark.slow
 @given(walk_tables())
 def test_write_walks_to_minari_is_read_back(table):
     walks, dataset = walks_from_table(table), "minari:" + fresh("ours/walks")

@@ -88,6 +88,7 @@ def length_by_new_plans(model, truth, goal, start, reward):
     return length
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reward", REWARDS)
 @pytest.mark.parametrize("connectivity", [4, 8])
 def test_replanning_lengths_on_random_maps_equal_those_of_new_plans(reward, connectivity):

@@ -34,6 +34,7 @@ def test_backup_of_two_values_equals_the_values_by_hand(name):
     np.testing.assert_allclose(BACKUPS[name].fixed_policy_weights(q, beta), policy, rtol=1e-12)
 
 
+@pytest.mark.slow
 @each_backup
 @given(seed=st.integers(0, 2**32 - 1))
 def test_weights_of_random_values_are_the_gradient_and_sum_to_one(name, seed):

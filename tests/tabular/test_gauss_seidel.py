@@ -46,6 +46,7 @@ def agent(name, beta=5.0):
 # Starts
 
 
+@pytest.mark.slow
 @each_backup
 def test_solve_from_any_start_gives_the_same(name):
     """Starts: a model nearby, a wrong order, meaningless values, a failed solve, the solution."""
@@ -76,6 +77,7 @@ def test_solve_from_any_start_gives_the_same(name):
     assert again.sweeps <= 2
 
 
+@pytest.mark.slow
 @each_backup
 @pytest.mark.parametrize("first", ["none", "all", "few"])
 def test_solve_adjoint_from_any_start_solves_its_equation(name, first):
@@ -120,6 +122,7 @@ def test_solve_gradient_after_an_earlier_adjoint_leaves_no_traces_of_it():
 # Which states
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [SOLVER, Jacobi(tolerance=1e-11)], ids=["GaussSeidel", "Jacobi"])
 def test_solve_visited_outside_the_states_are_clipped(solver):
     model, wanted = some_map(), reach(Grid.unknown(20, 21), 5, discount=0.99)

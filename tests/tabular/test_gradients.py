@@ -33,6 +33,8 @@ from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.solve import SolveOptions, solve
 from sidestep.tabular.tasks import Task, reach
 
+pytestmark = pytest.mark.slow
+
 BETA = 4.0
 EVERY = PROBLEMS | FAMILIES
 CLOSE = 1e-6

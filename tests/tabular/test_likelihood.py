@@ -147,6 +147,7 @@ def test_solve_of_other_parameters_and_goals_compiles_once():
     assert not again
 
 
+@pytest.mark.slow
 def test_likelihoods_of_persons_with_any_number_of_moves_compile_once():
     """Ten persons with 1 to 41 moves towards one to five goals."""
     grid = Grid.unknown(2, 7)

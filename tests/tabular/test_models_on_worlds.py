@@ -135,6 +135,7 @@ def test_fit_of_the_farm_to_actions_of_ten_demonstrations_a_goal_recovers_what_m
 # Walls between cells, and roads
 
 
+@pytest.mark.slow
 def test_fit_of_walls_between_cells_recovers_the_wall():
     """A room of five by six; the wall runs between its third and fourth column but for the last row."""
     grid = ObstacleGrid(Grid.unknown(5, 6))
@@ -163,6 +164,7 @@ def test_walled_grid_of_known_cells_blocks_occupied_ones():
         walled_grid(Grid(known, connectivity=8))
 
 
+@pytest.mark.slow
 def test_fit_of_a_road_network_recovers_the_closed_link():
     """A ring of eight links in both directions; link 3 is closed, so trips go around it."""
     forth = [[link, (link + 1) % 8] for link in range(8)]

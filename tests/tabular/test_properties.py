@@ -41,6 +41,7 @@ def test_solve_with_more_blocked_cells_lowers_values(seed, connectivity, form):
     assert (after <= before + 1e-8 * np.abs(before)).all()
 
 
+@pytest.mark.slow
 @each_backup
 @given(seed=seeds, connectivity=connectivities, form=forms)
 def test_solve_of_a_mirrored_map_mirrors_values(name, seed, connectivity, form):
@@ -54,6 +55,7 @@ def test_solve_of_a_mirrored_map_mirrors_values(name, seed, connectivity, form):
     np.testing.assert_allclose(up_down[::-1], values, rtol=1e-7)
 
 
+@pytest.mark.slow
 @each_backup
 @given(seed=seeds)
 def test_solve_of_renumbered_states_renumbers_values(name, seed):

@@ -168,6 +168,7 @@ def test_solve_with_a_horizon_equals_the_best_action_sequence():
 # Hard cases
 
 
+@pytest.mark.slow
 @each_backup
 @pytest.mark.parametrize("beta", [10.0, 1e3, 1e4])
 @pytest.mark.parametrize(("spread", "gamma", "cost"), [(3.0, 0.95, None), (3.0, 1.0, 1.0), (40.0, 0.95, None)])
@@ -186,6 +187,7 @@ def test_solve_extreme_logits_and_beta_is_finite_and_solves_the_bellman_equation
 WALLS = np.array([[0, 0, 0, 1, 0], [1, 1, 0, 1, 0], [0, 0, 0, 1, 0], [0, 1, 1, 1, 0], [0, 0, 0, 0, 0]])
 
 
+@pytest.mark.slow
 @each_backup
 @pytest.mark.parametrize("beta", [1e3, 1e4])
 def test_solve_walls_of_logit_40_equals_shortest_paths(name, beta):
@@ -237,6 +239,7 @@ def test_solve_nearly_blocked_grid_takes_few_sweeps(name, theta):
     assert solution.sweeps <= 40
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [Jacobi(max_sweeps=3), None], ids=["stopped", "ample"])
 def test_log_likelihood_without_convergence_is_nan(solver):
     """The likelihood and its gradient are NaN; with sweeps enough they are not."""
@@ -334,6 +337,7 @@ def test_solve_with_horizon_0_raises():
 # Any model
 
 
+@pytest.mark.slow
 @each_backup
 @given(seed=st.integers(0, 2**32 - 1), cost=st.booleans(), kind=st.sampled_from([4, 8, "tabular"]))
 def test_solve_random_problems_solves_the_bellman_equation(name, seed, cost, kind):
@@ -354,6 +358,7 @@ def test_solve_random_problems_solves_the_bellman_equation(name, seed, cost, kin
     assert residual(name, solution, wanted, beta) < 1e-8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dtype", "close"), [("float64", 1e-6), ("float32", 1e-3)])
 def test_solve_with_jacobi_of_oscillating_values_converges(dtype, close):
     """Among nearly closed cells full Jacobi steps oscillate for ever, and the adjoint's diverge."""
@@ -374,6 +379,7 @@ def test_solve_with_jacobi_of_oscillating_values_converges(dtype, close):
     np.testing.assert_allclose(slope, slope_expected, rtol=close, atol=close * jnp.abs(slope_expected).max())
 
 
+@pytest.mark.slow
 def test_solve_with_jacobi_of_a_long_path_takes_few_more_sweeps_than_steps():
     """The goal's value spreads one step a sweep; a residual that stays must not restart the solve."""
     grid = Grid.unknown(3, 1_500)

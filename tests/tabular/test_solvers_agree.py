@@ -19,6 +19,8 @@ from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import Task, reach, stack_tasks
 from sidestep.worlds.offices import office
 
+pytestmark = pytest.mark.slow
+
 SOLVERS = (Jacobi(), GaussSeidel())
 each_backup = pytest.mark.parametrize("name", BACKUPS)
 

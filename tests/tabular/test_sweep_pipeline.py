@@ -78,6 +78,7 @@ def test_pipeline_narrow_band_overlaps_the_sweeps():
     assert [end for number, end in log if number == 2] == list(range(9, 100, 10))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "fraction"), [(BOLTZMANN, 1.0), (LOG_SUM_EXP, 0.3)])
 def test_sweep_loop_pipelined_equals_waiting(kind, fraction):
     """With a bandwidth of all states, the second sweep waits for the end of the first."""
@@ -106,6 +107,7 @@ def half_learned(plan, random):
     return ObstacleGrid(Grid.unknown(*plan.shape), jnp.asarray(logits))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backup", [BoltzmannAverage(), LogSumExp()], ids=["Boltzmann", "log-sum-exp"])
 def test_solve_batch_equals_each_task_alone(backup):
     """Values, and the gradient from an earlier adjoint: alone a task uses all cores, in a batch one."""

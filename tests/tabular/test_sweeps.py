@@ -86,6 +86,7 @@ def differentiate_all(backup, exact, q):
     return weights, policy, by_beta
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @each_backup
 def test_backup_kernels_equal_the_backups(name, dtype):
