@@ -7,8 +7,7 @@ Compiled code is kept from run to run, in the folder that the environment variab
 import os
 from pathlib import Path
 
-# The suite compiles hundreds of functions and runs each for milliseconds: without optimization they compile four times
-# as fast.
+# The suite compiles hundreds of functions and runs each for milliseconds: without optimization they compile sooner.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
 
 import jax

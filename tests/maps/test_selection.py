@@ -19,7 +19,7 @@ from sidestep.tabular.reward import Reward
 from sidestep.worlds.walks import simulate_walks
 
 SHORT = FitConfig(max_iterations=10)
-"""Ten iterations take a map close enough to compare rewards; a test takes a tenth of the time."""
+"""Ten iterations take a map close enough to compare rewards."""
 WIDER = replace(BLANK, known=np.full((5, 8), Cell.UNKNOWN))
 """The office, and three more columns to the right."""
 

@@ -186,7 +186,7 @@ def _check_problem(problem: Problem, optimizer: Optimizer) -> None:
     check(terms and set(terms) <= set(ALL_TERMS), f"expected one or both of {ALL_TERMS}, found {terms}", field="terms")
     check(0 < tempering <= 1, f"expected a number above 0 and at most 1, found {tempering}", field="tempering")
     has_objective = options.gradient == "exact" or not isinstance(behavior.behavior.backup, BoltzmannAverage)
-    message = "the fixed-policy gradient of the Boltzmann average is that of no function: expected Adam(), or 'exact'"
+    message = "the fixed-policy gradient of the Boltzmann average belongs to no objective: expected Adam(), or 'exact'"
     check(has_objective or isinstance(optimizer, Adam), message, field="gradient")
     (tasks, states), actions = demos.tasks.terminal.shape, int(np.asarray(demos.actions).max())
     message = f"expected the model's {graph.states} states and {graph.actions} actions, found {states} states and "
