@@ -7,8 +7,13 @@ Compiled code is kept from run to run, in the folder that the environment variab
 import os
 from pathlib import Path
 
-# The suite compiles hundreds of functions and runs each for milliseconds: without optimization they compile sooner.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+# The suite compiles thousands of functions and runs each for milliseconds: without optimization, and by one thread in
+# each process, they compile sooner.
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
+    "--xla_cpu_parallel_codegen_split_count=1 --xla_cpu_multi_thread_eigen=false",
+)
 
 import jax
 import pytest
