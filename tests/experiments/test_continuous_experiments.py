@@ -12,12 +12,9 @@ from sidestep.experiments import pendulum, representations, room
 from sidestep.worlds import continuous_room
 from sidestep.worlds.continuous_room import without_moves
 
-QUICK = {
-    "planner": sc.Planner(horizon=3, batch_size=4, samples=2, critic_width=4),
-    "schedule": sc.Schedule(iterations=2, policy_warmup=0, batch_size=4),
-    "agents_per_goal": 1,
-    "width": 4,
-}
+PLANNER = sc.Planner(horizon=3, batch_size=4, samples=2, critic_width=4)
+SCHEDULE = sc.Schedule(iterations=2, policy_warmup=0, batch_size=4)
+QUICK = {"planner": PLANNER, "schedule": SCHEDULE, "agents_per_goal": 1, "width": 4}
 ROOM = representations.RepresentationsConfig(**QUICK, lattice_points=21, grid_optimizer=ss.LBFGS(max_iterations=1))
 PENDULUM = pendulum.PendulumConfig(**QUICK, moves=5, lattice_points=(24, 21))
 
@@ -53,7 +50,7 @@ def test_experiment_command_unknown_name_is_wrong_usage(capsys):
 
 @pytest.mark.slow
 def test_demonstrations_never_aim_at_the_wall():
-    world = continuous_room.room()
+    world = continuous_room.room(ROOM.lattice_points)
     demonstrations, _ = ROOM.demonstrations(world, seed=3)
     targets = demonstrations.states + world.actions[demonstrations.actions]
     assert not world.inside(np.asarray(targets)).any()

@@ -117,8 +117,7 @@ def pathwise_surrogate(agent: Agent, rollouts: Rollout, critic: Critic | None = 
     q = q_estimates(rollouts)
     if agent.policy.reparameterized:
         return q[..., 0]
-    beyond = q - rollouts.action_baselines(critic)
-    credit = jax.lax.stop_gradient(rollouts.discount_powers(rollouts.acting.shape[-1]) * beyond)
+    credit = jax.lax.stop_gradient(rollouts.discount_powers(q.shape[-1]) * (q - rollouts.action_baselines(critic)))
     scores = jnp.where(rollouts.acting, rollouts.policy_log_probs(agent.policy) * credit, 0.0)
     return q[..., 0] + scores[..., 1:].sum(axis=-1)
 

@@ -160,8 +160,8 @@ def problem_fingerprint(problem: Tree) -> str:
 def _initialize(problem: FitProblem, key: PRNGKeyArray) -> _State:
     demos, parameters = problem.demonstrations, problem.agent.dynamics.parameters
     planner_state = problem.planner.initialize(key, problem.agent, task_at(demos.tasks, demos.task), demos.states)
-    flat = ravel_pytree(parameters)[0]
-    sums = jnp.zeros((2, len(flat)), flat.dtype)
+    flat = jax.eval_shape(lambda: ravel_pytree(parameters)[0])
+    sums = jax.device_put(np.zeros((2, *flat.shape), flat.dtype))
     return _State(parameters, problem.schedule.adam().init(parameters), planner_state, sums)
 
 
@@ -177,8 +177,7 @@ def _step(problem: FitProblem, state: _State, key: PRNGKeyArray, iteration: Arra
     step, moments = schedule.adam().update(slope, state.moments)
     parameters = optax.apply_updates(state.parameters, step)
     begin, middle, end = _last_quarter(schedule)
-    after = jnp.stack([iteration >= begin, iteration >= middle])
-    within = after & jnp.stack([iteration < middle, iteration < end])
+    within = jnp.stack([(begin <= iteration) & (iteration < middle), (middle <= iteration) & (iteration < end)])
     sums = state.sums + within[:, None] * ravel_pytree(parameters)[0]
     return _State(parameters, moments, planner_state, sums), numbers
 
@@ -191,17 +190,22 @@ def _last_quarter(schedule: Schedule) -> tuple[int, int, int]:
 
 def _result(problem: FitProblem, state: _State, history: list[FitProgress]) -> ContinuousFit:
     schedule = problem.schedule
-    begin, middle, end = _last_quarter(schedule)
-    flat, to_parameters = ravel_pytree(problem.agent.dynamics.parameters)
-    former, latter = state.sums / jnp.asarray([[middle - begin], [end - middle]], flat.dtype)
-    distance = jnp.cumsum(schedule.rate()(jnp.arange(end)))
-    possible = distance[middle:end].mean() - distance[begin:middle].mean()
-    drift = float(jnp.abs(latter - former).max() / possible)
-    gap = float(np.mean([progress.policy_gap for progress in history[begin:]]))
-    converged = drift <= schedule.drift_tolerance and abs(gap) <= schedule.policy_gap_tolerance
+    learned, drift = _mean_and_drift(schedule, problem.agent.dynamics, state)
+    gap = float(np.mean([progress.policy_gap for progress in history[_last_quarter(schedule)[0] :]]))
+    converged = bool(drift <= schedule.drift_tolerance) and abs(gap) <= schedule.policy_gap_tolerance
     message = (
         f"over the last quarter parameters drifted by up to {drift:.2g} of what their steps allow (tolerance "
         f"{schedule.drift_tolerance:g}), and the policy gap was {gap:.2g} (tolerance {schedule.policy_gap_tolerance:g})"
     )
-    learned = problem.agent.dynamics.with_parameters(to_parameters((former + latter) / 2))
-    return ContinuousFit(learned, state.planner_state, tuple(history), drift, gap, converged, message)
+    return ContinuousFit(learned, state.planner_state, tuple(history), float(drift), gap, converged, message)
+
+
+@eqx.filter_jit
+def _mean_and_drift(schedule: Schedule, dynamics: Dynamics, state: _State) -> tuple[Dynamics, Array]:
+    """Return the dynamics at the mean of θ over the last quarter of the iterations, and the drift of θ."""
+    begin, middle, end = _last_quarter(schedule)
+    flat, to_parameters = ravel_pytree(state.parameters)
+    former, latter = state.sums / jnp.asarray([[middle - begin], [end - middle]], flat.dtype)
+    distance = jnp.cumsum(schedule.rate()(jnp.arange(end)))
+    possible = distance[middle:end].mean() - distance[begin:middle].mean()
+    return dynamics.with_parameters(to_parameters((former + latter) / 2)), jnp.abs(latter - former).max() / possible

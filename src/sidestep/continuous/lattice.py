@@ -124,6 +124,7 @@ class LatticePlanner(eqx.Module):
     behavior: Behavior
     lattice: Lattice
 
+    @eqx.filter_jit
     def tabular_model(self) -> TabularModel:
         """Return the transition model of the lattice over the world."""
 
@@ -138,6 +139,7 @@ class LatticePlanner(eqx.Module):
         logits = jnp.log(jnp.where(possible, probabilities, 1.0))
         return TabularModel(Graph(successors, jnp.ones((1, 1))), logits, possible)
 
+    @eqx.filter_jit
     def tabular_task(self, task: ContinuousTask) -> Task:
         """Return a continuous task on the points of the lattice.
 

@@ -130,13 +130,12 @@ class FitProblem(eqx.Module):
         known = isinstance(agent.policy, FinitePolicy) or isinstance(agent.behavior.backup, LogSumExp)
         check(known, message, field="behavior")
         check_finite(demos.next_states, field="next_states")
-        moves = demos.states, jax.vmap(agent.policy.action)(demos.actions), demos.next_states
-        _check_shapes(agent.dynamics, *(part[0] for part in moves[:2]))
-        densities = np.asarray(jax.vmap(agent.dynamics.log_prob)(*moves))
+        _check_shapes(agent.dynamics, *jax.eval_shape(lambda: (demos.states[0], agent.policy.action(demos.actions[0]))))
+        densities = np.asarray(_log_densities(agent.dynamics, agent.policy, demos, np.arange(len(demos))))
         wrong = np.isnan(densities) | ((densities == -np.inf) & ("transitions" in self.terms))
-        move = int(wrong.argmax())
+        move, which = int(wrong.argmax()), np.asarray(demos.trajectory)
         message = f"expected a density above 0 for every transition, found the logarithm {densities[move]}"
-        check(not wrong.any(), message, source=f"trajectory {int(demos.trajectory[move]) + 1}", field="log_prob")
+        check(not wrong.any(), message, source=f"trajectory {which[move] + 1}", field="log_prob")
 
     def improve_policy(self, parameters: Tree, state: PlannerState[Any], key: PRNGKeyArray) -> PlannerState[Any]:
         """Make a step of the policy and its critic by rollouts from a batch of moves; the model stays the same.
@@ -192,9 +191,7 @@ class FitProblem(eqx.Module):
             dynamics, prior = agent.dynamics.with_parameters(parameters), self.prior.log_density(parameters)
             transitions = jnp.zeros_like(prior)
             if "transitions" in self.terms:
-                actions = jax.vmap(agent.policy.action)(demos.actions[moves])
-                log_probs = jax.vmap(dynamics.log_prob)(demos.states[moves], actions, demos.next_states[moves])
-                transitions = len(demos) / len(moves) * log_probs.sum()
+                transitions = len(demos) / len(moves) * _log_densities(dynamics, agent.policy, demos, moves).sum()
             return -(transitions + prior), (transitions, prior)
 
         slope, (transitions, prior) = jax.grad(loss, has_aux=True)(parameters)
@@ -223,6 +220,13 @@ class FitProblem(eqx.Module):
         q, scale = q_estimates(rollouts)[..., 0].mean(axis=-1), len(demos) / len(moves)
         slope = jax.tree.map(lambda leaf: -scale * leaf, gradient)
         return improved, slope, scale * likelihood.log_probs(q).sum(), progress
+
+
+@eqx.filter_jit
+def _log_densities(dynamics: Dynamics, policy: Policy, demos: Demonstrations, moves: Array | np.ndarray) -> Array:
+    """Return the logarithm of the density of the transition of each of some moves."""
+    actions = jax.vmap(policy.action)(demos.actions[moves])
+    return jax.vmap(dynamics.log_prob)(demos.states[moves], actions, demos.next_states[moves])
 
 
 class _ActionLikelihood(NamedTuple):
@@ -284,7 +288,7 @@ def _check_choices(demos: Demonstrations, policy: Policy) -> None:
         check(choices.shape[1:] == policy.log_spread.shape, message, field="actions")
 
 
-def _check_shapes(dynamics: Dynamics, state: Array, action: Array) -> None:
+def _check_shapes(dynamics: Dynamics, state: jax.ShapeDtypeStruct, action: jax.ShapeDtypeStruct) -> None:
     """Refuse states or actions of shapes that the dynamics cannot take."""
     expected = f"expected states and actions that the dynamics can take, found shapes {state.shape} and {action.shape}"
     try:

@@ -92,8 +92,7 @@ def radial_field(low: Vector, high: Vector, counts: Sequence[int], logit: float 
     axes = [np.linspace(*ends) for ends in zip(np.asarray(low), np.asarray(high), counts, strict=True)]
     centers = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(counts))
     spacing = max(float(axis[1] - axis[0]) for axis in axes)
-    parameters = jnp.full(len(centers), logit, jnp.result_type(float))
-    return RadialField(parameters, jnp.asarray(centers), width=0.7 * spacing)
+    return RadialField(jnp.full(len(centers), logit, jnp.result_type(float)), jnp.asarray(centers), width=0.7 * spacing)
 
 
 class NetworkField(Field):
@@ -147,7 +146,7 @@ def network_field(
         [0.25, 0.25]
     """
     check_corners(low, high)
-    network = eqx.nn.MLP(len(low), "scalar", width, depth, jnp.tanh, key=key)
+    network = eqx.filter_jit(eqx.nn.MLP)(len(low), "scalar", width, depth, jnp.tanh, key=key)
     parameters, structure = eqx.partition(network, eqx.is_inexact_array)
     return NetworkField(parameters, (low + high) / 2, (high - low) / 4, logit, structure)
 
@@ -240,5 +239,5 @@ class ObstacleMotion(GaussianDynamics):
         logit = self.field.logit(target)
         if not self.stops:
             return Outcomes.single(state + jax.nn.sigmoid(-logit) * (target - state))
-        log_probabilities = jnp.stack([jax.nn.log_sigmoid(-logit), jax.nn.log_sigmoid(logit)])
-        return Outcomes(log_probabilities, jnp.stack([target, state]))
+        log_probabilities = jax.nn.log_sigmoid(-logit), jax.nn.log_sigmoid(logit)
+        return Outcomes(jnp.stack(log_probabilities), jnp.stack([target, state]))

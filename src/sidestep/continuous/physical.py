@@ -96,8 +96,7 @@ class Pendulum(GaussianDynamics):
         """
         gravity, mass, length = (self.constant(name) for name in PENDULUM_CONSTANTS)
         angle, speed = state
-        torque = jnp.clip(action[0], -2, 2)
-        acceleration = 3 * gravity / (2 * length) * jnp.sin(angle) + 3 / (mass * length**2) * torque
+        acceleration = 3 * gravity / (2 * length) * jnp.sin(angle) + 3 / (mass * length**2) * jnp.clip(action[0], -2, 2)
         speed = jnp.clip(speed + acceleration * self.time_step, -8, 8)
         return Outcomes.single(jnp.stack([angle + speed * self.time_step, speed]))
 

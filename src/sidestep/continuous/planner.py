@@ -43,8 +43,6 @@ from sidestep.continuous.tasks import ContinuousTask, States, check_tasks, has_e
 from sidestep.errors import NotConverged, check, check_count, check_positive
 from sidestep.tabular.backups import Behavior, HardMax
 
-_sample = eqx.filter_jit(sample_rollouts)
-
 
 class PlanProgress(NamedTuple):
     """Figures of a policy, estimated from one batch of rollouts.
@@ -134,19 +132,11 @@ class Planner(eqx.Module):
         Raises:
             InputError: For no start where a task goes on.
         """
-        start_key, rollout_key, choice_key, critic_key = jax.random.split(key, 4)
-        count, policy = len(states), agent.policy
-        batch = jax.random.choice(start_key, count, (min(count, 8 * self.batch_size),), replace=False)
-        tasks, states = task_at(tasks, batch), states[batch]
-        choices, _ = self.candidate_actions(choice_key, policy, tasks, states)
-        rollouts = _sample(agent, Starts(tasks, states, choices), rollout_key, self.horizon, self.samples)
-        acting = np.asarray(rollouts.acting)
+        critic_key, *moves = _first_moves(self, agent, tasks, states, key)
+        acting, *examples = map(np.asarray, moves)
         check(acting.any(), "expected starts where a task has not ended", field="states")
-        examples = rollouts.features(), rollouts.fraction_left, returns_to_go(rollouts)[..., :-1]
-        critic = make_critic(critic_key, *(leaf[acting] for leaf in examples), width=self.critic_width)
-        optimizers = (policy, optax.adam(self.learning_rate)), (critic, optax.adam(self.critic_rate))
-        moments = (adam.init(eqx.filter(module, eqx.is_inexact_array)) for module, adam in optimizers)
-        return PlannerState(policy, critic, *moments)
+        critic = make_critic(critic_key, *(jax.device_put(leaf[acting]) for leaf in examples), width=self.critic_width)
+        return PlannerState(agent.policy, critic, *_fresh_moments(self, agent.policy, critic))
 
     def candidate_actions(
         self, key: PRNGKeyArray, policy: Policy, tasks: ContinuousTask, states: States
@@ -297,6 +287,25 @@ def plan_policy(
 
 
 @eqx.filter_jit
+def _first_moves(planner: Planner, agent: Agent, tasks: ContinuousTask, states: States, key: PRNGKeyArray) -> tuple:
+    """Return a key for the critic, whether each move of some first rollouts counts, and what the critic is made of."""
+    start_key, rollout_key, choice_key, critic_key = jax.random.split(key, 4)
+    batch = jax.random.choice(start_key, len(states), (min(len(states), 8 * planner.batch_size),), replace=False)
+    tasks, states = task_at(tasks, batch), states[batch]
+    choices, _ = planner.candidate_actions(choice_key, agent.policy, tasks, states)
+    rollouts = sample_rollouts(agent, Starts(tasks, states, choices), rollout_key, planner.horizon, planner.samples)
+    examples = rollouts.features(), rollouts.fraction_left, returns_to_go(rollouts)[..., :-1]
+    return critic_key, rollouts.acting, *examples
+
+
+@eqx.filter_jit
+def _fresh_moments(planner: Planner, policy: Policy, critic: Critic) -> tuple[Tree, Tree]:
+    """Return the states of both optimizers before their first step."""
+    rates = (policy, planner.learning_rate), (critic, planner.critic_rate)
+    return tuple(optax.adam(rate).init(eqx.filter(module, eqx.is_inexact_array)) for module, rate in rates)
+
+
+@eqx.filter_jit
 def _plan_step(
     planner: Planner, agent: Agent, tasks: ContinuousTask, states: States, state: PlannerState, key: PRNGKeyArray
 ) -> tuple[PlannerState, PlanProgress]:
@@ -306,8 +315,7 @@ def _plan_step(
     tasks, states = task_at(tasks, batch), states[batch]
     choices, probabilities = planner.candidate_actions(choice_key, agent.policy, tasks, states)
     rollouts = sample_rollouts(agent, Starts(tasks, states, choices), rollout_key, planner.horizon, planner.samples)
-    rollouts = with_control_variates(agent, rollouts, state.critic)
-    return planner.update(state, agent.behavior, rollouts, probabilities)
+    return planner.update(state, agent.behavior, with_control_variates(agent, rollouts, state.critic), probabilities)
 
 
 def policy_gradient(policy: Policy, critic: Critic, rollouts: Rollout, probabilities: PerCandidate) -> Tree:
@@ -327,8 +335,7 @@ def policy_gradient(policy: Policy, critic: Critic, rollouts: Rollout, probabili
     """
     beyond = q_estimates(rollouts) - rollouts.action_baselines(critic)
     # all candidates of the first move were tried, whatever their probability
-    first = (probabilities * probabilities.shape[1])[..., None, None]
-    first = jnp.broadcast_to(first, (*rollouts.acting.shape[:-1], 1))
+    first = jnp.broadcast_to((probabilities * probabilities.shape[1])[..., None, None], beyond[..., :1].shape)
     counts = jnp.concatenate([first, jnp.ones_like(beyond[..., 1:])], axis=-1)
     powers = rollouts.discount_powers(beyond.shape[-1])
     credit = jax.lax.stop_gradient(jnp.where(rollouts.acting, counts * powers * beyond, 0.0))
@@ -359,8 +366,7 @@ def fit_critic(
     """
     if rollouts.acting.shape[-1] == 1:
         return critic, moments
-    returns = returns_to_go(rollouts)[..., :-1]
-    moves = rollouts.features(), rollouts.fraction_left, returns, rollouts.acting
+    moves = rollouts.features(), rollouts.fraction_left, returns_to_go(rollouts)[..., :-1], rollouts.acting
     batches = jax.tree.map(lambda leaf: minibatches(leaf[:, :, :, 1:], steps), moves)
     learned, fixed = eqx.partition(critic, eqx.is_inexact_array)
 
@@ -446,6 +452,6 @@ def check_starts(states: States, task: Int[Array, " starts"], tasks: ContinuousT
     check(0 < len(states) == len(task), message, field="states")
     finite = np.isfinite(states).reshape(len(states), -1).all(axis=1)
     check(finite.all(), "expected finite numbers", source="states", row=int(finite.argmin()) + 1)
-    check(((task >= 0) & (task < count)).all(), f"expected tasks in 0…{count - 1}", field="task")
-    ended, message = has_ended(tasks, task, states), "expected starts where a task has not ended"
+    check(np.isin(task, np.arange(count)).all(), f"expected tasks in 0…{count - 1}", field="task")
+    ended, message = np.asarray(has_ended(tasks, task, states)), "expected starts where a task has not ended"
     check(not ended.any(), message, source="states", row=int(ended.argmax()) + 1)

@@ -58,11 +58,15 @@ def scaled_network(key: PRNGKeyArray, examples: Examples, outputs: int, width: i
     """
     valid = len(examples) > 0 and np.isfinite(examples).all()
     check(valid, "expected one or more rows of finite numbers", field="examples")
-    network = eqx.nn.MLP(examples.shape[-1], outputs, width, depth, jnp.tanh, key=key)
-    last = network.layers[-1]
-    network = eqx.tree_at(lambda net: net.layers[-1], network, jax.tree.map(lambda leaf: 0.01 * leaf, last))
-    spread = examples.std(axis=0)
-    return ScaledNetwork(network, examples.mean(axis=0), jnp.where(spread > 1e-6, spread, 1.0))
+    network = eqx.filter_jit(eqx.nn.MLP)(examples.shape[-1], outputs, width, depth, jnp.tanh, key=key)
+    last = jax.tree.map(lambda leaf: jax.device_put(0.01 * np.asarray(leaf)), network.layers[-1])
+    return ScaledNetwork(eqx.tree_at(lambda net: net.layers[-1], network, last), *_center_and_scale(examples, 1e-6))
+
+
+def _center_and_scale(rows: Float[Array, "rows *_"], least: float) -> tuple[Float[Array, "*_"], Float[Array, "*_"]]:
+    """Return the mean of the rows, and their standard deviation where it is above `least`, elsewhere 1."""
+    spread = np.asarray(rows.std(axis=0))
+    return rows.mean(axis=0), jax.device_put(np.where(spread > least, spread, 1.0))
 
 
 class Policy(eqx.Module):
@@ -353,5 +357,5 @@ def make_critic(
         >>> float(critic.center), float(critic.spread)
         (2.0, 1.0)
     """
-    network, spread = scaled_network(key, jnp.column_stack([examples, left]), 1, width, depth), returns.std()
-    return Critic(network, returns.mean(), jnp.where(spread > 0, spread, 1.0))
+    network = scaled_network(key, jax.device_put(np.column_stack([examples, left])), 1, width, depth)
+    return Critic(network, *_center_and_scale(returns, 0.0))

@@ -217,8 +217,7 @@ def sample_rollouts(agent: Agent, starts: Starts, key: PRNGKeyArray, horizon: in
     def sample(task: ContinuousTask, state: State, choice: Choice, key: PRNGKeyArray) -> Rollout:
         return sample_rollout(agent, task, key, state, horizon, choice)
 
-    over_samples = jax.vmap(sample, (None, None, None, 0))
-    over_candidates = jax.vmap(over_samples, (None, None, 0, None))
+    over_candidates = jax.vmap(jax.vmap(sample, (None, None, None, 0)), (None, None, 0, None))
     return jax.vmap(over_candidates)(starts.tasks, starts.states, starts.choices, keys)
 
 

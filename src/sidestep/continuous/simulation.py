@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sidestep.continuous.dynamics import GaussianDynamics
+from sidestep.continuous.dynamics import Dynamics, GaussianDynamics
 from sidestep.continuous.lattice import LatticePlanner
 from sidestep.continuous.tasks import ContinuousTask, batch_tasks, check_tasks, has_ended
 from sidestep.errors import NotConverged, check, check_count
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory
 from sidestep.tabular.solve import SolveOptions, check_proper, solve
 
@@ -75,9 +76,7 @@ def simulate_trajectories(
         solution = solve(model, table, agent.behavior, options=options)
         if not solution.converged:
             raise NotConverged(f"values did not converge for task {index}: a finer lattice or a smaller β may help")
-        own_keys = jax.random.split(jax.random.fold_in(key, index), len(own))
-        keys = jax.vmap(partial(jax.random.split, num=moves))(own_keys)
-        parts = _simulate(agent, real, task, solution.values, jnp.asarray(own), keys)
+        parts = _simulate(agent, real, task, solution.values, to_jax(own), jax.random.fold_in(key, index), moves)
         for states, choices, acting in zip(*map(np.asarray, parts), strict=True):
             length = int(acting.sum())
             if length:
@@ -112,12 +111,12 @@ def gather_trajectories(trajectories: Sequence[Trajectory], tasks: Sequence[Cont
         _check_trajectory(trajectory, trajectories[0], len(tasks), row)
     states, actions, task = zip(*trajectories, strict=True)
     parts = [each[:-1] for each in states], actions, [each[1:] for each in states]
-    moves = (jnp.asarray(np.concatenate(part)) for part in parts)
+    moves = (to_jax(np.concatenate(part)) for part in parts)
     lengths = [len(each) for each in actions]
-    numbers = (jnp.asarray(np.repeat(each, lengths), jnp.int32) for each in (task, np.arange(len(lengths))))
-    demonstrations = Demonstrations(*moves, *numbers, tasks=batched)
-    ended = has_ended(batched, demonstrations.task, demonstrations.states)
-    row = int(demonstrations.trajectory[int(ended.argmax())]) + 1
+    which, trajectory = (np.repeat(each, lengths).astype(np.int32) for each in (task, np.arange(len(lengths))))
+    demonstrations = Demonstrations(*moves, to_jax(which), to_jax(trajectory), tasks=batched)
+    ended = np.asarray(has_ended(batched, demonstrations.task, demonstrations.states))
+    row = int(trajectory[ended.argmax()]) + 1
     check(not ended.any(), "goes on after a terminal state of its task", source="trajectory", row=row)
     return demonstrations
 
@@ -138,7 +137,7 @@ def _check_trajectory(trajectory: Trajectory, first: Trajectory, tasks: int, row
 
 @eqx.filter_jit
 def _simulate(
-    agent: LatticePlanner, real: GaussianDynamics, task: ContinuousTask, values: Array, starts: Array, keys: Array
+    agent: LatticePlanner, real: Dynamics, task: ContinuousTask, values: Array, starts: Array, key: Array, moves: int
 ) -> tuple[Array, Array, Array]:
     """Return states, choices, and whether the task had not ended, of every agent at every move."""
 
@@ -150,8 +149,9 @@ def _simulate(
         after = jnp.where(over, state, real.sample(transition_key, state, agent.actions[choice]))
         return (after, over), (state, choice, ~over)
 
-    def simulate(start: Array, keys: Array) -> tuple[Array, Array, Array]:
+    def simulate(start: Array, key: PRNGKeyArray) -> tuple[Array, Array, Array]:
+        keys = jax.random.split(key, moves)
         (last, _), (states, choices, acting) = jax.lax.scan(move, (start, jnp.zeros((), bool)), keys)
         return jnp.concatenate([states, last[None]]), choices, acting
 
-    return jax.vmap(simulate)(starts, keys)
+    return jax.vmap(simulate)(starts, jax.random.split(key, len(starts)))

@@ -293,9 +293,10 @@ def batch_tasks(tasks: Sequence[_Task]) -> _Task:
     """
     kinds = {(jax.tree.structure(task), *map(np.shape, jax.tree.leaves(task))) for task in tasks}
     check(len(kinds) == 1, "expected at least one task, all of a kind", field="tasks")
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *tasks)
+    return jax.tree.map(lambda *leaves: jax.device_put(np.stack(leaves)), *tasks)
 
 
+@eqx.filter_jit
 def task_at(tasks: _Task, index: Array | int) -> _Task:
     """Return one of a batch of tasks, or several for an array of indices.
 
@@ -306,6 +307,7 @@ def task_at(tasks: _Task, index: Array | int) -> _Task:
     return jax.tree.map(lambda leaf: leaf[index], tasks)
 
 
+@eqx.filter_jit
 def task_features(tasks: ContinuousTask, states: States) -> Float[Array, "states features"]:
     """Return the features of every state under its own task (`tasks` has an axis of states).
 
@@ -316,7 +318,8 @@ def task_features(tasks: ContinuousTask, states: States) -> Float[Array, "states
     return jax.vmap(lambda task, state: task.features(state))(tasks, states)
 
 
-def has_ended(tasks: ContinuousTask, task: Int[Array, " states"], states: States) -> Bool[np.ndarray, " states"]:
+@eqx.filter_jit
+def has_ended(tasks: ContinuousTask, task: Int[Array, " states"], states: States) -> Bool[Array, " states"]:
     """Return whether every state is terminal in its task; `task` holds indices into a batch of tasks.
 
     Args:
@@ -324,7 +327,7 @@ def has_ended(tasks: ContinuousTask, task: Int[Array, " states"], states: States
         task: The index of the task of each state.
         states: The states, one a task or an index.
     """
-    return np.asarray(jax.vmap(lambda task, state: task.terminal(state))(task_at(tasks, task), states))
+    return jax.vmap(lambda task, state: task.terminal(state))(task_at(tasks, task), states)
 
 
 def check_tasks(tasks: ContinuousTask) -> None:
@@ -337,5 +340,5 @@ def check_tasks(tasks: ContinuousTask) -> None:
         InputError: For any of these.
     """
     check_finite(tasks, field="tasks")
-    for discount in np.ravel(tasks.discount):
+    for discount in np.ravel(np.asarray(tasks.discount)):
         check_discount(float(discount))

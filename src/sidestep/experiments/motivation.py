@@ -215,8 +215,7 @@ def run_trial(result: ModelResult, form: Form, goal: int, stakes: float) -> Tria
     starts = np.setdiff1d(np.flatnonzero(fails < 1), [goal])
     paths = robot.follow(starts)
     bumps = np.array([bool((fails[path[1:]] == 1).any()) for path in paths])
-    away = np.asarray(robot.solution.values)[starts] <= 0
-    stays = away | (~bumps & (np.array([path[-1] for path in paths]) != goal))
+    stays = (np.asarray(robot.solution.values)[starts] <= 0) | (~bumps & np.array([path[-1] != goal for path in paths]))
     outcomes = np.where(stays, "stays_put", np.where(bumps, "bumps", "arrives"))
     with np.errstate(divide="ignore"):
         expected = np.array([np.sum(1 / (1 - fails[path[1:]])) for path in paths])
@@ -226,8 +225,7 @@ def run_trial(result: ModelResult, form: Form, goal: int, stakes: float) -> Tria
 @cache
 def _fewest_moves(goal: int) -> Float[np.ndarray, " states"]:
     """Return the smallest expected number of moves from each state in the true world."""
-    task = ss.Reward(discount=1.0, step_cost=1.0).reach(BLANK, goal)
-    return -np.asarray(ss.plan(true_world(), task).solution.values)
+    return -np.asarray(ss.plan(true_world(), ss.Reward(discount=1.0, step_cost=1.0).reach(BLANK, goal)).solution.values)
 
 
 def _over_stakes(by_goal: list[list[Trial]]) -> dict[str, Any]:
