@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers.numbered_worlds import numbered_process, order_of
+from helpers.numbered_worlds import host_process, numbered_process, order_of
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
@@ -99,6 +99,13 @@ def test_sweep_loop_pipelined_equals_waiting(kind, fraction):
     np.testing.assert_array_equal(pipelined.values, waiting.values)
     for ours, expected in zip(pipelined.history, waiting.history, strict=True):
         np.testing.assert_array_equal(ours, expected)
+
+
+def test_kernel_sizes_of_a_large_grid_equal_those_of_a_small_one():
+    """Cores count the states of a large grid in parts."""
+    models = [ObstacleGrid(Grid.unknown(size, size)) for size in (5, 200)]
+    small, large = (host_process(model, reach(model.graph, 0)).kernel_sizes() for model in models)
+    assert small == large == (4, 2, 1)
 
 
 def half_learned(plan, random):

@@ -61,7 +61,7 @@ class HostProcess(NamedTuple):
     def kernel_sizes(self) -> tuple[int, int, int]:
         """Return the numbers of actions and outcomes, and the most outcomes of an action that leave its state."""
         states, actions, outcomes = self.successors.shape
-        most = map_ranges(lambda begin, end: _most_leaving_outcomes(self.successors[begin:end]), states)
+        most = map_ranges(lambda begin, end: _most_leaving_outcomes(begin, end, self.successors), states)
         return actions, outcomes, max(most)
 
 
@@ -344,9 +344,9 @@ def _sources(folder: Path) -> str:
 
 
 @compiled()
-def _most_leaving_outcomes(successors):  # pragma: no cover
+def _most_leaving_outcomes(begin, end, successors):  # pragma: no cover
     most = 1
-    for state in range(len(successors)):
+    for state in range(begin, end):
         for a in range(successors.shape[1]):
             count = 0
             for k in range(successors.shape[2]):

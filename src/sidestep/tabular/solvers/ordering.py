@@ -107,6 +107,7 @@ def number_process(
     probs, self_loop_factor = np.empty(successors.shape, dtype), np.empty((states, actions), dtype)
     reward, terminal = np.broadcast_to(process.reward, (len(process.reward), actions)), np.empty(states, bool)
     reward = np.ascontiguousarray(reward[order] if len(reward) > 1 else reward)
+    reward.flags.writeable = False  # as where it has one row: numba compiles once for each kind of array
     numbered = NumberedProcess(successors, probs, self_loop_factor, reward, terminal, 1 - process.discount, bandwidth=0)
     arrays = (order, position, process, numbered)
     bandwidth = max(map_ranges(lambda begin, end: kernels.number_states(begin, end, *arrays), states))
