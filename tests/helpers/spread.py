@@ -29,8 +29,8 @@ from sidestep.tabular.tasks import reach
 
 GOALS = ((4, 0.95), (14, 0.95), (0, 0.95), (4, 0.9), (14, 0.9))
 """Goals and discounts of five tasks: neither 4 nor 2 devices get equal numbers of them."""
-CASES = {"jacobi": (Jacobi(), 1.0), "gauss_seidel": (GaussSeidel(), MEMORY)}
-"""Solvers and memory: the largest number of batches, and one."""
+CASES = {"jacobi": (Jacobi(), MEMORY), "gauss_seidel": (GaussSeidel(), 1.0)}
+"""Solvers and memory: one batch, and the largest number of batches."""
 STEP = 0.3 * np.sin(np.arange(25.0))
 """A change of the parameters, different in every cell."""
 ITERATIONS = 5
@@ -135,20 +135,19 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--port", type=int)
     parser.add_argument("--process", type=int, default=0)
-    parser.add_argument("--names", nargs="+")
+    parser.add_argument("--name")
     options = parser.parse_args()
     if options.port:
         jax.distributed.initialize(
             f"127.0.0.1:{options.port}", num_processes=2, process_id=options.process, initialization_timeout=60
         )
-    mesh = tasks_mesh()
-    for name in options.names:
-        results = measured(name, mesh)
-        results["resumed"] = resumed(name, mesh, options.out / f"{name}.checkpoint")
-        results["devices"] = np.array(mesh.size)
-        np.savez(options.out / f"{name}-{options.process}.npz", allow_pickle=False, **results)
+    mesh, name = tasks_mesh(), options.name
+    results = measured(name, mesh)
+    results["resumed"] = resumed(name, mesh, options.out / f"{name}.checkpoint")
+    results["devices"] = np.array(mesh.size)
+    np.savez(options.out / f"{name}-{options.process}.npz", allow_pickle=False, **results)
     if options.port:
-        (options.out / f"refusal-{options.process}.txt").write_text(refusal_of_different_data("jacobi", mesh))
+        (options.out / f"refusal-{options.process}.txt").write_text(refusal_of_different_data(name, mesh))
 
 
 if __name__ == "__main__":

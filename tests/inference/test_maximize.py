@@ -54,7 +54,7 @@ class Watched(Objective):
 
 @pytest.fixture(scope="module")
 def problem():
-    truth = office(14, 16, 2)
+    truth = office(12, 14, 2)
     trajectories, goals = simulate_walks(truth, SimulationConfig(16, 4, reward=Reward(1.0, 1.0)))
     demos = gather(trajectories, [reach(truth.forget(), goal, discount=1.0, step_cost=1.0) for goal in goals])
     behavior = behavior_model(Behavior(LogSumExp(), 5.0))

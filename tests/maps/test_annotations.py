@@ -69,8 +69,8 @@ def test_learn_map_with_goal_candidates_reports_every_fit():
 @pytest.mark.slow
 def test_learn_with_a_person_column_estimates_beta_of_each_person(office, tmp_path):
     walks = {
-        "Ada": simulated(walks=40, goals=3, beta=30.0, seed=1),
-        "Bo": simulated(walks=40, goals=3, beta=3.0, seed=2),
+        "Ada": simulated(walks=20, goals=3, beta=30.0, seed=1),
+        "Bo": simulated(walks=20, goals=3, beta=3.0, seed=2),
     }
     tables = []
     for name, own in walks.items():

@@ -14,7 +14,7 @@ from sidestep.io.walks import write_walks
 from sidestep.maps.config import BehaviorConfig, FitConfig, MapConfig, PriorConfig, SimulationConfig
 from sidestep.maps.learn import learn_map
 from sidestep.maps.selection import Trial, select_behavior
-from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.grid import Grid
 from sidestep.tabular.reward import Reward
 from sidestep.worlds.walks import simulate_walks
 

@@ -95,7 +95,7 @@ def test_replanning_lengths_on_random_maps_equal_those_of_new_plans(reward, conn
     """Models are random: some cells are known, and some of these wrongly."""
     random = np.random.default_rng(5)
     infinite = total = 0
-    for walls in [0.2, 0.4] * 6:
+    for walls in [0.2, 0.4] * 3:
         truth = Grid((random.random((6, 7)) < walls).astype(int), connectivity=connectivity)
         known = random.choice([Cell.UNKNOWN, Cell.FREE, Cell.OCCUPIED], p=[0.9, 0.08, 0.02], size=(6, 7))
         model = ObstacleGrid(Grid(known.astype(int), connectivity=connectivity), random.normal(-2, 2, size=42))

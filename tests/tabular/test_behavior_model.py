@@ -127,14 +127,14 @@ def test_fit_of_reward_weights_tells_a_disliked_carpet_from_a_wall():
     wall[1:4, 3] = 1
     carpet = np.zeros((GRID.size, 1, 1))
     carpet[[7, 13, 19]] = 1.0
-    goals = (5, 12, 29, 17, 0, 24)
+    goals = (5, 12, 29, 0)
     plain, disliked = (
         [task(weight * carpet[..., 0] - 0.05, 1.0, np.arange(GRID.size) == goal) for goal in goals]
         for weight in (0.0, -0.05)
     )
     starts = [np.setdiff1d(np.flatnonzero(wall.ravel() == 0), [goal]) for goal in goals]
     agent = Behavior(LogSumExp(), 40.0)
-    demos = simulate(jax.random.key(0), true_model(Grid(wall)), disliked, [np.tile(own, 4) for own in starts], agent)
+    demos = simulate(jax.random.key(0), true_model(Grid(wall)), disliked, [np.tile(own, 2) for own in starts], agent)
     result = fit(ObstacleGrid(GRID, -2.0), gather(demos, plain), behavior_model(agent, features=carpet))
     weights = result.behavior.parameters.reward_weights
     assert weights is not None

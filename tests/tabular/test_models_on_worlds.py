@@ -39,8 +39,7 @@ def logit(chance):
 
 def anywhere(graph: Graph, states, discount=0.95) -> Task:
     """The task of reaching any of some states."""
-    terminal = jnp.zeros(graph.states, bool).at[jnp.asarray(states)].set(True)
-    return Task(jnp.zeros((1, 1)), jnp.ones(1), terminal, jnp.asarray(discount))
+    return Task(*map(jnp.asarray, ([[0.0]], [1.0], np.isin(np.arange(graph.states), states), discount)))
 
 
 def recovered(world, model, tasks, starts, prior=None, beta=10.0, terms=ALL_TERMS):
@@ -234,11 +233,11 @@ def test_slippery_grid_of_a_wrong_terrain_raises(terrain):
 @pytest.mark.slow
 def test_fit_of_a_slippery_grid_with_two_terrains_recovers_walls_and_slips():
     """Slips within four standard deviations of the fraction of moves that slip."""
-    rooms, slips = rooms_in_a_row(7, 9, doors=(6,)), np.array([0.1, 0.4])
-    terrain = np.zeros((7, 9), int)
-    terrain[:, 5:] = 1
+    rooms, slips = rooms_in_a_row(5, 7, doors=(4,)), np.array([0.1, 0.4])
+    terrain = np.zeros((5, 7), int)
+    terrain[:, 4:] = 1
     world, random = SlipperyGrid(rooms, slip=logit(slips), terrain=terrain), np.random.default_rng(0)
-    goals, free = [0, 21, 46, 8, 26, 62, 5], np.flatnonzero(rooms.known.ravel() == Cell.FREE)
+    goals, free = [0, 16, 6, 27], np.flatnonzero(rooms.known.ravel() == Cell.FREE)
     tasks = [reach(rooms.forget(), goal, discount=1.0, step_cost=1.0) for goal in goals]
     starts = [random.choice(np.setdiff1d(free, [goal]), 10) for goal in goals]
     learned, demos = recovered(world, SlipperyGrid(rooms.forget(), terrain=terrain), tasks, starts, beta=3.0)

@@ -28,6 +28,7 @@ from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import Task, reach, stack_tasks, task, with_state_costs
 
 each_backup = pytest.mark.parametrize("name", BACKUPS)
+backed_up = jax.jit(plain_backup, static_argnums=0)
 
 
 def agent(name: str, beta: float = 10.0) -> Behavior:
@@ -72,9 +73,9 @@ def test_solve_equal_actions_equals_the_closed_form(name):
     """n equal actions that pay r and reach F, or stay with p: V = (r + γ(1−p)F [+ log n/β]) / (1 − γp)."""
     n, r, final, gamma, p, beta = 5, -0.3, 2.0, 0.8, 0.6, 3.0
     successors = np.tile([1, 0], (2, n, 1))
-    logits = jnp.tile(jnp.log(jnp.asarray([1 - p, p])), (2, n, 1))
-    ends = Task(jnp.full((1, 1), r), jnp.asarray([0.0, final]), jnp.asarray([False, True]), jnp.asarray(gamma))
-    solution = solve_jit(TabularModel(graph(successors), logits), ends, agent(name, beta))
+    logits = np.tile(np.log([1 - p, p]), (2, n, 1))
+    ends = Task(*map(jnp.asarray, ([[r]], [0.0, final], [False, True], gamma)))
+    solution = solve_jit(TabularModel(graph(successors), jnp.asarray(logits)), ends, agent(name, beta))
     bonus = np.log(n) / beta if name == "log-sum-exp" else 0
     assert float(solution.values[0]) == pytest.approx((r + gamma * (1 - p) * final + bonus) / (1 - gamma * p), rel=1e-9)
 
@@ -170,7 +171,7 @@ def test_solve_with_a_horizon_equals_the_best_action_sequence():
 
 @pytest.mark.slow
 @each_backup
-@pytest.mark.parametrize("beta", [10.0, 1e3, 1e4])
+@pytest.mark.parametrize("beta", [10.0, 1e4])
 @pytest.mark.parametrize(("spread", "gamma", "cost"), [(3.0, 0.95, None), (3.0, 1.0, 1.0), (40.0, 0.95, None)])
 def test_solve_extreme_logits_and_beta_is_finite_and_solves_the_bellman_equation(name, beta, spread, gamma, cost):
     """Logits up to ±40: cells all but surely blocked, or free."""
@@ -193,12 +194,13 @@ WALLS = np.array([[0, 0, 0, 1, 0], [1, 1, 0, 1, 0], [0, 0, 0, 1, 0], [0, 1, 1, 1
 def test_solve_walls_of_logit_40_equals_shortest_paths(name, beta):
     """At large β values count the steps on the map (walls can be left)."""
     grid = Grid.unknown(5, 5)
-    theta = jnp.where(WALLS.reshape(-1) == 1, 40.0, -40.0)
+    theta = jnp.asarray(np.where(WALLS.reshape(-1) == 1, 40.0, -40.0))
     wanted = reach(grid, 0, discount=1.0, step_cost=1.0)
     solution, slope = solution_and_gradient(ObstacleGrid(grid), theta, wanted, agent(name, beta))
     free, steps = WALLS.ravel() == 0, dijkstra(walkable_graph(Grid(WALLS)), indices=0)
-    np.testing.assert_allclose(-solution.values[free], steps[free], atol=np.log(4) / beta * 20)
-    assert np.isfinite([solution.values, slope]).all()
+    values = np.asarray(solution.values)
+    np.testing.assert_allclose(-values[free], steps[free], atol=np.log(4) / beta * 20)
+    assert np.isfinite([values, slope]).all()
 
 
 @eqx.filter_jit
@@ -214,9 +216,9 @@ def solution_and_gradient(model, theta, wanted, behavior):
 def residual(name: str, solution, wanted, beta) -> float:
     """How far V is from B(Q(V)) at states that act, relative to the size of V and Q."""
     acting = ~np.asarray(wanted.terminal)
-    backed_up = np.asarray(plain_backup(name, solution.action_values, beta))[acting]
+    again = np.asarray(backed_up(name, solution.action_values, beta))[acting]
     values = np.asarray(solution.values)[acting]
-    return float(np.max(np.abs(values - backed_up) / np.maximum(np.abs(values), 1)))
+    return float(np.max(np.abs(values - again) / np.maximum(np.abs(values), 1)))
 
 
 def test_solve_nearly_blocked_corridor_equals_the_closed_form():
@@ -284,8 +286,8 @@ def test_solve_enclosed_cells_at_discount_1_have_no_effect_on_others(name):
     grid = Grid(known, connectivity=8)
     enclosed, walls = np.array([0, 1, 5, 6]), np.flatnonzero(known == Cell.OCCUPIED)
     wanted = reach(grid, 19, discount=1.0, step_cost=1.0)
-    solution, slope = solution_and_gradient(ObstacleGrid(grid), jnp.zeros(grid.size), wanted, agent(name))
-    values = solution.values
+    result = solution_and_gradient(ObstacleGrid(grid), jnp.zeros(grid.size), wanted, agent(name))
+    values, slope = np.asarray(result[0].values), np.asarray(result[1])
     assert (values[enclosed] <= 0.9 * neg_inf(jnp.dtype(jnp.float64))).all()
     others = np.setdiff1d(np.arange(grid.size), [*enclosed, *walls])
     assert (values[others] > -100).all()
@@ -339,20 +341,18 @@ def test_solve_with_horizon_0_raises():
 
 @pytest.mark.slow
 @each_backup
-@given(seed=st.integers(0, 2**32 - 1), cost=st.booleans(), kind=st.sampled_from([4, 8, "tabular"]))
-def test_solve_random_problems_solves_the_bellman_equation(name, seed, cost, kind):
+@given(seed=st.integers(0, 2**32 - 1), cost=st.booleans(), is_map=st.booleans())
+def test_solve_random_problems_solves_the_bellman_equation(name, seed, cost, is_map):
     rng = np.random.default_rng(seed)
     # at smaller β in nearly closed worlds, Jacobi does not always converge (see there)
     beta = float(10 ** rng.uniform(0.7, 3))
-    if kind == "tabular":
-        model = random_problem(seed=seed).model
-        world, goal = model.graph, 0
-    else:
-        world, goal = Grid.unknown(3, 4, kind), int(rng.integers(12))
+    model, goal = random_problem(seed=seed).model, 0
+    if is_map:
         # a goal that is entered once in two thousand tries takes Jacobi more sweeps than it has
-        model = ObstacleGrid(world, jnp.asarray(rng.normal(0, 4, 12).clip(max=5)))
+        logits, goal = rng.normal(0, 4, 12).clip(max=5), int(rng.integers(12))
+        model = ObstacleGrid(Grid.unknown(3, 4, connectivity=8), jnp.asarray(logits))
     gamma = float(rng.uniform(0.5, 0.99))
-    wanted = reach(world, goal, discount=1.0 if cost else gamma, step_cost=1.0 if cost else None)
+    wanted = reach(model.graph, goal, discount=1.0 if cost else gamma, step_cost=1.0 if cost else None)
     solution = solve_jit(model, wanted, agent(name, beta))
     assert solution.converged
     assert residual(name, solution, wanted, beta) < 1e-8
@@ -382,11 +382,11 @@ def test_solve_with_jacobi_of_oscillating_values_converges(dtype, close):
 @pytest.mark.slow
 def test_solve_with_jacobi_of_a_long_path_takes_few_more_sweeps_than_steps():
     """The goal's value spreads one step a sweep; a residual that stays must not restart the solve."""
-    grid = Grid.unknown(3, 1_500)
+    grid = Grid.unknown(3, 750)
     goal, behavior = reach(grid, 0, discount=1.0, step_cost=1.0), agent("Boltzmann", 5.0)
     solution = solve_with(Jacobi(), ObstacleGrid(grid), goal, behavior)
     assert solution.converged
-    assert solution.sweeps < 1_700
+    assert solution.sweeps < 850
 
 
 @pytest.mark.parametrize("solver", [Jacobi(), GaussSeidel()], ids=["Jacobi", "GaussSeidel"])
