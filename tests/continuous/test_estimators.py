@@ -24,9 +24,9 @@ TABLE, LINEAR = small_worlds.table(), small_worlds.linear()
 SOFT = ss.Behavior(ss.LogSumExp(), BETA)
 BEHAVIORS = {"log-sum-exp": SOFT, "Boltzmann": ss.Behavior(ss.BoltzmannAverage(), BETA)}
 WEIGHTS = jnp.asarray(np.random.default_rng(1).normal(size=(len(PLACES), ACTIONS)))
-COUNTS = (10, 60, 600, 6000)
+COUNTS = (10, 60, 500, 4500)
 EACH = 10  # rollouts of a candidate for one estimate
-MANY = 600  # estimates; always the same number, because each one is compiled for
+MANY = 450  # estimates; always the same number, because each one is compiled for
 
 
 EVERYWHERE = sc.Starts(sc.task_at(TABLE.tasks, WHICH), PLACES, jnp.broadcast_to(jnp.arange(ACTIONS), WEIGHTS.shape))
@@ -64,7 +64,7 @@ def assert_agrees(sample, exact, precision, uncertain=0.0):
 
 
 def assert_falls_as_root(sample, exact):
-    """The root-mean-square error of means over N rollouts falls as 1/√N, for N over almost three decades."""
+    """The root-mean-square error of means over N rollouts falls as 1/√N, for N over 2.6 decades."""
     errors = []
     for count in COUNTS:
         means = sample.reshape(-1, count // EACH, sample.shape[-1]).mean(axis=1)
@@ -104,7 +104,7 @@ def exact_table(name, world, level, tilt=0.0):
 ])  # fmt: skip
 def test_value_gradient_score_in_table_is_unbiased_for_any_critic(name, critic):
     values, _, exact = exact_table(name, TABLE, WEIGHTS)
-    wrong = 2 + jnp.asarray(np.random.default_rng(2).normal(size=values.shape))
+    wrong = 1 + 0.5 * jnp.asarray(np.random.default_rng(2).normal(size=values.shape))
     critics = {"no": None, "an exact": critic_of(values), "a wrong": critic_of(wrong)}
     sample = drawn(3, MANY, TABLE, BEHAVIORS[name], EVERYWHERE, WEIGHTS, critic=critics[critic])
     assert_agrees(sample, exact, precision=0.03)
@@ -196,7 +196,7 @@ def closed_form():
 
 @pytest.fixture(scope="module")
 def along_paths():
-    return drawn(7, 4200, LINEAR, SOFT, AROUND, WEIGHTS_AROUND, estimator="pathwise")
+    return drawn(7, 10 * MANY, LINEAR, SOFT, AROUND, WEIGHTS_AROUND, estimator="pathwise")
 
 
 def test_value_gradient_pathwise_in_linear_world_matches_closed_form(along_paths, closed_form):

@@ -299,7 +299,7 @@ def _first_moves(planner: Planner, agent: Agent, tasks: ContinuousTask, states: 
 
 
 @eqx.filter_jit
-def _fresh_moments(planner: Planner, policy: Policy, critic: Critic) -> tuple[Tree, Tree]:
+def _fresh_moments(planner: Planner, policy: Policy, critic: Critic) -> tuple[Tree, ...]:
     """Return the states of both optimizers before their first step."""
     rates = (policy, planner.learning_rate), (critic, planner.critic_rate)
     return tuple(optax.adam(rate).init(eqx.filter(module, eqx.is_inexact_array)) for module, rate in rates)

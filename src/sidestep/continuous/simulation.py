@@ -114,7 +114,7 @@ def gather_trajectories(trajectories: Sequence[Trajectory], tasks: Sequence[Cont
     moves = (to_jax(np.concatenate(part)) for part in parts)
     lengths = [len(each) for each in actions]
     which, trajectory = (np.repeat(each, lengths).astype(np.int32) for each in (task, np.arange(len(lengths))))
-    demonstrations = Demonstrations(*moves, to_jax(which), to_jax(trajectory), tasks=batched)
+    demonstrations = Demonstrations(*moves, *map(to_jax, (which, trajectory)), tasks=batched)
     ended = np.asarray(has_ended(batched, demonstrations.task, demonstrations.states))
     row = int(trajectory[ended.argmax()]) + 1
     check(not ended.any(), "goes on after a terminal state of its task", source="trajectory", row=row)
