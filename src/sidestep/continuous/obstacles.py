@@ -239,5 +239,4 @@ class ObstacleMotion(GaussianDynamics):
         logit = self.field.logit(target)
         if not self.stops:
             return Outcomes.single(state + jax.nn.sigmoid(-logit) * (target - state))
-        log_probabilities = jax.nn.log_sigmoid(-logit), jax.nn.log_sigmoid(logit)
-        return Outcomes(jnp.stack(log_probabilities), jnp.stack([target, state]))
+        return Outcomes(jnp.stack([jax.nn.log_sigmoid(-logit), jax.nn.log_sigmoid(logit)]), jnp.stack([target, state]))
