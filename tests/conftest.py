@@ -4,6 +4,7 @@ Import nothing of `sidestep` above `pytest_configure`: jaxtyping's checks must b
 Compiled code is kept from run to run, in the folder that the environment variable `SIDESTEP_CACHE` names.
 """
 
+import gc
 import os
 from pathlib import Path
 
@@ -19,6 +20,7 @@ import jax
 import pytest
 from hypothesis import settings
 
+gc.set_threshold(50_000)  # a search for garbage visits all that JAX and the collected tests hold
 jax.config.update("jax_enable_x64", True)
 
 settings.register_profile("sidestep", deadline=None, max_examples=25)
