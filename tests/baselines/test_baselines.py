@@ -24,6 +24,8 @@ from sidestep.tabular.simulation import simulate
 from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.tasks import reach, with_state_costs
 
+pytestmark = pytest.mark.slow
+
 WALL = np.zeros((5, 5), int)
 WALL[:4, 2] = 1
 TRUTH, BLANK = Grid(WALL), Grid.unknown(5, 5)
@@ -39,7 +41,6 @@ def walks():
     return gather(simulate(jax.random.key(0), true_model(TRUTH), tasks, starts), tasks)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method", [behavior_aware, constraint_inference, joint_estimation])
 def test_method_finds_a_wall_that_walks_avoid(method, walks):
     learned = method(BLANK, walks, MapConfig())
@@ -76,7 +77,6 @@ def test_maxent_irl_explains_detours_by_costs(walks):
     assert not WALL.ravel()[path].any()
 
 
-@pytest.mark.slow
 def test_maxent_irl_reproduces_the_fraction_of_detours():
     """Two equal detours around an obstacle: of a hundred walks forty take the lower one."""
     known = np.array([[0, 0, 0], [0, 1, 0], [0, 0, 0]])
@@ -102,7 +102,6 @@ def test_constraint_inference_on_an_empty_map_forbids_nothing():
     assert np.asarray(constraint_inference(BLANK, demos, MapConfig()).model.blocked).max() < 0.5
 
 
-@pytest.mark.slow
 def test_joint_estimation_distinguishes_a_costly_floor_from_a_wall():
     """Agents that pay to cross a carpet do so where a detour costs more: it is costly and not blocked."""
     carpet = WALL.astype(float).ravel()
@@ -157,7 +156,6 @@ def test_behavior_cloning_in_a_free_room_generalizes_to_new_goals():
         assert [len(path) - 1 for path in paths] == shortest
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("logit", "converges"), [(5.0, True), (20.0, False)])
 def test_mean_log_likelihood_without_values_is_none(logit, converges, walks):
     """At a logit of 20 a move through the wall succeeds once in 5·10⁸ tries, each at a cost: values do not converge."""

@@ -61,7 +61,6 @@ def test_learn_by_a_building_that_all_drive_around_is_found(data):
     assert precision.pop("behavior") > max(precision.values()) + 0.2
 
 
-@pytest.mark.slow
 def test_learn_by_moves_into_buildings_are_counted_and_survived(data):
     with (data / "magellan" / "town_A" / "drives.csv").open("a") as file:
         # straight through the building's three cells

@@ -3,9 +3,13 @@
 import subprocess
 import sys
 
+import pytest
+
 PROGRAM = """
 from pathlib import Path
 import sys
+
+import pytest
 import numpy as np
 from sidestep.cli.drawing import draw, prepare_drawing
 from sidestep.tabular.grid import Grid
@@ -16,6 +20,7 @@ assert "matplotlib" not in sys.modules  # the second process has drawn
 """
 
 
+@pytest.mark.slow
 def test_draw_in_a_folder_with_a_file_named_like_a_module_does_not_run_it(tmp_path):
     (tmp_path / "matplotlib.py").write_text("open('was_run', 'w').close()")
     subprocess.run([sys.executable, "-P", "-c", PROGRAM], cwd=tmp_path, check=True)

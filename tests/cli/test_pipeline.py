@@ -21,6 +21,8 @@ from sidestep.maps.learned_map import load_map
 from sidestep.tabular.grid import Cell
 from sidestep.tabular.reward import Reward
 
+pytestmark = pytest.mark.slow
+
 SCORES = (
     "auc", "average_precision", "auc_relevant", "mean_obstacle", "mean_free", "max_probability", "legal_fraction",
     "excess_length",
@@ -74,7 +76,6 @@ def test_learn_writes_a_map_and_a_picture(learned):
         assert min(picture.size) > 100
 
 
-@pytest.mark.slow
 def test_learn_reads_walks_from_minari_datasets(office, tmp_path, datasets, capsys):
     write_walks("minari:office/walks-v0", read_walks(office / "walks.csv"))
     options = ("--map", office / "half.yaml", "--out", tmp_path, "--terms", "transitions")
@@ -149,7 +150,6 @@ def test_plan_from_a_cell_to_itself_has_no_moves(learned, tmp_path):
     assert summary(tmp_path)["moves"] == 0
 
 
-@pytest.mark.slow
 def test_commands_with_eight_directions_parquet_and_fixed_policy_gradient(office, tmp_path):
     walks, out = tmp_path / "walks.parquet", tmp_path / "learned"
     simulate = ("simulate", office / "true.yaml", "--out", walks, "--walks", 40, "--connectivity", 8, "--beta", 40)
@@ -191,7 +191,6 @@ def test_sample_walks_and_simulate_walks_repeat_by_seed():
     assert one == same != other
 
 
-@pytest.mark.slow
 def test_learn_resumes_after_an_interruption(office, learned, tmp_path, monkeypatch, capsys):
     command = ("learn", office / "walks.csv", "--map", office / "half.yaml", "--out", tmp_path)
     iterations = []

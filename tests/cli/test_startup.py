@@ -13,6 +13,8 @@ from sidestep.maps.learned_map import LearnedMap
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.reward import Reward
 
+pytestmark = pytest.mark.slow
+
 COMMAND = "import sys; from sidestep.cli.app import main; code = main(sys.argv[1:])"
 MODULES = "; print(*sorted(sys.modules))"
 PLAN = ("plan", "learned", "--start", "0.5,0.5", "--goal", "2.5,0.5", "--out")
@@ -62,14 +64,12 @@ def plan(folder, out, cache):
     return start(COMMAND + "; sys.exit(code)", *PLAN, out, cwd=folder, env=env)
 
 
-@pytest.mark.slow
 def test_plan_with_cache_off_keeps_no_compiled_code(folder):
     assert "moves" in output(plan(folder, "out", "off"))
     assert not (folder / "home").exists()
     assert not (folder / "off").exists()
 
 
-@pytest.mark.slow
 def test_plan_shares_a_cache_and_rebuilds_damaged_entries(folder):
     """Two processes share an empty cache; then all entries are damaged."""
     both = [plan(folder, name, folder / "cache") for name in ("one", "other")]

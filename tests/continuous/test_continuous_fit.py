@@ -17,6 +17,8 @@ from helpers.families import Drift, Gusts, LaplaceDrift, vector
 from sidestep.continuous.fit import problem_fingerprint
 from sidestep.continuous.policies import ScaledNetwork
 
+pytestmark = pytest.mark.slow
+
 # Agents on a line move by −1, 0 or 1 and look two moves ahead, to stay near 0: R(s, a) = −s². With the Boltzmann
 # average, Q(s, a) = −s² − γ E(s + a + θ + noise)², for every later choice.
 WAYS, DISCOUNT, NOISE, TRUTH, MOVES = np.array([-1.0, 0.0, 1.0]), 0.9, 0.4, 0.6, 90
@@ -65,7 +67,6 @@ def fitted(seed=0):
 # Results
 
 
-@pytest.mark.slow
 def test_fit_dynamics_transitions_alone_give_least_squares():
     seen = np.column_stack([STATES, WAYS[CHOICES]])
     following = seen @ [0.7, 0.5] + 0.3 * np.random.default_rng(0).normal(size=MOVES)
@@ -83,7 +84,6 @@ def test_fit_dynamics_transitions_alone_give_least_squares():
     assert (result.converged, result.policy_gap) == (True, 0)
 
 
-@pytest.mark.slow
 def test_fit_dynamics_actions_alone_give_the_maximum_likelihood():
     """The tolerance allows for the noise of rollouts."""
 
@@ -98,7 +98,6 @@ def test_fit_dynamics_actions_alone_give_the_maximum_likelihood():
     assert result.history[0].prior == pytest.approx(-(0.5**2) / 100)
 
 
-@pytest.mark.slow
 def test_fit_dynamics_vector_actions_give_the_true_drift():
     """With R(s, a) = −s² − a² the policy is normal, by Riccati's equation."""
     beta, discount, count = 4.0, 0.6, 300
@@ -127,7 +126,6 @@ def test_fit_dynamics_vector_actions_give_the_true_drift():
     assert learned == pytest.approx(likelihood, abs=0.1)
 
 
-@pytest.mark.slow
 def test_fit_dynamics_policy_warmup_plans_for_the_first_model():
     """Without the actions' term there is no policy to plan."""
     by_both, by_transitions = fitted()[0], BOTH(terms=("transitions",))
@@ -135,7 +133,6 @@ def test_fit_dynamics_policy_warmup_plans_for_the_first_model():
     assert by_transitions.planner_state.policy_moments[0].count == 0
 
 
-@pytest.mark.slow
 def test_fit_dynamics_objective_is_the_sum_of_its_terms():
     result, _ = fitted()
     for progress in result.history:
@@ -146,7 +143,6 @@ def test_fit_dynamics_objective_is_the_sum_of_its_terms():
     assert abs(float(result.dynamics.parameters[0]) - TRUTH) < 0.25
 
 
-@pytest.mark.slow
 def test_fit_dynamics_batches_of_a_laplace_family_give_the_median():
     """The batch log-likelihood is scaled up to all moves."""
     result = sc.fit_dynamics(
@@ -163,7 +159,6 @@ def test_fit_dynamics_batches_of_a_laplace_family_give_the_median():
 # Diagnostics
 
 
-@pytest.mark.slow
 def test_fit_dynamics_result_is_the_mean_of_the_last_quarter():
     result, reports = fitted()
     drifts = np.array([float(dynamics.parameters[0]) for _, dynamics in reports])
@@ -178,7 +173,6 @@ def test_fit_dynamics_result_is_the_mean_of_the_last_quarter():
     assert [progress.iteration for progress in result.history] == list(range(16))
 
 
-@pytest.mark.slow
 def test_fit_dynamics_large_policy_gap_is_not_converged():
     result, _ = fitted()
     assert 0 < result.drift < 1
@@ -190,7 +184,6 @@ def test_fit_dynamics_large_policy_gap_is_not_converged():
     )
 
 
-@pytest.mark.slow
 def test_fit_dynamics_noisy_policy_gap_is_not_converged():
     """At this β the noise of two rollouts exceeds the gap that it is subtracted from."""
     sharp = ss.Behavior(ss.BoltzmannAverage(), 40.0)
@@ -217,7 +210,6 @@ def test_fit_dynamics_constant_slope_has_drift_1():
     assert not result.converged
 
 
-@pytest.mark.slow
 def test_fit_dynamics_repeats_by_seed():
     again, other = BOTH(), fitted(1)[0]
     assert again.history == fitted()[0].history
@@ -247,7 +239,6 @@ def leaves(result):
     return [np.asarray(leaf) for leaf in jax.tree.leaves((result.dynamics, result.planner_state)) if eqx.is_array(leaf)]
 
 
-@pytest.mark.slow
 def test_fit_dynamics_resumed_is_identical(checkpoint):
     whole = partial(BOTH, checkpoint=checkpoint)
     expected = whole()
@@ -263,7 +254,6 @@ def test_fit_dynamics_resumed_is_identical(checkpoint):
     assert (result.drift, result.policy_gap, result.message) == (expected.drift, expected.policy_gap, expected.message)
 
 
-@pytest.mark.slow
 def test_fit_dynamics_without_resume_starts_again(checkpoint):
     iterations = []
     with pytest.raises(KeyboardInterrupt):
@@ -272,7 +262,6 @@ def test_fit_dynamics_without_resume_starts_again(checkpoint):
     assert iterations[0] == 0
 
 
-@pytest.mark.slow
 def test_fit_dynamics_checkpoint_of_another_problem_is_refused(checkpoint):
     with pytest.raises(KeyboardInterrupt):
         BOTH(report=interrupted_at(2), checkpoint=checkpoint)
@@ -398,7 +387,6 @@ def test_fit_dynamics_no_moves_are_refused():
         sc.fit_dynamics(INITIAL, nothing, *AGENTS)
 
 
-@pytest.mark.slow
 def test_fit_dynamics_infinite_rewards_raise():
     demos = with_tasks(eqx.tree_at(lambda task: task.state_cost, NEAR, 1e308 * jnp.eye(1)))
     with pytest.raises(ss.NotConverged, match="the figures ceased to be finite at iteration 0: dynamics or rewards"):

@@ -105,6 +105,7 @@ def test_log_prob_integrates_to_one_and_samples_have_its_moments(name):
     np.testing.assert_allclose((away.T @ away / SAMPLES - covariance) / np.outer(spread, spread), 0, atol=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*GAUSSIAN, "table"])
 def test_transition_control_variate_has_mean_0_and_removes_linear_noise(name):
     seen = evaluate(name)

@@ -89,6 +89,7 @@ def test_simulate_trajectories_start_at_goal_gives_none():
     np.testing.assert_array_equal([walk.states[0] for walk in walking], np.delete(starts, [0, 2], axis=0))
 
 
+@pytest.mark.slow
 def test_simulate_trajectories_soft_choices_match_action_values():
     place = np.array([4.2, 4.0])
     walking = simulate(ROOM, SOFT, starts=[np.tile(place, (COUNT, 1))])

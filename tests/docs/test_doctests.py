@@ -17,6 +17,7 @@ def modules_with_examples():
             yield module.name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(modules_with_examples()))
 def test_doctest_of_module_runs_as_printed(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -12,6 +12,8 @@ from sidestep.experiments import pendulum, representations, room
 from sidestep.worlds import continuous_room
 from sidestep.worlds.continuous_room import without_moves
 
+pytestmark = pytest.mark.slow
+
 PLANNER = sc.Planner(horizon=3, batch_size=4, samples=2, critic_width=4)
 SCHEDULE = sc.Schedule(iterations=2, policy_warmup=0, batch_size=4)
 QUICK = {"planner": PLANNER, "schedule": SCHEDULE, "agents_per_goal": 1, "width": 4}
@@ -30,7 +32,6 @@ def check_run(module, config, keys, folder):
     assert any("iteration 1 of 2" in line for line in lines)
 
 
-@pytest.mark.slow
 def test_run_in_the_room_writes_pictures_and_summaries(tmp_path):
     """Both experiments compile the same functions."""
     scores = {"auc", "mean_inside", "mean_outside"}
@@ -38,7 +39,6 @@ def test_run_in_the_room_writes_pictures_and_summaries(tmp_path):
     check_run(representations, ROOM, scores | {"representations"}, tmp_path)
 
 
-@pytest.mark.slow
 def test_run_of_the_pendulum_writes_picture_and_summary(tmp_path):
     check_run(pendulum, PENDULUM, {"gravity_true", "gravity_estimate", "converged", "message"}, tmp_path)
 
@@ -48,7 +48,6 @@ def test_experiment_command_unknown_name_is_wrong_usage(capsys):
     assert "kitchen" in capsys.readouterr().err
 
 
-@pytest.mark.slow
 def test_demonstrations_never_aim_at_the_wall():
     world = continuous_room.room(ROOM.lattice_points)
     demonstrations, _ = ROOM.demonstrations(world, seed=3)

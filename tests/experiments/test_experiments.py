@@ -13,6 +13,8 @@ from sidestep.maps.config import SimulationConfig
 from sidestep.tabular.graph import walkable_graph
 from sidestep.worlds.grids import block
 
+pytestmark = pytest.mark.slow
+
 SCORES = {
     "auc", "average_precision", "auc_relevant", "mean_obstacle", "mean_free", "max_probability", "legal_fraction",
     "excess_length",
@@ -39,7 +41,6 @@ def test_variants_are_those_of_the_paper():
     assert all(isinstance(variant.optimizer, kinds[variant.gradient]) for variant in VARIANTS.values())
 
 
-@pytest.mark.slow
 def test_reproduce_writes_figures_and_numbers(reproduced):
     folder, summary = reproduced
     assert {path.name for path in folder.iterdir()} == {
@@ -56,7 +57,6 @@ def test_reproduce_writes_figures_and_numbers(reproduced):
         assert scores["converged"]
 
 
-@pytest.mark.slow
 def test_reproduce_finds_the_block_by_actions(reproduced):
     bam, exact, actions, transitions = (reproduced[1]["maps"]["block"][name] for name in VARIANTS)
     for scores in (bam, exact):
@@ -82,7 +82,6 @@ def test_simulate_walks_returns_optimal_walks_with_random_ties():
     assert [path.tolist() for path in again] == [path.tolist() for path in paths]
 
 
-@pytest.mark.slow
 def test_demo_in_a_small_office_writes_map_and_numbers(tmp_path):
     config = demo.DemoConfig(rows=10, columns=10, agents=SimulationConfig(walks=60, goals=5))
     lines = []

@@ -12,6 +12,8 @@ from sidestep.experiments import motivation
 from sidestep.experiments.motivation import COLUMNS, FORMS, ROWS, Form, run_trial, task_at_stakes, true_result
 from sidestep.maps.fit import behavior_of
 
+pytestmark = pytest.mark.slow
+
 BLANK = ss.Grid.unknown(ROWS, COLUMNS)
 GOAL = 8 * COLUMNS + 12
 """The lower right corner, beyond the wall and below the mud."""
@@ -65,7 +67,6 @@ def test_run_trial_in_the_true_model_takes_the_fewest_moves():
     assert corner == pytest.approx(8 + 6 + 3 + 5 - 2 + 10)  # down, to the door, and up to the mud
 
 
-@pytest.mark.slow
 def test_run_shows_that_costs_fail_when_the_stakes_change(tmp_path):
     """The transition model does not depend on the stakes; three goals of the agents suffice for that."""
     usual = motivation.MotivationConfig()

@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 PROGRAM = """
 import jax, jax.numpy as jnp, numpy as np
 from typing import NamedTuple
@@ -54,14 +56,12 @@ def folder(tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
 def test_keep_program_in_a_second_process_traces_nothing_but_callbacks(folder):
     # a gradient is traced as a whole
     assert set(run(folder)) == {"traces the callback", "traces b"}
     assert len(list((folder / "cache" / "programs").iterdir())) == 2
 
 
-@pytest.mark.slow
 def test_keep_program_with_damaged_entries_replaces_them(folder):
     for entry in (folder / "cache" / "programs").iterdir():
         entry.write_bytes(entry.read_bytes()[:-1] + b"?")
@@ -69,7 +69,6 @@ def test_keep_program_with_damaged_entries_replaces_them(folder):
     assert set(run(folder)) == {"traces the callback", "traces b"}
 
 
-@pytest.mark.slow
 def test_keep_program_with_another_version_of_a_library_traces_anew(folder):
     (folder / "optax.py").touch()  # beside the program, so that it is found first
     assert run(folder).count("traces a") == 2

@@ -19,6 +19,8 @@ from sidestep.tabular.planning import plan
 from sidestep.tabular.simulation import simulate
 from sidestep.tabular.tasks import reach
 
+pytestmark = pytest.mark.slow
+
 GRID = Grid.unknown(rows=6, columns=6)
 WORLD = true_model(GRID.passable())
 TASK = reach(GRID, 35)
@@ -31,7 +33,6 @@ def demonstrations():
     return gather(simulate(jax.random.key(0), WORLD, [TASK], [starts], BEHAVIOR), [TASK])
 
 
-@pytest.mark.slow
 def test_score_statistics_equal_central_differences_by_log_beta(demonstrations):
     statistics = score_statistics(WORLD, demonstrations, BEHAVIOR)
     q = plan(WORLD, TASK, BEHAVIOR).solution.action_values[demonstrations.states]

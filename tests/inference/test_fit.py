@@ -23,6 +23,8 @@ from sidestep.tabular.solve import SolveOptions, solve
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import reach
 
+pytestmark = pytest.mark.slow
+
 PAYING, COSTLY = (0.95, None), (1.0, 1.0)
 """Rewards: discount and step cost."""
 ADAM, FIXED_POLICY = Adam(max_iterations=200), SolveOptions("fixed_policy")
@@ -57,7 +59,6 @@ def objective_of(name: str):
     return jax.jit(lambda theta: objective(MODEL, demonstrations, behavior, theta, **of_likelihood))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_fit_history_has_the_objective_and_its_parts(name):
     result = fitted(name)
@@ -79,7 +80,6 @@ def test_fit_with_lbfgs_increases_the_objective_at_every_iteration(name):
     assert (np.diff(objective) > -1e-7).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", SMOOTH)
 def test_fit_ends_at_a_maximum(name):
     result, maximized = fitted(name), objective_of(name)
@@ -178,7 +178,6 @@ def test_fit_keeps_known_cells():
     assert blocked[1:4, 2].min() > 0.5
 
 
-@pytest.mark.slow
 def test_fit_follows_a_narrow_prior_of_a_cell():
     narrow = jnp.full(25, 2.0).at[7].set(5e-7).at[13].set(5e-7)
     prior = Normal(jnp.full(25, -2.0).at[13].set(1.5), narrow)
@@ -187,7 +186,6 @@ def test_fit_follows_a_narrow_prior_of_a_cell():
     assert float(fitted("Boltzmann").model.parameters[7]) > 1
 
 
-@pytest.mark.slow
 def test_fit_of_a_tabular_model_learns_an_avoided_transition():
     """Five states in a line; a step leads one further, a jump two, and either may fail.
 
@@ -224,7 +222,6 @@ def test_fit_refuses_tasks_without_values():
         fit(MODEL, walks(BLANK, *COSTLY), Behavior(LogSumExp(), 1.0))
 
 
-@pytest.mark.slow
 def test_fit_raises_if_solves_do_not_converge():
     behavior, demonstrations = Behavior(BoltzmannAverage()), walks(BLANK, *PAYING)
     with pytest.raises(NotConverged, match=r"task\(s\) \[0, 1, 2\]"):
@@ -264,7 +261,6 @@ def test_fit_twice_is_the_same_bit_for_bit():
     np.testing.assert_array_equal(again.model.parameters, fitted("Boltzmann").model.parameters)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("whole", [True, False])
 def test_fit_in_32_bits_finds_the_same_map(whole):
     """With 32 bits for all numbers, or for the model only."""

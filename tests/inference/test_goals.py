@@ -16,6 +16,8 @@ from sidestep.tabular.planning import plan
 from sidestep.tabular.simulation import simulate
 from sidestep.tabular.tasks import reach
 
+pytestmark = pytest.mark.slow
+
 BEHAVIOR = Behavior(BoltzmannAverage(), 30.0)
 WALL = np.zeros((6, 7), dtype=int)
 WALL[1:5, 3] = 1
@@ -68,7 +70,6 @@ def test_weighted_demonstrations_count_as_copies():
         assert float(getattr(weighted, term)) == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.slow
 def test_fit_goals_learns_goals_and_the_wall_from_truncated_paths():
     seen = trajectories(cut=1)
     result = fit_goals(

@@ -25,6 +25,8 @@ from sidestep.tabular.tasks import reach
 from sidestep.worlds.offices import office
 from sidestep.worlds.walks import simulate_walks
 
+pytestmark = pytest.mark.slow
+
 LOOSE = Rprop.solve_tolerance
 
 
@@ -73,7 +75,6 @@ def approximate(problem):
     return maximized(problem, reuses=True)
 
 
-@pytest.mark.slow
 def test_maximize_solves_a_part_of_the_states_only_at_trial_points(approximate):
     objective, result = approximate
     assert result.status is Status.CONVERGED
@@ -85,7 +86,6 @@ def test_maximize_solves_a_part_of_the_states_only_at_trial_points(approximate):
     assert objective.reused == {False, True}
 
 
-@pytest.mark.slow
 def test_maximize_with_approximations_solves_all_states_less_often_and_ends_at_the_same_point(problem, approximate):
     objective, result = approximate
     exact, expected = maximized(problem, reuses=False)
@@ -108,7 +108,6 @@ def test_fit_in_32_bits_advises_64_bits():
     assert "jax.config.update('jax_enable_x64', True)" in result.message
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("backup", "optimizer", "status", "advice"), [
     (BoltzmannAverage(), LBFGS(), Status.CONVERGED, ""),
     (BoltzmannAverage(), Adam(max_iterations=3), Status.MAX_ITERATIONS, "a larger max_iterations"),

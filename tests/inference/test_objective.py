@@ -73,13 +73,13 @@ def directly(problem, parameters):
     return np.array(parts), np.asarray(gradient)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("name", "memory"), [
     ("jacobi", MEMORY),
     ("jacobi", 46 * ONE_TASK),
     ("jacobi", 1.0),
     ("gauss_seidel", 46 * ONE_TASK),
 ])  # fmt: skip
+@pytest.mark.slow
 def test_evaluate_equals_likelihood_and_prior_for_every_batch_size(name, memory):
     objective = objective_of(memory, solver=SOLVERS[name])
     result, _ = objective.evaluate(at(POINT), objective.cold_starts())
@@ -282,6 +282,7 @@ def test_evaluate_in_32_bits_stays_in_32_bits():
     np.testing.assert_allclose(result.gradient.model, gradient, atol=1e-3 * np.abs(gradient).max())
 
 
+@pytest.mark.slow
 def test_evaluate_with_a_failed_solve_is_nan():
     objective = Objective(problem_of(Jacobi(max_sweeps=2)))
     result, _ = objective.evaluate(at(POINT), objective.cold_starts())

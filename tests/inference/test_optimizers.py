@@ -102,6 +102,7 @@ def test_lbfgs_keeps_the_dtype_of_the_start():
     assert len(calls) > 3
 
 
+@pytest.mark.slow
 def test_adam_reaches_the_minimum():
     way = run(Adam(max_iterations=300, learning_rate=0.1), quadratic, [2.0, 0.0, 0.0], 300)
     np.testing.assert_allclose(way[-1][0], MINIMUM, atol=1e-3)

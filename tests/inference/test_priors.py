@@ -65,6 +65,7 @@ def test_wall_prior_counts_blocked_cells_in_lines(drawing, expected):
         assert float(gain) == pytest.approx(2 * expected, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_wall_prior_fills_a_gap_in_a_known_wall():
     known = np.array([[0, 1, 0], [0, -1, 0], [0, 1, 0]])
     theta = jnp.full(9, 0.5)

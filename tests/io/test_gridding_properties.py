@@ -75,6 +75,7 @@ def test_grid_walks_on_borders_and_corners_follows_the_rules(line, obstacles, co
     assert not (known[row, column + steps[:, 1]] == Cell.OCCUPIED).any(), "a diagonal cuts a known corner"
 
 
+@pytest.mark.slow
 @given(st.lists(lines(anywhere | center), min_size=2, max_size=3), connectivities)
 def test_grid_walks_treats_walks_independently(many, connectivity):
     together = grid_walks(walk_along(*many), Grid.unknown(SIZE, SIZE, connectivity=connectivity))
@@ -109,6 +110,7 @@ def test_grid_walks_backward_visits_the_same_cells(line):
     np.testing.assert_array_equal(back.states[::-1], there.next_states)
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(lines(anywhere))
 def test_grid_walks_agrees_with_dense_sampling(line):

@@ -12,6 +12,8 @@ from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.demonstrations import gather
 from sidestep.tabular.planning import plan
 
+pytestmark = pytest.mark.slow
+
 DISCOUNT = 0.97
 TAXI = max(name for name in gymnasium.registry if name.startswith("Taxi-"))
 LAKES = ("FrozenLake-v1", {}), ("FrozenLake-v1", {"map_name": "8x8"}), ("FrozenLake-v1", {"is_slippery": False})

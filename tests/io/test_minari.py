@@ -158,6 +158,7 @@ def record(env, act, episodes):
     return dataset
 
 
+@pytest.mark.slow
 def test_read_demonstrations_of_collected_episodes_keeps_rewards():
     env = gymnasium.make("FrozenLake-v1", max_episode_steps=30)
     world, draw = from_gymnasium(env, DISCOUNT), np.random.default_rng(0)

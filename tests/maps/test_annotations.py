@@ -16,6 +16,8 @@ from sidestep.maps.goal_candidates import GoalCandidates
 from sidestep.maps.learn import learn_map
 from sidestep.tabular.demonstrations import Trajectory
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def office(tmp_path_factory):
@@ -28,7 +30,6 @@ def learn(office, walks, out, *options):
     return call("learn", walks, "--map", office / "blank.yaml", "--out", out, *options)
 
 
-@pytest.mark.slow
 def test_learn_with_goal_candidates_infers_goals(office, tmp_path):
     """Candidates are the three goals and another cell; walks stop a step before their goals."""
     walks = simulated(walks=40, goals=3, seed=2)
@@ -57,7 +58,6 @@ def test_learn_with_goal_candidates_infers_goals(office, tmp_path):
     assert abs(correct - posterior.max(axis=1).mean()) < 0.2  # the posterior is calibrated
 
 
-@pytest.mark.slow
 def test_learn_map_with_goal_candidates_reports_every_fit():
     walks, reports = simulated(walks=6, goals=3), []
     annotations = WalkAnnotations(goal_candidates=GoalCandidates(np.unique(walks.goals, axis=0)))
@@ -66,7 +66,6 @@ def test_learn_map_with_goal_candidates_reports_every_fit():
     assert [progress.iteration for progress in reports].count(0) == fits > 1
 
 
-@pytest.mark.slow
 def test_learn_with_a_person_column_estimates_beta_of_each_person(office, tmp_path):
     walks = {
         "Ada": simulated(walks=20, goals=3, beta=30.0, seed=1),

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.optimize import root_scalar
 
 from sidestep.inference.fit import fit
@@ -65,6 +66,7 @@ def test_fit_map_ignores_first_cells_of_walks_of_weight_0():
     np.testing.assert_allclose(learned, [1.0, 1.0, most_probable(1), most_probable(1)], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_fit_map_of_actions_alone_ignores_first_cells():
     config = replace(CONFIG, fit=FitConfig("actions"))
     prior = Normal(config.prior.mean, config.prior.variance)

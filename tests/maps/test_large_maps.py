@@ -20,6 +20,8 @@ from sidestep.tabular.reward import Reward
 from sidestep.worlds.offices import office
 from sidestep.worlds.walks import simulate_walks
 
+pytestmark = pytest.mark.slow
+
 TRUTH = office(20, 24, seed=0)
 UNKNOWN = TRUTH.forget()
 SMALL = MapConfig(Reward(1.0, 1.0), BehaviorConfig("logsumexp", 5.0), PriorConfig(0.5, 4.0, wall_prior=0.0))
@@ -38,7 +40,6 @@ def learned(demonstrations):
     return fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, LARGE)
 
 
-@pytest.mark.slow
 def test_fit_map_of_a_large_map_ranks_relevant_cells_better_than_visits(demonstrations, learned):
     objectives = [progress.objective for progress in learned.history]
     assert learned.converged, learned.message
@@ -56,7 +57,6 @@ def test_fit_map_of_a_large_map_ranks_relevant_cells_better_than_visits(demonstr
     assert of_map > 2 * of_visits
 
 
-@pytest.mark.slow
 def test_fit_map_by_rprop_is_no_worse_than_by_lbfgs(demonstrations, learned):
     """Up to the tolerance: some thousandths of a nat a move."""
     by_lbfgs = fit_map(ObstacleGrid(UNKNOWN, 0.5), demonstrations, SMALL)

@@ -18,6 +18,8 @@ from sidestep.tabular.grid import Grid
 from sidestep.tabular.reward import Reward
 from sidestep.worlds.walks import simulate_walks
 
+pytestmark = pytest.mark.slow
+
 SHORT = FitConfig(max_iterations=2)
 """Two iterations take a map close enough to compare rewards."""
 
@@ -26,7 +28,6 @@ def select(walks, config=MapConfig(), grid=BLANK):  # noqa: B008
     return select_behavior(grid, grid_walks(walks, grid), replace(config, fit=SHORT))
 
 
-@pytest.mark.slow
 def test_learn_with_selection_of_optimal_walks_raises_beta(tmp_path, capsys):
     write_office(tmp_path)
     write_walks(tmp_path / "walks.csv", simulated(walks=40, goals=4))
@@ -43,7 +44,6 @@ def test_learn_with_selection_of_optimal_walks_raises_beta(tmp_path, capsys):
     assert blocked[WALL].min() > blocked[~WALL].max()
 
 
-@pytest.mark.slow
 def test_select_behavior_of_agents_with_different_beta_tempers_their_actions():
     """An agent with a small β has it in every move of the walk, so moves are not independent."""
     random, sharp = (simulate_walks(OFFICE, SimulationConfig(10, 2, beta, seed=3)) for beta in (0.5, 60.0))
@@ -53,7 +53,6 @@ def test_select_behavior_of_agents_with_different_beta_tempers_their_actions():
     assert any("actions count by" in reason for reason in selection.reasons)
 
 
-@pytest.mark.slow
 def test_select_behavior_of_long_walks_with_step_costs_selects_them():
     """At sixty cells from the goal a reward of 1 with the discount .95 is close to 0."""
     grid = Grid(np.zeros((1, 60), dtype=int))
@@ -63,7 +62,6 @@ def test_select_behavior_of_long_walks_with_step_costs_selects_them():
     assert "the reward is a cost of every cell" in selection.reasons[0]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("config", "message"), [
     # two cells from all walks an agent pays for some 5·10⁸ moves that fail: values do not converge
     (MapConfig(prior=PriorConfig(mean=20.0)), "converge"),

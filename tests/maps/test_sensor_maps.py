@@ -21,6 +21,8 @@ from sidestep.tabular.simulation import simulate
 from sidestep.tabular.tasks import reach
 from sidestep.worlds.rooms import rooms_in_a_row
 
+pytestmark = pytest.mark.slow
+
 NORMAL = ("--prior-mean", 0.5, "--prior-variance", 4, "--wall-prior", 0)
 """Cells are independent, so that the observation of one cell moves no other."""
 
@@ -132,7 +134,6 @@ UPPER, LOWER = slice(0, 5), slice(7, 12)
 """The rows that sensors saw, and rows of the wall that agents walk around."""
 
 
-@pytest.mark.slow
 def test_learn_with_a_sensor_map_of_one_half_infers_the_other_half_from_behavior(tmp_path):
     """Sensors saw the upper rows of two rooms; agents walk in the lower ones."""
     goals = [7 * 9 + 3, 7 * 9 + 5, 11 * 9, 11 * 9 + 8]

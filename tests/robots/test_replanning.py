@@ -26,6 +26,7 @@ def lengths(model, truth, goal, starts, reward=REWARDS[1]):
     return replanning_lengths(model, grid_environment(truth), task, goal, np.array(starts)).tolist()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reward", REWARDS)
 def test_replanning_lengths_around_a_wall_count_bumps_and_detours(reward):
     """A wall in the way, and a way around its upper end.

@@ -26,6 +26,7 @@ def test_risk_averse_task_of_a_move_that_fails_costs_a_fifth_of_a_bump():
     assert (up, down, left, right) == (-1.8, -1.8, -1.8, -1)
 
 
+@pytest.mark.slow
 def test_risk_averse_task_value_falls_with_the_probability_of_an_obstacle():
     """Although the reward of one move may rise: it is repeated more often."""
     values = []

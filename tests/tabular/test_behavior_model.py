@@ -23,6 +23,8 @@ from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import reach, task
 
+pytestmark = pytest.mark.slow
+
 GRID = Grid.unknown(rows=5, columns=6)
 OPEN = true_model(GRID.passable())
 GOALS = (0, 17, 29)
@@ -121,7 +123,6 @@ def test_fit_with_persons_pools_their_betas():
     assert float(result.behavior_of().beta) == pytest.approx(np.exp(np.mean(np.log(betas))), rel=1e-9)
 
 
-@pytest.mark.slow
 def test_fit_of_reward_weights_tells_a_disliked_carpet_from_a_wall():
     wall = np.zeros(GRID.shape, dtype=int)
     wall[1:4, 3] = 1

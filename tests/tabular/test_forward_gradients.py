@@ -11,8 +11,9 @@ from sidestep.tabular.forward_gradients import forward_gradient
 from sidestep.tabular.solve import SolveOptions, solve
 from sidestep.tabular.solvers.jacobi import Jacobi
 
+pytestmark = pytest.mark.slow
 
-@pytest.mark.slow
+
 @pytest.mark.parametrize(
     ("name", "gradient"),
     [("hard max", "exact"), ("Boltzmann", "exact"), ("Boltzmann", "fixed_policy"), ("mellowmax", "fixed_policy")],
@@ -34,7 +35,6 @@ def test_forward_gradient_equals_the_adjoint_gradient(name, gradient):
     assert relative_error(result.action_value_gradient, expected[1]) < 1e-8
 
 
-@pytest.mark.slow
 def test_forward_gradient_with_too_few_sweeps_has_not_converged():
     problem = PROBLEMS["tabular"]
     result = forward_gradient(problem.model, generic_task(problem, 0.9), Behavior(BACKUPS["hard max"]), max_sweeps=3)

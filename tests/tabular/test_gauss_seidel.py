@@ -135,6 +135,7 @@ def test_solve_visited_outside_the_states_are_clipped(solver):
 # Batches
 
 
+@pytest.mark.slow
 def test_solve_in_nested_batches_and_loops_equals_each_alone():
     """Over β and over tasks at once, in a scan, in a map: each as by itself."""
     model = some_map(4, 5)
@@ -166,6 +167,7 @@ def test_solve_in_nested_batches_and_loops_equals_each_alone():
             np.testing.assert_allclose(mine, theirs, rtol=1e-12, atol=1e-12, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [GaussSeidel(), Jacobi()], ids=["GaussSeidel", "Jacobi"])
 def test_solve_of_32_bit_numbers_stays_in_32_bits(solver):
     problem = obstacle_problem(4)

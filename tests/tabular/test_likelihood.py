@@ -72,6 +72,7 @@ def test_log_likelihood_at_horizon_1_equals_the_value_by_hand():
     assert float(likelihood.actions) == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_log_likelihood_of_outcomes_with_the_same_state_adds_them_up():
     world = graph(np.array([[[1, 1, 0]], [[0, 0, 1]]]))
     model = TabularModel(world, jnp.log(jnp.asarray([[[0.2, 0.3, 0.5]], [[0.6, 0.3, 0.1]]])))

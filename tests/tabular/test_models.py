@@ -128,6 +128,7 @@ def test_obstacle_grid_diagonals_do_not_cut_corners(known, passes):
     assert float(model.probabilities()[0, 7, 1]) == 1 - passes
 
 
+@pytest.mark.slow
 def test_obstacle_grid_of_known_cells_keeps_them_constant():
     grid = Grid(np.array([[F, O, U]]))
     model = ObstacleGrid(grid, jnp.asarray([3.0, -3.0, 1.0]))
@@ -166,6 +167,7 @@ def test_tabular_model_probabilities_are_a_softmax_over_outcomes(seed):
     np.testing.assert_allclose(dense(model), expected, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_tabular_model_impossible_outcomes_have_probability_0():
     world = graph(np.array([[[0, 1, 1]], [[0, 1, 0]]]))
     possible = jnp.asarray([[[True, False, True]], [[False, False, True]]])

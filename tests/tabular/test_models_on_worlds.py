@@ -23,6 +23,8 @@ from sidestep.worlds.farm import Farm
 from sidestep.worlds.gravity import DIRECTIONS, Gravity, most_probable_rule
 from sidestep.worlds.rooms import rooms_in_a_row
 
+pytestmark = pytest.mark.slow
+
 UP, DOWN, LEFT, RIGHT = range(4)
 
 
@@ -80,7 +82,6 @@ def test_gravity_model_at_first_has_uniform_directions():
         Gravity(np.zeros((2, 2), int)).model()
 
 
-@pytest.mark.slow
 def test_fit_of_gravity_to_ten_demonstrations_a_goal_recovers_the_rule():
     """Optimal agents choose their colors by where these let them go."""
     world, random = FALLING.known_model(RULE), np.random.default_rng(1)
@@ -118,7 +119,6 @@ def test_farm_known_model_stops_the_wrong_machine_and_swaps_machines():
         Farm(np.zeros((2, 2), int), MACHINE).model()
 
 
-@pytest.mark.slow
 def test_fit_of_the_farm_to_actions_of_ten_demonstrations_a_goal_recovers_what_machines_enter():
     """Optimal agents never fail to enter; that they fetch another machine shows what theirs cannot enter."""
     world, random = FARM.known_model(ENTERS), np.random.default_rng(2)
@@ -134,7 +134,6 @@ def test_fit_of_the_farm_to_actions_of_ten_demonstrations_a_goal_recovers_what_m
 # Walls between cells, and roads
 
 
-@pytest.mark.slow
 def test_fit_of_walls_between_cells_recovers_the_wall():
     """A room of five by six; the wall runs between its third and fourth column but for the last row."""
     grid = ObstacleGrid(Grid.unknown(5, 6))
@@ -163,7 +162,6 @@ def test_walled_grid_of_known_cells_blocks_occupied_ones():
         walled_grid(Grid(known, connectivity=8))
 
 
-@pytest.mark.slow
 def test_fit_of_a_road_network_recovers_the_closed_link():
     """A ring of eight links in both directions; link 3 is closed, so trips go around it."""
     forth = [[link, (link + 1) % 8] for link in range(8)]
@@ -230,7 +228,6 @@ def test_slippery_grid_of_a_wrong_terrain_raises(terrain):
         SlipperyGrid(Grid.unknown(2, 2), terrain=terrain.astype(int))
 
 
-@pytest.mark.slow
 def test_fit_of_a_slippery_grid_with_two_terrains_recovers_walls_and_slips():
     """Slips within four standard deviations of the fraction of moves that slip."""
     rooms, slips = rooms_in_a_row(5, 7, doors=(4,)), np.array([0.1, 0.4])

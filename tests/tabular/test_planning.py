@@ -65,6 +65,7 @@ def test_plan_on_a_learned_model_goes_around_probable_obstacles():
     assert made.path_from(0).tolist() == [0, 1, 2]
 
 
+@pytest.mark.slow
 def test_plan_intended_is_the_most_probable_outcome_elsewhere():
     world = graph(np.array([[[0, 1, 2]], [[1, 1, 1]], [[2, 2, 2]]]))
     model = TabularModel(world, jnp.log(jnp.array([[[0.6, 0.1, 0.3]], [[1.0, 1.0, 1.0]], [[1.0, 1.0, 1.0]]])))
@@ -94,6 +95,7 @@ def test_plan_without_values_raises():
         plan(true_model(OPEN), reach(OPEN, 0), options=SolveOptions(solver=Jacobi(max_sweeps=1)))
 
 
+@pytest.mark.slow
 def test_roll_out_against_an_unknown_wall_fails_until_the_last_move():
     corridor = Grid(np.array([[0, 0, 1, 0]]))
     made = plan(true_model(Grid(np.zeros((1, 4), dtype=int))), reach(corridor, 3))
@@ -107,6 +109,7 @@ def test_roll_out_against_an_unknown_wall_fails_until_the_last_move():
     assert rollouts.arrived.tolist() == [False, False, True]
 
 
+@pytest.mark.slow
 def test_roll_out_at_a_terminal_state_ignores_the_policy():
     always_right = jnp.zeros((9, 4)).at[:, RIGHT].set(1.0)
     rollouts = roll_out(

@@ -13,6 +13,8 @@ from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid, TabularModel
 from sidestep.tabular.tasks import Task, reach
 
+pytestmark = pytest.mark.slow
+
 ROWS, COLUMNS = 3, 4
 
 each_backup = pytest.mark.parametrize("name", BACKUPS)
@@ -40,7 +42,6 @@ def test_solve_with_more_blocked_cells_lowers_values(seed, form):
     assert (after <= before + 1e-8 * np.abs(before)).all()
 
 
-@pytest.mark.slow
 @each_backup
 @given(seed=seeds, form=forms)
 def test_solve_of_a_mirrored_map_mirrors_values(name, seed, form):
@@ -54,7 +55,6 @@ def test_solve_of_a_mirrored_map_mirrors_values(name, seed, form):
     np.testing.assert_allclose(up_down[::-1], values, rtol=1e-7)
 
 
-@pytest.mark.slow
 @each_backup
 @given(seed=seeds)
 def test_solve_of_renumbered_states_renumbers_values(name, seed):

@@ -16,6 +16,8 @@ from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import reach, stack_tasks
 from sidestep.worlds.offices import office
 
+pytestmark = pytest.mark.slow
+
 each_backup = pytest.mark.parametrize("name", BACKUPS)
 SOLVER = GaussSeidel(tolerance=1e-9)
 TRUTH = office(50, 50, 1)
@@ -70,7 +72,6 @@ def test_region_without_an_adjoint_is_all_states():
     assert two.region.tolist() == [[True, True, True], [False, True, False]]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in BACKUPS if name != "hard max"])
 def test_solve_with_a_region_gives_the_same_in_fewer_sweeps(name):
     behavior, visited = Behavior(BACKUPS[name], 5.0), near_the_goal()
@@ -112,7 +113,6 @@ def test_solve_with_jacobi_ignores_the_region():
     np.testing.assert_array_equal(its_slope, slope)
 
 
-@pytest.mark.slow
 @each_backup
 def test_vjp_with_a_region_above_the_tolerance_is_nan(name):
     """λ (B(Q) − V) is by how much a sum over values is wrong; beyond the tolerance there is no gradient."""
@@ -161,7 +161,6 @@ def test_solve_gradient_after_too_many_sweeps_with_a_region_is_nan():
         assert bool(jnp.isnan(slope).all()) == given_up
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("gradient", "dtype"), [("exact", jnp.float64), ("fixed_policy", jnp.float32)])
 def test_solve_gradient_in_a_batch_uses_the_region_of_each_task(gradient, dtype):
     """As each by itself; also with a discount below 1."""

@@ -18,6 +18,8 @@ from sidestep.tabular.models import ObstacleGrid, true_model
 from sidestep.tabular.simulation import simulate
 from sidestep.tabular.tasks import reach
 
+pytestmark = pytest.mark.slow
+
 OPEN = np.zeros((3, 3), dtype=int)
 ROOMS = np.array([[0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 0, 0], [1, 0, 1, 1, 0], [0, 0, 0, 1, 0]])
 CORRIDOR = np.zeros((1, 6), dtype=int)

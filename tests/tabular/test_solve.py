@@ -27,6 +27,8 @@ from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import Task, reach, stack_tasks, task, with_state_costs
 
+pytestmark = pytest.mark.slow
+
 each_backup = pytest.mark.parametrize("name", BACKUPS)
 backed_up = jax.jit(plain_backup, static_argnums=0)
 
@@ -169,7 +171,6 @@ def test_solve_with_a_horizon_equals_the_best_action_sequence():
 # Hard cases
 
 
-@pytest.mark.slow
 @each_backup
 @pytest.mark.parametrize("beta", [10.0, 1e4])
 @pytest.mark.parametrize(("spread", "gamma", "cost"), [(3.0, 0.95, None), (3.0, 1.0, 1.0), (40.0, 0.95, None)])
@@ -188,7 +189,6 @@ def test_solve_extreme_logits_and_beta_is_finite_and_solves_the_bellman_equation
 WALLS = np.array([[0, 0, 0, 1, 0], [1, 1, 0, 1, 0], [0, 0, 0, 1, 0], [0, 1, 1, 1, 0], [0, 0, 0, 0, 0]])
 
 
-@pytest.mark.slow
 @each_backup
 @pytest.mark.parametrize("beta", [1e3, 1e4])
 def test_solve_walls_of_logit_40_equals_shortest_paths(name, beta):
@@ -241,7 +241,6 @@ def test_solve_nearly_blocked_grid_takes_few_sweeps(name, theta):
     assert solution.sweeps <= 40
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("solver", [Jacobi(max_sweeps=3), None], ids=["stopped", "ample"])
 def test_log_likelihood_without_convergence_is_nan(solver):
     """The likelihood and its gradient are NaN; with sweeps enough they are not."""
@@ -339,7 +338,6 @@ def test_solve_with_horizon_0_raises():
 # Any model
 
 
-@pytest.mark.slow
 @each_backup
 @given(seed=st.integers(0, 2**32 - 1), cost=st.booleans(), is_map=st.booleans())
 def test_solve_random_problems_solves_the_bellman_equation(name, seed, cost, is_map):
@@ -358,7 +356,6 @@ def test_solve_random_problems_solves_the_bellman_equation(name, seed, cost, is_
     assert residual(name, solution, wanted, beta) < 1e-8
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("dtype", "close"), [("float64", 1e-6), ("float32", 1e-3)])
 def test_solve_with_jacobi_of_oscillating_values_converges(dtype, close):
     """Among nearly closed cells full Jacobi steps oscillate for ever, and the adjoint's diverge."""
@@ -379,7 +376,6 @@ def test_solve_with_jacobi_of_oscillating_values_converges(dtype, close):
     np.testing.assert_allclose(slope, slope_expected, rtol=close, atol=close * jnp.abs(slope_expected).max())
 
 
-@pytest.mark.slow
 def test_solve_with_jacobi_of_a_long_path_takes_few_more_sweeps_than_steps():
     """The goal's value spreads one step a sweep; a residual that stays must not restart the solve."""
     grid = Grid.unknown(1, 1_500)

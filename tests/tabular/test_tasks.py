@@ -31,6 +31,7 @@ def test_reach_with_a_step_cost_charges_by_length(connectivity):
     assert (result.terminal_reward == 0).all()
 
 
+@pytest.mark.slow
 def test_reach_of_a_position_or_a_state_ends_there():
     grid = Grid(np.full((2, 3), -1), resolution=2.0, origin=(10.0, 20.0, 0.0))
     assert jnp.flatnonzero(reach(grid, (15.0, 21.0)).terminal).tolist() == [5]  # right column, bottom row
