@@ -68,10 +68,10 @@ def test_run_trial_in_the_true_model_takes_the_fewest_moves():
 
 
 def test_run_shows_that_costs_fail_when_the_stakes_change(tmp_path):
-    """The transition model does not depend on the stakes; three goals of the agents suffice for that."""
+    """The transition model does not depend on the stakes; two goals of the agents suffice for that."""
     usual = motivation.MotivationConfig()
-    goals, new_goals = tuple(usual.goals[index] for index in (4, 6, 7)), usual.new_goals[:2]
-    config = motivation.MotivationConfig(1, goals, 6, stakes=(0.1, 1.0, 10.0), new_goals=new_goals)
+    goals, new_goals = tuple(usual.goals[index] for index in (2, 4)), usual.new_goals[:2]
+    config = motivation.MotivationConfig(1, goals, 8, stakes=(0.1, 1.0, 10.0), new_goals=new_goals)
     summary = motivation.run(tmp_path, config=config)
     assert json.loads((tmp_path / "summary.json").read_text()) == json.loads(json.dumps(summary))
     assert summary["command"] == "experiment motivation"
