@@ -14,9 +14,11 @@ import hashlib
 import os
 import pickle
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache, wraps
 from importlib.util import find_spec
 from pathlib import Path
+from threading import Thread
 from typing import Any, TypeVar, cast
 
 from sidestep import _cache
@@ -40,17 +42,14 @@ def keep_program(function: _Function) -> _Function:
     @wraps(function)
     def run(*arguments: Any) -> Any:
         import jax
-
-        folder = _cache.kept_in()
-        if folder is None or jax.device_count() > 1:
-            return compiled(*arguments)
         import numpy as np
         from jax.core import Tracer
 
+        folder, is_traced = _cache.kept_in(), any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments))
+        if folder is None or is_traced or jax.device_count() > 1:
+            return compiled(*arguments)
         dynamic, static = eqx.partition(arguments, lambda leaf: eqx.is_array(leaf) or isinstance(leaf, np.ndarray))
         leaves, structure = jax.tree.flatten(dynamic)
-        if any(isinstance(leaf, Tracer) for leaf in leaves):
-            return compiled(*arguments)
         others, static_structure = jax.tree.flatten(static)
         types = tuple((leaf.shape, leaf.dtype, bool(getattr(leaf, "weak_type", False))) for leaf in leaves)
         key = structure, tuple(others), static_structure, types
@@ -83,10 +82,9 @@ def _load(path: Path) -> _Program | None:
 
 
 def _compile(path: Path, function: Callable[..., Any], leaves: list[Any], structure: Any, static: Any) -> _Program:
-    """Compile a function, and store the program if it does not call back into Python."""
+    """Compile a function, and start to store the program."""
     import equinox as eqx
     import jax
-    from jax.experimental.serialize_executable import serialize
 
     result = None
 
@@ -96,20 +94,23 @@ def _compile(path: Path, function: Callable[..., Any], leaves: list[Any], struct
         return tuple(outputs)
 
     # an executable that comes from JAX's own cache cannot be stored again; so JAX must not keep this one
-    written_after = jax.config.jax_persistent_cache_min_compile_time_secs  # pyright: ignore[reportAttributeAccessIssue]
     jax.config.update("jax_persistent_cache_min_compile_time_secs", float("inf"))
     try:
         program = jax.jit(program_of_sidestep).lower(*leaves).compile()
     finally:
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", written_after)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     assert result is not None
-    skeleton = jax.tree.unflatten(result, range(result.num_leaves))
-    try:
-        content = pickle.dumps((serialize(program), skeleton))
-    except (AttributeError, NotImplementedError, TypeError, ValueError, pickle.PicklingError):
-        return program, result
-    _cache.keep_entry(path, content)
+    # beside the first run of the program; a process waits for its threads before it ends
+    Thread(target=_keep, args=(path, program, jax.tree.unflatten(result, range(result.num_leaves)))).start()
     return program, result
+
+
+def _keep(path: Path, program: Any, skeleton: Any) -> None:
+    """Store a program if it does not call back into Python."""
+    from jax.experimental.serialize_executable import serialize
+
+    with suppress(AttributeError, NotImplementedError, TypeError, ValueError, pickle.PicklingError):
+        _cache.keep_entry(path, pickle.dumps((serialize(program), skeleton)))
 
 
 @cache

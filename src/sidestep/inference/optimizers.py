@@ -8,6 +8,7 @@ minus the objective. To add an optimizer, subclass `Optimizer`.
 import abc
 import warnings
 from collections.abc import Callable
+from threading import Thread
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -130,6 +131,8 @@ class LBFGS(Optimizer):
 
     def init(self, x: Vector) -> Tree:
         """Return an empty memory."""
+        # this import takes as long as the compilation of a program, which leaves Python's lock to others
+        Thread(target=__import__, args=("scipy.optimize",)).start()
         return _lbfgs_memory(self.memory_size, x)
 
     def step(self, loss: Loss, x: Vector, value: float, gradient: Vector, state: Tree) -> tuple[Vector, Tree] | None:
