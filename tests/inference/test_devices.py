@@ -65,7 +65,7 @@ def check_resumed(result, bit_for_bit):
 
 def run_children(out, processes, devices, name):
     """Run the program in several processes at once, and end them all if one fails or takes too long."""
-    flags = f"--xla_cpu_use_fusion_emitters=false --xla_force_host_platform_device_count={devices}"
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"
     changes = {
         "XLA_FLAGS": flags,
         "JAX_PLATFORMS": "cpu",
