@@ -65,8 +65,8 @@ def scaled_network(key: PRNGKeyArray, examples: Examples, outputs: int, width: i
 
 def _center_and_scale(rows: Float[Array, "rows *_"], least: float) -> tuple[Float[Array, "*_"], Float[Array, "*_"]]:
     """Return the mean of the rows, and their standard deviation where it is above `least`, elsewhere 1."""
-    center, spread = np.mean(np.asarray(rows), axis=0), np.std(np.asarray(rows), axis=0)
-    return jax.device_put((center, np.where(spread > least, spread, 1.0)))
+    spread = np.asarray(rows.std(axis=0))
+    return rows.mean(axis=0), jax.device_put(np.where(spread > least, spread, 1.0))
 
 
 class Policy(eqx.Module):
