@@ -45,22 +45,22 @@ def keep_program(function: _Function) -> _Function:
         import numpy as np
         from jax.core import Tracer
 
-        folder, is_traced = _cache.kept_in(), any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments))
-        if folder is None or is_traced or jax.device_count() > 1:
+        folder = _cache.kept_in()
+        leaves, structure = jax.tree.flatten(arguments)
+        arrays = [leaf for leaf in leaves if isinstance(leaf, jax.Array | np.ndarray)]
+        if folder is None or jax.device_count() > 1 or any(isinstance(array, Tracer) for array in arrays):
             return compiled(*arguments)
-        dynamic, static = eqx.partition(arguments, lambda leaf: eqx.is_array(leaf) or isinstance(leaf, np.ndarray))
-        leaves, structure = jax.tree.flatten(dynamic)
-        others, static_structure = jax.tree.flatten(static)
-        types = tuple((leaf.shape, leaf.dtype, bool(getattr(leaf, "weak_type", False))) for leaf in leaves)
-        key = structure, tuple(others), static_structure, types
+        others = tuple(... if isinstance(leaf, jax.Array | np.ndarray) else leaf for leaf in leaves)
+        types = tuple((array.shape, array.dtype, bool(getattr(array, "weak_type", False))) for array in arrays)
+        key = structure, others, types
         if key not in programs:
             text = f"{_package()} {function.__module__}.{function.__qualname__} {key}"
             if " at 0x" in text:  # an address is another one in every process
                 return compiled(*arguments)
             path = folder / "programs" / f"{function.__qualname__}-{hashlib.sha256(text.encode()).hexdigest()}"
-            programs[key] = _load(path) or _compile(path, function, leaves, structure, static)
+            programs[key] = _load(path) or _compile(path, function, arrays, structure, others)
         call, result = programs[key]
-        return jax.tree.unflatten(result, call(*leaves))
+        return jax.tree.unflatten(result, call(*arrays))
 
     return cast(_Function, run)
 
@@ -81,22 +81,23 @@ def _load(path: Path) -> _Program | None:
         return None
 
 
-def _compile(path: Path, function: Callable[..., Any], leaves: list[Any], structure: Any, static: Any) -> _Program:
-    """Compile a function, and start to store the program."""
-    import equinox as eqx
+def _compile(path: Path, function: Callable[..., Any], arrays: list[Any], structure: Any, others: Any) -> _Program:
+    """Compile a function, and start to store the program; `...` in the place of an array in `others`."""
     import jax
 
     result = None
 
-    def program_of_sidestep(*leaves: Any) -> tuple[Any, ...]:
+    def program_of_sidestep(*arrays: Any) -> tuple[Any, ...]:
         nonlocal result
-        outputs, result = jax.tree.flatten(function(*eqx.combine(jax.tree.unflatten(structure, leaves), static)))
+        given = iter(arrays)
+        leaves = [next(given) if other is ... else other for other in others]
+        outputs, result = jax.tree.flatten(function(*jax.tree.unflatten(structure, leaves)))
         return tuple(outputs)
 
     # an executable that comes from JAX's own cache cannot be stored again; so JAX must not keep this one
     jax.config.update("jax_persistent_cache_min_compile_time_secs", float("inf"))
     try:
-        program = jax.jit(program_of_sidestep).lower(*leaves).compile()
+        program = jax.jit(program_of_sidestep).lower(*arrays).compile()
     finally:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     assert result is not None

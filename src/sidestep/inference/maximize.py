@@ -208,7 +208,7 @@ class _Evaluator:
         self.scale = 0.0
 
     def parameters(self, x: Vector) -> Parameters:
-        return jax.tree.map(jax.device_put, self.unravel(x))
+        return jax.device_put(self.unravel(x))
 
     def evaluate(self, x: Vector, approximate: bool = False) -> _Point:
         if np.array_equal(x, self.last.x):
