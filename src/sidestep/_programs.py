@@ -89,8 +89,8 @@ def _compile(path: Path, function: Callable[..., Any], arrays: list[Any], struct
 
     def program_of_sidestep(*arrays: Any) -> tuple[Any, ...]:
         nonlocal result
-        given = iter(arrays)
-        leaves = [next(given) if other is ... else other for other in others]
+        remaining = iter(arrays)
+        leaves = [next(remaining) if other is ... else other for other in others]
         outputs, result = jax.tree.flatten(function(*jax.tree.unflatten(structure, leaves)))
         return tuple(outputs)
 
