@@ -51,8 +51,7 @@ def keep_program(function: _Function) -> _Function:
         if folder is None or jax.device_count() > 1 or any(isinstance(array, Tracer) for array in arrays):
             return compiled(*arguments)
         others = tuple(... if isinstance(leaf, jax.Array | np.ndarray) else leaf for leaf in leaves)
-        types = tuple((array.shape, array.dtype, bool(getattr(array, "weak_type", False))) for array in arrays)
-        key = structure, others, types
+        key = structure, others, *((a.shape, a.dtype, bool(getattr(a, "weak_type", False))) for a in arrays)
         if key not in programs:
             text = f"{_package()} {function.__module__}.{function.__qualname__} {key}"
             if " at 0x" in text:  # an address is another one in every process
@@ -95,11 +94,12 @@ def _compile(path: Path, function: Callable[..., Any], arrays: list[Any], struct
         return tuple(outputs)
 
     # an executable that comes from JAX's own cache cannot be stored again; so JAX must not keep this one
+    written_after = jax.config.jax_persistent_cache_min_compile_time_secs  # pyright: ignore[reportAttributeAccessIssue]
     jax.config.update("jax_persistent_cache_min_compile_time_secs", float("inf"))
     try:
         program = jax.jit(program_of_sidestep).lower(*arrays).compile()
     finally:
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", written_after)
     assert result is not None
     # beside the first run of the program; a process waits for its threads before it ends
     Thread(target=_keep, args=(path, program, jax.tree.unflatten(result, range(result.num_leaves)))).start()
