@@ -4,21 +4,21 @@ JAX keeps compiled code (`_cache.keep_compiled_code`), but a new process has to 
 before it can look its code up. For a fit of a small map that takes longer than the fit. `keep_program` stores the whole
 executable (`jax.experimental.serialize_executable`); `python -m benchmarks startup` shows the time of whole processes.
 
-An entry belongs to the files of this package, to the versions of JAX and of the other traced libraries, and to the
-types of all arguments. A function that calls back into Python cannot be stored; where there are several devices, no
-program is. An entry that is damaged, or that XLA refuses because it was made for another kind of processor, is
-replaced.
+An entry belongs to the files of this package, to the versions of JAX and of the other traced libraries, to the kind of
+processor, and to the types of all arguments. A function that calls back into Python cannot be stored; where there are
+several devices, no program is. An entry that is damaged, or that XLA refuses, is replaced.
 """
 
 import hashlib
 import os
 import pickle
+import platform
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache, wraps
 from importlib.util import find_spec
 from pathlib import Path
-from threading import Thread
+from threading import Lock, Thread
 from typing import Any, TypeVar, cast
 
 from sidestep import _cache
@@ -27,6 +27,8 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 _Program = tuple[Callable[..., Any], Any]
 """A function of arrays that returns a tuple of arrays, and the structure of the result."""
 _TRACED_LIBRARIES = ("jax", "jaxlib", "equinox", "optax", "numpy")
+_compiling = Lock()
+"""Held while a setting of JAX is another one."""
 
 
 def keep_program(function: _Function) -> _Function:
@@ -65,7 +67,7 @@ def keep_program(function: _Function) -> _Function:
 
 
 def _load(path: Path) -> _Program | None:
-    """Return the program of an entry; None if it is missing, damaged or made for another kind of processor."""
+    """Return the program of an entry; None if it is missing, damaged or refused by XLA."""
     content = _cache.kept_entry(path)
     if content is None:
         return None
@@ -94,12 +96,14 @@ def _compile(path: Path, function: Callable[..., Any], arrays: list[Any], struct
         return tuple(outputs)
 
     # an executable that comes from JAX's own cache cannot be stored again; so JAX must not keep this one
-    written_after = jax.config.jax_persistent_cache_min_compile_time_secs  # pyright: ignore[reportAttributeAccessIssue]
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", float("inf"))
-    try:
-        program = jax.jit(program_of_sidestep).lower(*arrays).compile()
-    finally:
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", written_after)
+    setting = "jax_persistent_cache_min_compile_time_secs"
+    with _compiling:
+        written_after = getattr(jax.config, setting)
+        jax.config.update(setting, float("inf"))
+        try:
+            program = jax.jit(program_of_sidestep).lower(*arrays).compile()
+        finally:
+            jax.config.update(setting, written_after)
     assert result is not None
     # beside the first run of the program; a process waits for its threads before it ends
     Thread(target=_keep, args=(path, program, jax.tree.unflatten(result, range(result.num_leaves)))).start()
@@ -108,15 +112,16 @@ def _compile(path: Path, function: Callable[..., Any], arrays: list[Any], struct
 
 def _keep(path: Path, program: Any, skeleton: Any) -> None:
     """Store a program if it does not call back into Python."""
+    from jax.errors import JaxRuntimeError
     from jax.experimental.serialize_executable import serialize
 
-    with suppress(AttributeError, NotImplementedError, TypeError, ValueError, pickle.PicklingError):
+    with suppress(AttributeError, JaxRuntimeError, NotImplementedError, TypeError, ValueError, pickle.PicklingError):
         _cache.keep_entry(path, pickle.dumps((serialize(program), skeleton)))
 
 
 @cache
 def _package() -> str:
-    """Return a text of the settings, files and devices for which programs are compiled.
+    """Return a text of the settings, files, processor and devices for which programs are compiled.
 
     The first file of a library stands for its version, which takes longer to read.
     """
@@ -128,4 +133,11 @@ def _package() -> str:
     stats = [(str(file), stat.st_size, stat.st_mtime_ns) for file in files for stat in [file.stat()]]
     variables = sorted(item for item in os.environ.items() if item[0].startswith(("JAX_", "XLA_")))
     settings = jax.config.read("jax_enable_x64"), jax.default_backend(), jax.device_count(), variables
-    return f"{settings} {hashlib.sha256(str(stats).encode()).hexdigest()}"
+    return f"{settings} {hashlib.sha256(f'{stats} {_processor()}'.encode()).hexdigest()}"
+
+
+def _processor() -> str:
+    """Return the kind of processor, and its instructions where the system lists them."""
+    with suppress(OSError), open("/proc/cpuinfo") as lines:
+        return next((line for line in lines if line.lower().startswith(("flags", "features"))), platform.platform())
+    return platform.platform()

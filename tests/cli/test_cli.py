@@ -187,8 +187,8 @@ class TestWithALearnedMap:
     def test_plan_and_evaluate_with_other_maps_or_positions_are_refused(self, learned, capsys):
         capsys.readouterr()
         for arguments, *expected in (
-            ("plan learned --start 0.5,0.5 --goal 9,0.5", "field 'goal'", "outside the map"),
-            ("plan learned --start nan,0.5 --goal 0.5,0.5", "field 'start'", "outside the map"),
+            ("plan learned --start 0.5,0.5 --goal 9,0.5", "field 'goal'", "on the map, x in"),
+            ("plan learned --start nan,0.5 --goal 0.5,0.5", "field 'start'", "on the map, x in"),
             ("plan learned --start 0.5,0.5 --goal 1.5,1.5", "field 'goal'", "known obstacle"),
             ("plan learned --start 1.5,1.5 --goal 0.5,0.5", "field 'start'", "known obstacle"),
             ("evaluate learned --true-map other.yaml", "other.yaml", "2 × 3"),

@@ -11,11 +11,11 @@ import sys
 
 import pytest
 import numpy as np
-from sidestep.cli.drawing import draw, prepare_drawing
+from sidestep.cli.drawing import draw, prepared_drawing
 from sidestep.tabular.grid import Grid
 
-prepare_drawing()
-draw("figure_plan", Path("plan.png"), Grid.unknown(2, 2), np.full((2, 2), 0.5), np.array([0, 1]))
+with prepared_drawing():
+    draw("figure_plan", Path("plan.png"), Grid.unknown(2, 2), np.full((2, 2), 0.5), np.array([0, 1]))
 assert "matplotlib" not in sys.modules  # the second process has drawn
 """
 

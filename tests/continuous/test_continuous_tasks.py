@@ -1,5 +1,6 @@
 """Tasks in continuous worlds: rewards, ends, features, and refusals."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -113,6 +114,8 @@ def test_batch_tasks_task_at_returns_each():
     for index, goal in enumerate(goals):
         assert all(map(np.array_equal, jax.tree.leaves(sc.task_at(batch, index)), jax.tree.leaves(goal)))
     np.testing.assert_array_equal(sc.task_at(batch, jnp.asarray([2, 0])).radius, [2.5, 0.5])
+    traced = jax.jit(lambda goal: sc.batch_tasks([eqx.tree_at(lambda task: task.goal, goals[0], goal)] * 2).goal)
+    np.testing.assert_array_equal(traced(jnp.ones(2)), np.ones((2, 2)))
 
 
 @pytest.mark.parametrize(

@@ -104,6 +104,12 @@ def test_tabular_model_probabilities_add_up_and_keep_the_mean(dynamics, lattice,
     np.testing.assert_allclose(transitions[here, 0] @ lattice.points(), np.exp(log_probabilities) @ means, atol=1e-12)
 
 
+def test_tabular_model_of_dynamics_that_return_nan_raises():
+    nan = jax.tree.map(lambda leaf: leaf * jnp.nan, WALKER.dynamics.parameters)
+    with pytest.raises(ss.InputError, match="expected a possible outcome for every state and action"):
+        replace(WALKER, dynamics=WALKER.dynamics.with_parameters(nan)).tabular_model()
+
+
 def test_tabular_model_outcomes_on_points_are_exact():
     """Moves of one step that are stopped by a field: the target or the place itself, and never outside."""
     field = sc.RadialField(jnp.asarray([1.0, -2.0]), jnp.asarray([[-1.0, 2.0], [2.0, 4.0]]), 1.0)

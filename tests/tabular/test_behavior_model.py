@@ -14,7 +14,7 @@ from sidestep.inference.objective import Objective, Problem
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
 from sidestep.tabular.behavior_model import LEARNABLE, behavior_model
-from sidestep.tabular.demonstrations import gather, split_by_person
+from sidestep.tabular.demonstrations import Trajectory, gather, split_by_person
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import ALL_TERMS
 from sidestep.tabular.models import ObstacleGrid, true_model
@@ -105,6 +105,13 @@ def test_fit_with_a_person_for_each_trajectory_instead_of_each_task_is_refused()
     behavior = behavior_model(agent, person=np.arange(demos.trajectories))
     with pytest.raises(InputError, match=r"field 'person': expected the person of each of the \d tasks \(see split_by"):
         fit(OPEN, demos, behavior)
+
+
+@pytest.mark.parametrize("person", [["ann", "bob"], [0.0, 1.0], [0]])
+def test_split_by_person_without_a_number_for_each_trajectory_raises(person):
+    walk = Trajectory(np.array([1, 2]), np.array([3]), task=0)
+    with pytest.raises(InputError, match="field 'person': expected a whole number for each trajectory"):
+        split_by_person(gather([walk, walk], tasks_of()), np.asarray(person))
 
 
 def test_fit_with_persons_pools_their_betas():

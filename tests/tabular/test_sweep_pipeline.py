@@ -15,6 +15,7 @@ from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.solve import SolveOptions, solve
+from sidestep.tabular.solvers import native
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.native import BOLTZMANN, LOG_SUM_EXP, NativeBackup, cores, run_parallel
 from sidestep.tabular.solvers.sweep_loop import SweepLoop, pipeline
@@ -101,8 +102,9 @@ def test_sweep_loop_pipelined_equals_waiting(kind, fraction):
         np.testing.assert_array_equal(ours, expected)
 
 
-def test_kernel_sizes_of_a_large_grid_equal_those_of_a_small_one():
+def test_kernel_sizes_of_a_large_grid_equal_those_of_a_small_one(monkeypatch):
     """Cores count the states of a large grid in parts."""
+    monkeypatch.setattr(native, "cores", lambda: 2)
     models = [ObstacleGrid(Grid.unknown(size, size)) for size in (5, 200)]
     small, large = (host_process(model, reach(model.graph, 0)).kernel_sizes() for model in models)
     assert small == large == (4, 2, 1)

@@ -5,6 +5,7 @@ import os
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import wraps
 from typing import Annotated, Any
 
@@ -46,17 +47,16 @@ def _prepared(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def run(**values: Any) -> None:
-        if command in _DRAWING:
-            from sidestep.cli.drawing import prepare_drawing
+        from sidestep.cli.drawing import prepared_drawing
 
-            prepare_drawing()
-        import jax
+        with prepared_drawing() if command in _DRAWING else nullcontext():
+            import jax
 
-        from sidestep._cache import keep_compiled_code
+            from sidestep._cache import keep_compiled_code
 
-        jax.config.update("jax_enable_x64", True)
-        keep_compiled_code()
-        command(**values)
+            jax.config.update("jax_enable_x64", True)
+            keep_compiled_code()
+            command(**values)
 
     return run
 

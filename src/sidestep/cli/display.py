@@ -5,8 +5,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
@@ -14,8 +12,6 @@ if TYPE_CHECKING:
 
     FitCallback = Callable[[FitProgress], None]
 
-_console = Console(highlight=False, width=None if sys.stdout.isatty() else 140)
-_errors = Console(stderr=True, highlight=False)
 _HEADINGS = {
     "auc": "AUC",
     "average_precision": "average\nprecision",
@@ -40,7 +36,7 @@ def print_lines(*lines: str) -> None:
         *lines: The lines, without markup.
     """
     for line in lines:
-        _console.print(line, markup=False, soft_wrap=True)
+        print(line)
 
 
 def print_notes(*lines: str) -> None:
@@ -50,7 +46,7 @@ def print_notes(*lines: str) -> None:
         *lines: The lines, without markup.
     """
     for line in lines:
-        _errors.print(line, markup=False, soft_wrap=True)
+        print(line, file=sys.stderr)  # a progress bar on the terminal makes room for it
 
 
 @contextmanager
@@ -63,16 +59,19 @@ def working(text: str) -> Iterator[Callable[[str], None]]:
     Returns:
         A context manager with a function that shows another text.
     """
-    with _errors.status(text) as status:
+    from rich.console import Console
+
+    with Console(stderr=True, highlight=False).status(text) as status:
         yield status.update
 
 
 def _bar(*before_remaining: str, left: str) -> "Progress":
-    from rich import progress
+    from rich import console, progress
 
     done = "{task.description}", progress.BarColumn(), progress.MofNCompleteColumn(), progress.TimeElapsedColumn()
+    errors = console.Console(stderr=True, highlight=False)
     columns = *done, *before_remaining, progress.TimeRemainingColumn(), left
-    return progress.Progress(*columns, console=_errors, transient=True, speed_estimate_period=600)
+    return progress.Progress(*columns, console=errors, transient=True, speed_estimate_period=600)
 
 
 @contextmanager
@@ -124,10 +123,11 @@ def print_scores(rows: Mapping[str, Mapping[str, Any]], columns: Sequence[str] =
         rows: The numbers of each row by key; a dash stands for None.
         columns: The keys of the columns; by default those of `evaluate`.
     """
+    from rich.console import Console
     from rich.table import Table
 
     table = Table("", *(_HEADINGS.get(key, key) for key in columns))
     for name, scores in rows.items():
         cells = (scores.get(key) for key in columns)
         table.add_row(name, *("–" if number is None else f"{number:.3f}" for number in cells))
-    _console.print(table)
+    Console(highlight=False, width=None if sys.stdout.isatty() else 140).print(table)

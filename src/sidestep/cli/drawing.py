@@ -7,16 +7,26 @@ matplotlib already draws by itself, and so does the first one if the second fail
 import os
 import pickle
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from subprocess import DEVNULL, PIPE, Popen
 from typing import Any
 
 
-def prepare_drawing() -> None:
-    """Start the process that draws, unless this one can draw without delay."""
+@contextmanager
+def prepared_drawing() -> Iterator[None]:
+    """Start the process that draws, unless this one can draw without delay; stop it if nothing is drawn."""
     if "matplotlib" not in sys.modules:
         _worker()
+    try:
+        yield
+    finally:
+        if _worker.cache_info().currsize:
+            with _worker() as unused:
+                unused.kill()
+            _worker.cache_clear()
 
 
 def draw(name: str, path: Path, *arguments: Any) -> None:

@@ -124,9 +124,18 @@ class LatticePlanner(eqx.Module):
     behavior: Behavior
     lattice: Lattice
 
-    @eqx.filter_jit
     def tabular_model(self) -> TabularModel:
-        """Return the transition model of the lattice over the world."""
+        """Return the transition model of the lattice over the world.
+
+        Raises:
+            InputError: For an action without a possible outcome, as of dynamics that return NaN.
+        """
+        successors, logits, possible = self._outcomes()
+        return TabularModel(Graph(successors, jnp.ones((1, 1))), logits, possible)
+
+    @eqx.filter_jit
+    def _outcomes(self) -> tuple[Array, Array, Array]:
+        """Return the next points of every point and action, their logits, and whether each is possible."""
 
         def outcomes(state: Vector, action: Array) -> tuple[Array, Array]:
             log_probabilities, means = self.dynamics.outcomes(state, action)
@@ -136,8 +145,7 @@ class LatticePlanner(eqx.Module):
         at_points = jax.vmap(jax.vmap(outcomes, (None, 0)), (0, None))
         successors, probabilities = at_points(self.lattice.points(), self.actions)
         possible = probabilities > 0
-        logits = jnp.log(jnp.where(possible, probabilities, 1.0))
-        return TabularModel(Graph(successors, jnp.ones((1, 1))), logits, possible)
+        return successors, jnp.log(jnp.where(possible, probabilities, 1.0)), possible
 
     @eqx.filter_jit
     def tabular_task(self, task: ContinuousTask) -> Task:

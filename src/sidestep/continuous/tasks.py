@@ -293,10 +293,14 @@ def batch_tasks(tasks: Sequence[_Task]) -> _Task:
     """
     kinds = {(jax.tree.structure(task), *map(np.shape, jax.tree.leaves(task))) for task in tasks}
     check(len(kinds) == 1, "expected at least one task, all of a kind", field="tasks")
-    return jax.tree.map(lambda *leaves: jax.device_put(np.stack(leaves)), *tasks)
+    return _stacked(tasks)
 
 
 @eqx.filter_jit
+def _stacked(tasks: Sequence[_Task]) -> _Task:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *tasks)
+
+
 def task_at(tasks: _Task, index: Array | int) -> _Task:
     """Return one of a batch of tasks, or several for an array of indices.
 
@@ -304,6 +308,12 @@ def task_at(tasks: _Task, index: Array | int) -> _Task:
         tasks: The tasks as a batch.
         index: The index of a task, or an array of them.
     """
+    # an array, because a function is compiled for each number
+    return _task_at(tasks, jnp.asarray(index))
+
+
+@eqx.filter_jit
+def _task_at(tasks: _Task, index: Array) -> _Task:
     return jax.tree.map(lambda leaf: leaf[index], tasks)
 
 

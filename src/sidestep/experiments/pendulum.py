@@ -105,9 +105,8 @@ def run(folder: Path, seed: int = 0, notify: Notify = quiet, config: PendulumCon
     fit = config.fit(dynamics, walks, config.actions, seed, notify, "learning gravity", seen.append, **settings)
     estimate = float(fit.dynamics.constant("gravity"))
     gravity = {"gravity_true": believed, "gravity_estimate": estimate, "gravity_real": real}
-    counts = {"trajectories": len(trajectories), "moves": len(walks)}
-    fitted = {"converged": fit.converged, "message": fit.message}
-    results = {**gravity, "relative_error": abs(estimate - believed) / believed, **counts, **fitted}
+    results = {**gravity, "relative_error": abs(estimate - believed) / believed, "trajectories": len(trajectories)}
+    results |= {"moves": len(walks), "converged": fit.converged, "message": fit.message}
     angles = [trajectory.states[:, 0] for trajectory in trajectories]
     estimates = np.asarray([float(each.constant("gravity")) for each in seen])
     figure = figure_belief(angles, dynamics.time_step, estimates, believed, real)

@@ -110,8 +110,8 @@ def run(folder: Path, seed: int = 0, notify: Notify = quiet, config: Representat
         results[name] = {**score_map(blocked, world), **fitted, "seconds": round(time.monotonic() - began, 1)}
         panels.append(Panel(f"{name} ({results[name]['seconds']:.0f} s)", world.cells, blocked, world.cells))
     best = max(results.values(), key=lambda result: result["auc"])
-    scores = {key: best[key] for key in ("auc", "mean_inside", "mean_outside")}
-    entries = {**scores, "representations": results, "moves": len(walks)}
+    entries = {key: best[key] for key in ("auc", "mean_inside", "mean_outside")}
+    entries |= {"representations": results, "moves": len(walks)}
     return write_results(folder, "representations", seed, started, figure_learned(panels), entries)
 
 

@@ -1,6 +1,6 @@
 """Optimizers of a fit: L-BFGS with a line search, Adam, and a variant of Rprop.
 
-An optimizer has three pure functions over vectors: `init` returns its first state, `step` the next point and state, and
+An optimizer has three functions over vectors: `init` returns its first state, `step` the next point and state, and
 `terminate` tells whether it has converged. The loop that calls them is `maximize`. They minimize a `Loss`, which is
 minus the objective. To add an optimizer, subclass `Optimizer`.
 """
@@ -138,7 +138,7 @@ class LBFGS(Optimizer):
     def step(self, loss: Loss, x: Vector, value: float, gradient: Vector, state: Tree) -> tuple[Vector, Tree] | None:
         """Return the best point along the L-BFGS direction, or None if no point is better than x."""
         for restart in (False, True):
-            memory = self.init(x) if restart else state
+            memory = _lbfgs_memory(self.memory_size, x) if restart else state
             direction, updated = _lbfgs_direction(self.memory_size, gradient, memory, x)
             best = _line_search(-np.asarray(direction, dtype=x.dtype), loss, x, value, gradient)
             if best is not None:

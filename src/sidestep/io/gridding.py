@@ -202,5 +202,5 @@ def _check_inside(positions: Points, rows: Int[np.ndarray, " points"], prefix: s
     """Raise `InputError` for the first position outside the map; its columns are x and y after the prefix."""
     inside, column = grid.contains(positions), grid.to_cell_units(positions)[:, 0]
     field = prefix + ("y" if 0 <= column[np.argmin(np.where(inside, np.inf, rows))] <= grid.shape[1] else "x")
-    message = "expected a position on the map, by its `resolution` and `origin`, found ({}, {})"
+    message = f"expected a position on the map, {grid.extent()} by its `resolution` and `origin`, found ({{}}, {{}})"
     check_rows(inside, message, walks.source, field, rows, positions)

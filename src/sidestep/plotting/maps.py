@@ -78,7 +78,7 @@ def draw_cells(
     extent = (0.0, columns * grid.resolution, 0.0, rows * grid.resolution)
     image = axes.imshow(values, cmap=colors, clim=limits, extent=extent, origin="upper", interpolation_stage="rgba")
     image.set_transform(Affine2D().rotate(yaw).translate(x, y) + axes.transData)
-    low, high = _corners(grid).min(axis=0), _corners(grid).max(axis=0)
+    low, high = grid.corners().min(axis=0), grid.corners().max(axis=0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x (m)", ylabel="y (m)")
     if max(grid.shape) <= _MOST_CELL_LINES:
         axes.add_collection(LineCollection(_cell_lines(grid), colors="0.75", linewidths=0.4, zorder=1), autolim=False)
@@ -334,11 +334,6 @@ def _width(grid: Grid, least: float, most: float) -> float:
 
 def _size(grid: Grid, longer: float) -> tuple[float, float]:
     """Return width and height of a map with a longer side of `longer` inches."""
-    span = np.ptp(_corners(grid), axis=0)
+    span = np.ptp(grid.corners(), axis=0)
     width, height = np.maximum(span * longer / span.max(), 0.8)
     return float(width), float(height)
-
-
-def _corners(grid: Grid) -> Float[np.ndarray, "4 2"]:
-    rows, columns = grid.shape
-    return grid.to_metres(np.array([[0, 0], [columns, 0], [columns, rows], [0, rows]], dtype=np.float64))

@@ -125,6 +125,9 @@ def split_by_person(
     Returns:
         The demonstrations with the split tasks, and the index of the person of each task.
 
+    Raises:
+        InputError: For a person that is not a whole number, and where there is not one for each trajectory.
+
     Example:
         >>> from sidestep.tabular.grid import Grid
         >>> from sidestep.tabular.tasks import reach
@@ -133,7 +136,10 @@ def split_by_person(
         >>> split_by_person(shown, np.array([0, 1]))[1].tolist()  # the goal of both is now two tasks
         [0, 1]
     """
-    of_moves = np.asarray(person)[np.asarray(demonstrations.trajectory)]
+    person = np.asarray(person)
+    whole = person.shape == (demonstrations.trajectories,) and person.dtype.kind in "iu"
+    check(whole, f"expected a whole number for each trajectory, found {person.dtype} {person.shape}", field="person")
+    of_moves = person[np.asarray(demonstrations.trajectory)]
     pairs, task = np.unique(np.stack([np.asarray(demonstrations.task), of_moves], axis=1), axis=0, return_inverse=True)
     tasks = jax.tree.map(lambda leaf: to_jax(np.asarray(leaf)[pairs[:, 0]]), demonstrations.tasks)
     split = eqx.tree_at(lambda each: (each.task, each.tasks), demonstrations, (flat_moves([task]), tasks))

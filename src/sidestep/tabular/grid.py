@@ -132,7 +132,8 @@ class Grid:
         inside = self.contains(positions)
         if not inside.all():
             index = int(np.argmin(inside))
-            raise InputError(f"position {tuple(positions[index].tolist())} lies outside the map", row=index + 1)
+            message = f"expected a position on the map, {self.extent()}, found {positions[index].tolist()}"
+            raise InputError(message, row=index + 1)
         rows, columns = self.shape
         # a position on a border, but for rounding, belongs to the cell above or to the right of it; one on the outer
         # edge to the cell inside it
@@ -159,6 +160,16 @@ class Grid:
         rows, columns = self.shape
         row, column = np.divmod(np.asarray(states), columns)
         return self.to_metres(np.stack([column + 0.5, rows - row - 0.5], axis=-1))
+
+    def corners(self) -> Float[np.ndarray, "4 2"]:
+        """Return the corners of the map in metres, the lower left one first."""
+        rows, columns = self.shape
+        return self.to_metres(np.array([[0, 0], [columns, 0], [columns, rows], [0, rows]], dtype=np.float64))
+
+    def extent(self) -> str:
+        """Return the ranges of x and y on the map, for messages."""
+        (left, bottom), (right, top) = self.corners().min(axis=0), self.corners().max(axis=0)
+        return f"x in {left:g} to {right:g} m and y in {bottom:g} to {top:g} m"
 
     def to_cell_units(self, positions: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 2"]:
         """Return positions in metres as (columns from the left, rows from the *bottom*), not rounded.

@@ -186,7 +186,7 @@ def state_at(world: Grid | Graph, place: int | tuple[float, float], field: str) 
             raise InputError(f"on a graph the {field} is a state, not a position", field=field)
         position = np.asarray([place], dtype=np.float64)
         on_map = position.shape == (1, 2) and world.contains(position)[0]
-        check(on_map, f"the {field} {place} lies outside the map", field=field)
+        check(on_map, f"expected a position on the map, {world.extent()}, found {place}", field=field)
         place = world.state(place)
     check(0 <= place < states, f"expected a state in 0…{states - 1}, found {place}", field=field)
     if isinstance(world, Grid):
