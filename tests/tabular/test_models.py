@@ -54,7 +54,7 @@ def test_contains_includes_the_border_only():
     assert grid.states(np.array([[0.0, 0.0], [3.0, 2.0]])).tolist() == [3, 2]
     outside = np.array([[3.1, 1.0], [1.0, -0.1], [np.nan, 1.0], [np.inf, 1.0]])
     assert not grid.contains(outside).any()
-    with pytest.raises(InputError, match=r"row 2.*outside"):
+    with pytest.raises(InputError, match=r"row 2.*y in 0 to 2 m, found \[3\.1, 1\.0\]"):
         grid.states(np.array([[1.0, 1.0], [3.1, 1.0]]))
 
 
