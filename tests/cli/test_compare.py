@@ -83,13 +83,15 @@ def test_compare_with_defaults_gives_every_method_every_score(office, compared):
 
 def test_readme_code_learn_and_compare_give_the_same_map(office, tmp_path, monkeypatch):
     """The block of Python in README.md, in a folder with the files that it names."""
-    for name, file in (("office.yaml", "half.yaml"), ("half.pgm", "half.pgm"), ("walks.csv", "walks.csv")):
+    for name, file in (("office.yaml", "half.yaml"), ("truth.yaml", "true.yaml")):
         shutil.copy(office / file, tmp_path / name)
+    for name in ("half.pgm", "true.pgm", "walks.csv"):
+        shutil.copy(office / name, tmp_path)
     monkeypatch.chdir(tmp_path)
     code = README.read_text().split("```python\n")[1].split("```")[0]
     # a start and a goal in the office of this test
     names: dict[str, Any] = {}
-    exec(code.replace("start=(0.5, 0.5), goal=(3.5, 6.5)", "start=(-0.75, 4.2), goal=(1.25, 4.25)"), names)
+    exec(code.replace("start=(3.5, 1.5), goal=(5.5, 7.5)", "start=(-0.75, 4.2), goal=(1.25, 4.25)"), names)
     assert len(names["path"]) == 13
     assert compare(office, tmp_path / "compared", "--hold-out", 0) == 0
     assert call("learn", office / "walks.csv", "--map", office / "half.yaml", "--out", tmp_path / "by_learn") == 0

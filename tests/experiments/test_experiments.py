@@ -92,7 +92,7 @@ def test_demo_in_a_small_office_writes_map_and_numbers(tmp_path):
     assert set(summary["scores"]) >= SCORES
     assert summary["scores"]["auc"] > 0.7
     assert {path.name for path in tmp_path.iterdir()} == {
-        "demo.png", "learned", "summary.json", "truth.pgm", "truth.yaml", "walks.csv",
+        "demo.png", "learned", "office.pgm", "office.yaml", "summary.json", "truth.pgm", "truth.yaml", "walks.csv",
     }  # fmt: skip
     learned = ss.load_map(tmp_path / "learned")
     assert learned.unknown.all()  # nothing of the office was known

@@ -29,10 +29,10 @@ app = typer.Typer(
 _EXAMPLES: dict[Callable[..., None], str] = {
     experiments.demo: "sidestep demo --out demo",
     learn: "sidestep learn walks.csv --map office.yaml --out learned",
-    plan: "sidestep plan learned --start 0.5,0.5 --goal 3.5,6.5",
-    evaluate: "sidestep evaluate learned --true-map office.yaml",
-    compare: "sidestep compare walks.csv --map blank.yaml --true-map office.yaml --out compared",
-    simulate: "sidestep simulate office.yaml --out walks.csv --walks 200 --goals 6",
+    plan: "sidestep plan learned --start 3.5,1.5 --goal 5.5,7.5",
+    evaluate: "sidestep evaluate learned --true-map truth.yaml",
+    compare: "sidestep compare walks.csv --map office.yaml --true-map truth.yaml --out compared",
+    simulate: "sidestep simulate truth.yaml --out walks.csv --walks 200 --goals 6",
     experiments.reproduce: "sidestep reproduce --out figures",
     experiments.experiment: "sidestep experiment room --out room",
 }

@@ -33,7 +33,7 @@ class DemoConfig:
 
 
 def demo(folder: Path, seed: int = 0, notify: Notify = quiet, config: DemoConfig | None = None) -> Summary:
-    """Run the demonstration; write `demo.png`, the true map, the walks and the learned map.
+    """Run the demonstration; write `demo.png`, the walks, and three maps: without obstacles, true, learned.
 
     Args:
         folder: The folder to write to.
@@ -51,6 +51,7 @@ def demo(folder: Path, seed: int = 0, notify: Notify = quiet, config: DemoConfig
     trajectories, goals = simulate_walks(truth, agents)
     walks = walks_from_trajectories(trajectories, goals, truth)
     ss.write_map(folder / "truth.yaml", truth.known.astype(np.float64), truth)
+    ss.write_map(folder / "office.yaml", np.full(truth.shape, 0.5), truth.forget())
     ss.write_walks(folder / "walks.csv", walks)
 
     notify("learning the map from their walks")
