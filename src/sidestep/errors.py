@@ -1,5 +1,7 @@
 """Errors of `sidestep`: each names the place, the expectation and the actual value."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from math import isfinite
 from numbers import Integral
 
@@ -45,6 +47,15 @@ def check(
     """Raise `InputError` with a message and a place unless something is true."""
     if not valid:
         raise InputError(message, source=source, row=row, field=field)
+
+
+@contextmanager
+def input_errors(message: str, *kinds: type[Exception], source: object, field: str | None = None) -> Iterator[None]:
+    """Turn errors of these kinds, inside a `with`, into `InputError`: the message, then the text of the error."""
+    try:
+        yield
+    except kinds as error:
+        raise InputError(f"{message}: {error}", source=source, field=field) from error
 
 
 def check_count(value: object, least: int, field: str) -> None:

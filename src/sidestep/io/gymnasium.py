@@ -81,22 +81,19 @@ def from_gymnasium(env: Any, discount: float = 0.99) -> Environment:
 def _outcomes(rows: Any) -> tuple[Any, ...]:
     """Return probability, next state, reward and whether the episode ends, of each outcome; and the separate ends."""
     table = [[[each for each in rows[s][a] if each[0] > 0] for a in rows[s]] for s in range(len(rows))]
-    width = max(1, *(len(outcomes) for row in table for outcomes in row))
+    outcomes = [(s, *each) for s, row in enumerate(table) for action in row for each in action]
+    # a state needs a separate end if episodes also pass it
+    ended = {int(after) for _, _, after, _, ends in outcomes if ends}
+    passed = {int(after) for s, _, after, _, ends in outcomes if not ends and s not in ended}
+    separate = {state: len(table) + index for index, state in enumerate(sorted(ended & passed))}
+    table += [[[(1.0, end, 0.0, False)]] * len(table[0]) for end in separate.values()]
+    width = max(1, *(len(action) for row in table for action in row))
     padded = [[each + [(0.0, s, 0.0, False)] * (width - len(each)) for each in row] for s, row in enumerate(table)]
     probabilities, states, rewards, ending = np.moveaxis(np.array(padded, dtype=np.float64), -1, 0)
     successors, ending = states.astype(np.int64), ending > 0
-    # a state needs a separate end if episodes also pass it
-    ended = np.unique(successors[ending])
-    acting = ~np.isin(np.arange(len(table)), ended)[:, None, None]
-    separate = np.intersect1d(ended, successors[(probabilities > 0) & ~ending & acting])
-    new = len(table) + np.arange(len(separate))
-    moved = ending & np.isin(successors, separate)
-    successors[moved] = new[np.searchsorted(separate, successors[moved])]
-    shape = len(new), *successors.shape[1:]
-    added = np.arange(width) == 0, new[:, None, None], 0.0, False
-    arrays = zip((probabilities, successors, rewards, ending), added, strict=True)
-    joined = (np.concatenate([array, np.broadcast_to(row, shape)]) for array, row in arrays)
-    return *joined, dict(zip(separate.tolist(), new.tolist(), strict=True))
+    for state, end in separate.items():
+        successors[ending & (successors == state)] = end
+    return probabilities, successors, rewards, ending, separate
 
 
 def slippery(environment: Environment, logit: float = 0.0) -> TiedModel:
@@ -162,11 +159,10 @@ def collect(env: Any, world: Environment, act: Act, episodes: int, *, seed: int 
     random, trajectories = np.random.default_rng(seed), []
     for episode in range(episodes):
         state, _ = env.reset(seed=seed if episode == 0 else None)
-        states, actions, over = [int(state)], [], False
-        while not over:
+        states, actions, terminated, truncated = [int(state)], [], False, False
+        while not (terminated or truncated):
             actions.append(int(act(states[-1], random)))
             state, _, terminated, truncated, _ = env.step(actions[-1])
             states.append(world.ends.get(int(state), int(state)) if terminated else int(state))
-            over = terminated or truncated
         trajectories.append(Trajectory(np.asarray(states), np.asarray(actions), task))
     return trajectories

@@ -107,9 +107,9 @@ def read_trips(path: str | Path, roads: Roads) -> list[Int[np.ndarray, " _"]]:
     table = _read(path, ("trip", "origin", "destination", "links"))
     number = {label: index for index, label in enumerate(roads.labels)}
     turns = {(int(begin), int(onto)) for begin, onto in roads.turns}
-    ends = zip(*(_labels(table, name, path) for name in ("origin", "destination")), strict=True)
+    columns = [_labels(table, name, path) for name in ("origin", "destination", "links")]
     trips = []
-    for row, (cell, (origin, destination)) in enumerate(zip(_labels(table, "links", path), ends, strict=True), start=1):
+    for row, (origin, destination, cell) in enumerate(zip(*columns, strict=True), start=1):
         trip = cell.split()
         check_trip = partial(check, source=path, row=row)
         check_trip(len(trip) >= 2, f"expected at least two links, found {len(trip)}", field="links")

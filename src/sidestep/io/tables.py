@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from pyarrow import parquet
 
 from sidestep._files import read_whole, write_whole
-from sidestep.errors import InputError, check
+from sidestep.errors import InputError, check, input_errors
 
 _WHOLE_NUMBER = r"^-?(0|[1-9][0-9]{0,17})$"
 _NUMBER = r"^-?(0|[1-9][0-9]{0,14})(\.[0-9]+)?([eE][+-]?[0-9]{1,3})?$"
@@ -31,13 +31,10 @@ def read_table(path: str | Path, labels: tuple[str, ...] = ()) -> pa.Table:
         InputError: For another ending, a file that cannot be read or is empty, text that is not UTF-8, a row of another
             length than the header (with its row), and for column names that repeat.
     """
-    table = _by_ending(path, _read_csv, _read_parquet)(Path(path))
+    table = _by_ending(path, lambda file: _read_csv(file, labels), _read_parquet)(Path(path))
     for name in table.column_names:
         check(table.column_names.count(name) == 1, "the column appears more than once", source=path, field=name)
-    if Path(path).suffix.lower() != ".csv":
-        return table
-    columns = [_typed(table[name], fractions=name not in labels) for name in table.column_names]
-    return table.from_arrays(columns, table.column_names)
+    return table
 
 
 def write_table(path: str | Path, table: pa.Table) -> None:
@@ -51,10 +48,8 @@ def write_table(path: str | Path, table: pa.Table) -> None:
         InputError: For another ending, and for a column that CSV cannot represent.
     """
     write = _by_ending(path, pyarrow.csv.write_csv, parquet.write_table)
-    try:
+    with input_errors("the table cannot be written", pa.ArrowException, source=path):
         write_whole(path, lambda file: write(table, file))
-    except pa.ArrowException as error:
-        raise InputError(f"the table cannot be written: {error}", source=path) from error
 
 
 def check_rows(
@@ -80,8 +75,7 @@ def check_rows(
     """
     if not valid.all():
         rows = np.arange(1, len(valid) + 1) if rows is None else rows
-        invalid = np.flatnonzero(~valid)
-        index = invalid[np.argmin(rows[invalid])]
+        index = int(np.argmin(np.where(valid, np.inf, rows)))
         content = values[index] if len(values) else ()
         text = message.format(*(content.tolist() if isinstance(content, np.ndarray) else [content]))
         raise InputError(text, source=source, row=int(rows[index]), field=field)
@@ -158,8 +152,8 @@ def _by_ending(path: str | Path, for_csv: Callable, for_parquet: Callable) -> Ca
     return functions[ending]
 
 
-def _read_csv(path: Path) -> pa.Table:
-    """Return a CSV with every cell as text, nulls where a cell is empty."""
+def _read_csv(path: Path, labels: tuple[str, ...]) -> pa.Table:
+    """Return the table in a CSV, read with every cell as text, and null where a cell is empty."""
     content = read_whole(path)
     ragged: list[pyarrow.csv.InvalidRow] = []
 
@@ -168,30 +162,29 @@ def _read_csv(path: Path) -> pa.Table:
         return "skip"
 
     try:
-        header = next(filter(None, csv.reader(io.StringIO(content.decode("utf-8-sig")))), [])
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        row = content[: error.start].count(b"\n")
+        raise InputError("expected text in UTF-8", source=path, row=row or None) from error
+    with input_errors("expected a table in CSV", pa.ArrowException, csv.Error, source=path):
+        header = next(filter(None, csv.reader(io.StringIO(text))), [])
         one_thread = pyarrow.csv.ReadOptions(use_threads=False)  # Rows are numbered only by one thread.
         parse = pyarrow.csv.ParseOptions(newlines_in_values=True, invalid_row_handler=remember)
         types = {name: pa.string() for name in header}
         convert = pyarrow.csv.ConvertOptions(column_types=types, null_values=[""], strings_can_be_null=True)
         table = pyarrow.csv.read_csv(pa.BufferReader(content), one_thread, parse, convert)
-    except UnicodeDecodeError as error:
-        row = content[: error.start].count(b"\n")
-        raise InputError("expected text in UTF-8", source=path, row=row or None) from error
-    except (pa.ArrowException, csv.Error) as error:
-        raise InputError(f"expected a table in CSV: {error}", source=path) from error
     if ragged:
         first = ragged[0]
         message = f"expected {first.expected_columns} cells as in the header, found {first.actual_columns}"
         raise InputError(message, source=path, row=first.number - 1)
-    return table
+    columns = zip(table.column_names, table.columns, strict=True)
+    return table.from_arrays([_typed(column, name not in labels) for name, column in columns], table.column_names)
 
 
 def _read_parquet(path: Path) -> pa.Table:
     """Return the table in a Parquet file; unlike `read_table`, `ParquetFile` adds no columns for folder names."""
-    try:
+    with input_errors("expected a table in Parquet", pa.ArrowException, OSError, source=path):
         return parquet.ParquetFile(pa.BufferReader(read_whole(path))).read()
-    except (pa.ArrowException, OSError) as error:
-        raise InputError(f"expected a table in Parquet: {error}", source=path) from error
 
 
 def _typed(column: pa.ChunkedArray, fractions: bool) -> pa.ChunkedArray:

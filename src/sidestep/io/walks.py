@@ -201,24 +201,23 @@ def table_from_walks(walks: Walks) -> pa.Table:
     Args:
         walks: The walks.
     """
-    lengths = np.diff(walks.offsets)
-    goals = np.repeat(walks.goals, lengths, axis=0)
-    columns = {"walk": pa.array(walks.labels).take(np.repeat(np.arange(len(walks)), lengths)), "step": walks.steps}
-    columns |= position_columns("", walks.positions) | position_columns("goal_", goals)
+    walk = np.repeat(np.arange(len(walks)), np.diff(walks.offsets))
+    columns = {"walk": pa.array(walks.labels).take(walk), "step": walks.steps}
+    columns |= position_columns("", walks.positions) | position_columns("goal_", walks.goals[walk])
     if not np.isnan(walks.failed_moves).all():
-        failed = position_columns("failed_", walks.failed_moves)
-        columns |= {name: pa.array(values, from_pandas=True) for name, values in failed.items()}
+        columns |= position_columns("failed_", walks.failed_moves)
     return pa.table(columns | {name: walks.metadata[name] for name in walks.metadata.column_names})
 
 
-def position_columns(prefix: str, positions: Float[np.ndarray, "rows 2"]) -> dict[str, Any]:
-    """Return x and y of positions as columns of a table.
+def position_columns(prefix: str, positions: Float[np.ndarray, "rows 2"]) -> dict[str, pa.Array]:
+    """Return x and y of positions as columns of a table; a cell is empty where a position is NaN.
 
     Args:
         prefix: What the names of the columns have before x and y.
         positions: x and y (metres) in each row.
     """
-    return {f"{prefix}x": positions[:, 0], f"{prefix}y": positions[:, 1]}
+    columns = zip("xy", positions.T, strict=True)
+    return {f"{prefix}{axis}": pa.array(values, from_pandas=True) for axis, values in columns}
 
 
 def _store(path: str | Path) -> tuple[Callable[[Any], pa.Table], Callable[[Any, pa.Table], None], str | Path]:

@@ -6,8 +6,9 @@ or text that is not an id, such as `./office-v0`. Nothing is ever downloaded.
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -17,6 +18,8 @@ from jaxtyping import Float
 from sidestep._files import write_whole_folder
 from sidestep.errors import InputError, SidestepError, check
 
+Metadata = Mapping[str, Any]
+"""Data about an episode or a dataset, by name."""
 _ID = re.compile(r"(?:(?P<namespace>[-\w]+(?:/[-\w]+)*)/)?[-\w]+?(?P<version>-v\d+)?")
 
 
@@ -38,24 +41,8 @@ class Episode(NamedTuple):
     rewards: Float[np.ndarray, " moves"]
     terminated: bool
     infos: Mapping[str, Any]
-    metadata: Mapping[str, Any]
+    metadata: Metadata
     source: str = ""
-
-
-class Dataset(NamedTuple):
-    """A dataset in memory.
-
-    Attributes:
-        observation_space: A space of Gymnasium.
-        action_space: A space of Gymnasium.
-        metadata: Of the whole dataset.
-        episodes: At least one.
-    """
-
-    observation_space: Any
-    action_space: Any
-    metadata: Mapping[str, Any]
-    episodes: list[Episode]
 
 
 def require_minari(dataset: str | Path) -> None:
@@ -64,15 +51,12 @@ def require_minari(dataset: str | Path) -> None:
     Args:
         dataset: The name of the dataset, for the error.
     """
-    try:
-        import minari  # noqa: F401
-    except ImportError as error:
-        message = "a Minari dataset, but Minari is not installed: expected pip install 'sidestep[minari]' to have run"
-        raise InputError(message, source=dataset) from error
+    message = "a Minari dataset, but Minari is not installed: expected pip install 'sidestep[minari]' to have run"
+    check(find_spec("minari") is not None, message, source=dataset)
 
 
-def read_dataset(dataset: str | Path, check_spaces: Callable[[Any, Any], None]) -> Dataset:
-    """Return a dataset on this machine.
+def read_dataset(dataset: str | Path, check_spaces: Callable[[Any, Any], None]) -> tuple[Metadata, list[Episode]]:
+    """Return the metadata of a dataset on this machine, and its episodes, at least one.
 
     Args:
         dataset: Its id or its path.
@@ -88,26 +72,25 @@ def read_dataset(dataset: str | Path, check_spaces: Callable[[Any, Any], None]) 
         from minari import MinariDataset
         from minari.storage import get_dataset_path
 
-        by_id = isinstance(dataset, str) and _ID.fullmatch(dataset)
-        folder = get_dataset_path(str(dataset)) if by_id else Path(dataset)
+        folder = get_dataset_path(dataset) if isinstance(dataset, str) and _ID.fullmatch(dataset) else Path(dataset)
         data = folder / "data" if (folder / "data").is_dir() else folder
         message = "there is no such dataset here: expected one that `minari list local` shows, or the path of one"
         check((data / "metadata.json").is_file(), message, source=dataset)
         opened = MinariDataset(data)
         check_spaces(opened.observation_space, opened.action_space)
-        stored = list(opened.iterate_episodes())
-        metadata = list(opened.storage.get_episode_metadata(opened.episode_indices))
-        spaces, whole = (opened.observation_space, opened.action_space), opened.storage.metadata
-    check(stored, "expected at least one episode, found none", source=dataset)
-    return Dataset(*spaces, whole, [_episode(dataset, each, own) for each, own in zip(stored, metadata, strict=True)])
+        check(len(opened), "expected at least one episode, found none", source=dataset)
+        stored = list(zip(opened, opened.storage.get_episode_metadata(opened.episode_indices), strict=True))
+        return opened.storage.metadata, [_episode(dataset, episode, metadata) for episode, metadata in stored]
 
 
-def write_dataset(dataset: str, content: Dataset) -> None:
+def write_dataset(dataset: str, spaces: tuple[Any, Any], episodes: Sequence[Episode], metadata: Metadata) -> None:
     """Write a dataset under an id atomically.
 
     Args:
         dataset: A new id with a version, such as `office/walks-v0`.
-        content: What to write.
+        spaces: Gymnasium's spaces of the observations and of the actions.
+        episodes: At least one.
+        metadata: Of the whole dataset.
 
     Raises:
         InputError: For an id that is malformed or exists already, and for data that Minari cannot store.
@@ -115,23 +98,23 @@ def write_dataset(dataset: str, content: Dataset) -> None:
     parts = _ID.fullmatch(dataset)
     if parts is None or parts["version"] is None:
         raise InputError("expected an id with a version, such as office/walks-v0", source=dataset)
+
+    def fill(folder: Path) -> None:
+        from minari import __version__
+        from minari.dataset.minari_storage import MinariStorage
+
+        storage = MinariStorage.new(folder / "data", *spaces)
+        storage.update_metadata({"dataset_id": dataset, "minari_version": __version__, **metadata})
+        storage.update_episodes([_buffer(episode) for episode in episodes])
+        storage.update_episode_metadata([dict(episode.metadata) for episode in episodes])
+
     with _input_errors(dataset, "written"):
         from minari.namespace import create_namespace, list_local_namespaces
         from minari.storage import get_dataset_path
 
-        write_whole_folder(get_dataset_path(dataset), lambda partial: _fill(partial / "data", dataset, content))
+        write_whole_folder(get_dataset_path(dataset), fill)
         if parts["namespace"] is not None and parts["namespace"] not in list_local_namespaces():
             create_namespace(parts["namespace"])
-
-
-def _fill(data: Path, dataset: str, content: Dataset) -> None:
-    from minari import __version__
-    from minari.dataset.minari_storage import MinariStorage
-
-    storage = MinariStorage.new(data, content.observation_space, content.action_space)
-    storage.update_metadata({"dataset_id": dataset, "minari_version": __version__, **content.metadata})
-    storage.update_episodes([_buffer(episode) for episode in content.episodes])
-    storage.update_episode_metadata([dict(episode.metadata) for episode in content.episodes])
 
 
 def _buffer(episode: Episode) -> Any:
@@ -144,7 +127,7 @@ def _buffer(episode: Episode) -> Any:
     return EpisodeBuffer(**fields, **ends, infos=dict(episode.infos))
 
 
-def _episode(dataset: str | Path, stored: Any, metadata: Mapping[str, Any]) -> Episode:
+def _episode(dataset: str | Path, stored: Any, metadata: Metadata) -> Episode:
     """Return an episode from one of Minari's; raise `InputError` for one without a move, or of other lengths."""
     source, moves, observations = f"{dataset}, episode {stored.id}", len(stored.rewards), stored.observations
     check(moves != 0, "expected at least one move, found none", source=source, field="rewards")

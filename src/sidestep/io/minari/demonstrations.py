@@ -15,12 +15,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from sidestep.errors import InputError, check
-from sidestep.io.minari.datasets import Dataset, Episode, read_dataset, require_minari, write_dataset
+from sidestep.errors import InputError, check, input_errors
+from sidestep.io.minari.datasets import Episode, Metadata, read_dataset, require_minari, write_dataset
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.grid import Grid
@@ -52,16 +53,17 @@ def write_demonstrations(
     from gymnasium.spaces import Discrete
 
     states, actions = _world_size(world)
-    own_states, last_action = demonstrations.tasks.terminal.shape[-1], np.asarray(demonstrations.actions).max()
+    moves = jax.tree.map(np.asarray, demonstrations)
+    own_states, last_action = moves.tasks.terminal.shape[-1], moves.actions.max()
     message = f"expected demonstrations in a world of {states} states and {actions} actions"
     message += f", found {own_states} states and action {last_action}"
     check(own_states == states and last_action < actions, message, field="demonstrations")
     names = ("discount", "terminal_reward", "reward")
-    columns = {name: np.asarray(getattr(demonstrations.tasks, name), dtype=np.float64).tolist() for name in names}
-    columns["terminal"] = [np.flatnonzero(ends).tolist() for ends in np.asarray(demonstrations.tasks.terminal)]
+    columns = {name: getattr(moves.tasks, name).astype(np.float64).tolist() for name in names}
+    columns["terminal"] = [np.flatnonzero(terminal).tolist() for terminal in moves.tasks.terminal]
     tasks = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
-    episodes = list(_episodes(demonstrations, tasks, (states, actions), ends))
-    write_dataset(dataset, Dataset(Discrete(states - len(ends)), Discrete(actions), {"tasks": tasks}, episodes))
+    spaces = Discrete(states - len(ends)), Discrete(actions)
+    write_dataset(dataset, spaces, list(_episodes(moves, tasks, actions, ends)), {"tasks": tasks})
 
 
 def read_demonstrations(
@@ -101,62 +103,59 @@ def read_demonstrations(
             fits = isinstance(space, Discrete) and space.n == count and space.start == 0
             check(fits, f"expected Discrete({count}), as the world has, found {space}", source=dataset, field=field)
 
-    stored = read_dataset(dataset, check_spaces)
-    if task is None:
-        tasks, indices = _tasks_of_episodes(stored, dataset, world, discount, step_cost)
-    elif task.terminal.shape == (states,):
-        tasks, indices = [task], [0] * len(stored.episodes)
+    metadata, episodes = read_dataset(dataset, check_spaces)
+    entries = metadata.get("tasks")
+    if task is not None:
+        message = f"expected one task of {states} states, found {task.terminal.shape}"
+        check(task.terminal.shape == (states,), message, field="task")
+        tasks, indices = [task], [0] * len(episodes)
+    elif entries is not None:
+        check(isinstance(entries, list) and entries, "expected a list of tasks", source=dataset, field="tasks")
+        tasks = [_task(entry, world, f"{dataset}, task {index}") for index, entry in enumerate(entries)]
+        indices = [_entry_of(episode, entries) for episode in episodes]
     else:
-        raise InputError(f"expected one task of {states} states, found {task.terminal.shape}", field="task")
-    pairs = zip(stored.episodes, indices, strict=True)
+        tasks, indices = _tasks_of_goals(episodes, world, discount, step_cost)
+    pairs = zip(episodes, indices, strict=True)
     trajectories = [_trajectory(episode, index, states - len(ends), actions, ends) for episode, index in pairs]
     try:
         return gather(trajectories, tasks)
     except InputError as error:
-        raise error.of(dataset if error.row is None else stored.episodes[error.row - 1].source) from error
+        raise error.of(dataset if error.row is None else episodes[error.row - 1].source) from error
 
 
 def _episodes(
-    demonstrations: Demonstrations[Task], tasks: list[dict], size: tuple[int, int], ends: Mapping[int, int]
+    moves: Demonstrations[Task], tasks: list[dict], actions: int, ends: Mapping[int, int]
 ) -> Iterator[Episode]:
-    """Yield the episode of each trajectory; `tasks` describes each task, `size` counts states and actions."""
+    """Yield the episode of each trajectory; `moves` has NumPy's arrays, `tasks` describes each task."""
     origin = {own: state for state, own in ends.items()}
-    before, after = np.asarray(demonstrations.states), np.asarray(demonstrations.next_states)
-    acted, task = np.asarray(demonstrations.actions), np.asarray(demonstrations.task)
-    rewards = _rewards(demonstrations, *size)
-    ended = np.asarray(demonstrations.tasks.terminal)[task, after]
-    trajectory = np.asarray(demonstrations.trajectory)
-    for moves in np.split(np.arange(len(trajectory)), np.flatnonzero(np.diff(trajectory)) + 1):
-        first, last = moves[0], moves[-1]
-        connected = (after[moves[:-1]] == before[moves[1:]]).all() and (task[moves] == task[first]).all()
+    rewards = _rewards(moves, actions)
+    for row, own in enumerate(np.split(np.arange(len(moves)), moves.first_moves()[1:]), start=1):
+        before, after, task = moves.states[own], moves.next_states[own], moves.task[own]
+        connected = (after[:-1] == before[1:]).all() and (task == task[0]).all()
         message = "expected moves that each start where the one before ended, and one task"
-        check(connected, message, source="trajectory", row=int(trajectory[first]) + 1)
-        end = origin.get(int(after[last]), int(after[last]))
-        path = np.append(before[moves], end).astype(np.int64)
-        entry = tasks[task[first]]
-        goals = _best_terminal_states(entry)
-        metadata = {"task": int(task[first]), "discount": entry["discount"]}
+        check(connected, message, source="trajectory", row=row)
+        index, last = int(task[0]), int(after[-1])
+        path = np.append(before, origin.get(last, last)).astype(np.int64)
+        acted = moves.actions[own].astype(np.int64)
+        metadata = {"task": index, "discount": tasks[index]["discount"]}
+        goals = _best_terminal_states(tasks[index])
         metadata |= {"goal": goals[0] if len(goals) == 1 else goals} if goals else {}
-        yield Episode(path, acted[moves].astype(np.int64), rewards[moves], bool(ended[last]), {}, metadata)
+        yield Episode(path, acted, rewards[own], last in tasks[index]["terminal"], {}, metadata)
 
 
-def _rewards(demonstrations: Demonstrations[Task], states: int, actions: int) -> Float[np.ndarray, " moves"]:
+def _rewards(moves: Demonstrations[Task], actions: int) -> Float[np.ndarray, " moves"]:
     """Return the reward of each move: R(s, a), plus γ times the terminal reward if the move ends the task."""
-    tasks, task = demonstrations.tasks, np.asarray(demonstrations.task)
-    number, after = len(tasks.discount), np.asarray(demonstrations.next_states)
-    reward = np.broadcast_to(np.asarray(tasks.reward, dtype=np.float64), (number, states, actions))
-    terminal_reward = np.broadcast_to(np.asarray(tasks.terminal_reward, dtype=np.float64), (number, states))
-    paid = reward[task, np.asarray(demonstrations.states), np.asarray(demonstrations.actions)]
-    at_end = np.asarray(tasks.terminal)[task, after] * terminal_reward[task, after]
-    return paid + np.asarray(tasks.discount, dtype=np.float64)[task] * at_end
+    tasks, task, after = moves.tasks, moves.task, moves.next_states
+    reward = np.broadcast_to(tasks.reward, (*tasks.terminal.shape, actions))[task, moves.states, moves.actions]
+    terminal_reward = np.broadcast_to(tasks.terminal_reward, tasks.terminal.shape)[task, after]
+    return reward + tasks.discount[task].astype(np.float64) * tasks.terminal[task, after] * terminal_reward
 
 
 def _trajectory(episode: Episode, task: int, states: int, actions: int, ends: Mapping[int, int]) -> Trajectory:
-    moves = len(episode.rewards)
-    path = _within(episode.observations, moves + 1, states, episode.source, "observations")
+    path = _within(episode.observations, len(episode.rewards) + 1, states, episode.source, "observations")
     if episode.terminated:
         path[-1] = ends.get(int(path[-1]), int(path[-1]))
-    return Trajectory(path, _within(episode.actions, moves, actions, episode.source, "actions"), task)
+    return Trajectory(path, _within(episode.actions, len(episode.rewards), actions, episode.source, "actions"), task)
 
 
 def _within(values: object, length: int, count: int, source: str, field: str) -> Int[np.ndarray, " length"]:
@@ -178,18 +177,13 @@ def _best_terminal_states(entry: Mapping[str, Any]) -> list[int]:
     return terminal[paid == paid.max(initial=-np.inf)].tolist()
 
 
-def _tasks_of_episodes(
-    dataset: Dataset, source: object, world: Grid | Graph, discount: float | None, step_cost: float | None
+def _tasks_of_goals(
+    episodes: Sequence[Episode], world: Grid | Graph, discount: float | None, step_cost: float | None
 ) -> tuple[list[Task], list[int]]:
-    """Return the tasks of a dataset, and the index of each episode's task."""
-    entries = dataset.metadata.get("tasks")
-    if entries is not None:
-        check(isinstance(entries, list) and entries, "expected a list of tasks", source=source, field="tasks")
-        tasks = [_task(entry, world, f"{source}, task {index}") for index, entry in enumerate(entries)]
-        return tasks, [_entry_of(episode, entries) for episode in dataset.episodes]
+    """Return the tasks of reaching the goals of episodes, and the index of each episode's task."""
     towards: dict[tuple[int, float], Task] = {}
     keys = []
-    for episode in dataset.episodes:
+    for episode in episodes:
         metadata = {"discount": discount} | dict(episode.metadata)
         key = _whole(metadata, "goal", episode.source), _number(metadata, "discount", episode.source)
         keys.append(key)
@@ -213,7 +207,7 @@ def _entry_of(episode: Episode, entries: Sequence[Mapping[str, Any]]) -> int:
     return index
 
 
-def _number(metadata: Mapping[str, Any], field: str, source: str) -> float:
+def _number(metadata: Metadata, field: str, source: str) -> float:
     """Return a number in the metadata of an episode."""
     value: Any = metadata.get(field)
     message = "neither the episode nor an argument has it: expected a number, or a task for all episodes"
@@ -223,7 +217,7 @@ def _number(metadata: Mapping[str, Any], field: str, source: str) -> float:
     return float(value)
 
 
-def _whole(metadata: Mapping[str, Any], field: str, source: str) -> int:
+def _whole(metadata: Metadata, field: str, source: str) -> int:
     """Return a whole number in the metadata of an episode."""
     value = _number(metadata, field, source)
     check(value.is_integer(), f"expected a whole number, found {value:g}", source=source, field=field)
@@ -249,10 +243,8 @@ def _task(entry: Any, world: Grid | Graph, source: str) -> Task:
 
 def _table(entry: Mapping[str, Any], field: str, shape: tuple[int, ...], source: str) -> Float[np.ndarray, "..."]:
     """Return a table of finite numbers of a shape, of which any axis may have length 1."""
-    try:
+    with input_errors("expected a table of numbers", TypeError, ValueError, source=source, field=field):
         table = np.asarray(entry[field], dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError("expected a table of numbers", source=source, field=field) from error
     fits = table.ndim == len(shape) and all(np.isin(table.shape, 1) | (np.array(table.shape) == shape))
     message = f"expected finite numbers of shape {shape}, found shape {table.shape}"
     check(fits and np.isfinite(table).all(), message, source=source, field=field)

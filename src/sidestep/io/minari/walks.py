@@ -19,8 +19,8 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Float, Shaped
 
-from sidestep.errors import InputError, check
-from sidestep.io.minari.datasets import Dataset, Episode, read_dataset, require_minari, write_dataset
+from sidestep.errors import check, input_errors
+from sidestep.io.minari.datasets import Episode, read_dataset, require_minari, write_dataset
 from sidestep.io.tables import check_rows
 
 _OWN = ("walk", "x", "y", "goal_x", "goal_y")
@@ -39,13 +39,11 @@ def read_positions(dataset: str) -> pa.Table:
             two walks with one label, and, naming the episode and the field, for positions and goals that are not finite
             or of another shape, and for goals that change.
     """
-    episodes = read_dataset(dataset, lambda observation_space, _: _check_space(observation_space, dataset)).episodes
+    _, episodes = read_dataset(dataset, lambda observation_space, _: _check_space(observation_space, dataset))
     tables = [_table(episode, label) for episode, label in zip(episodes, _labels(episodes, dataset), strict=True)]
-    try:
+    message = "expected infos of the same kind in all episodes"
+    with input_errors(message, pa.ArrowException, source=dataset, field="infos"):
         return pa.concat_tables(tables, promote_options="permissive")
-    except pa.ArrowException as error:
-        message = f"expected infos of the same kind in all episodes: {error}"
-        raise InputError(message, source=dataset, field="infos") from error
 
 
 def write_positions(dataset: str, table: pa.Table) -> None:
@@ -65,18 +63,16 @@ def write_positions(dataset: str, table: pa.Table) -> None:
 
     plane = Box(-np.inf, np.inf, (2,), np.float64)
     observation_space = Dict({"observation": plane, "achieved_goal": plane, "desired_goal": plane})
-    write_dataset(dataset, Dataset(observation_space, plane, {}, list(_episodes(table, dataset))))
+    write_dataset(dataset, (observation_space, plane), list(_episodes(table, dataset)), metadata={})
 
 
 def _episodes(table: pa.Table, dataset: str) -> Iterator[Episode]:
     """Yield the episode of each walk."""
     infos = {name: _info(table[name], name, dataset) for name in table.column_names if name not in _OWN}
-    positions = np.stack([table[name].to_numpy() for name in ("x", "y")], axis=1)
-    goals = np.stack([table[name].to_numpy() for name in ("goal_x", "goal_y")], axis=1)
-    targets = positions
-    if _FAILED[0] in infos:
-        failed = np.stack([infos[name] for name in _FAILED], axis=1)
-        targets = np.where(np.isnan(failed), positions, failed)
+    positions = np.stack([table["x"], table["y"]], axis=1)
+    goals = np.stack([table["goal_x"], table["goal_y"]], axis=1)
+    failed = np.stack([infos.get(name, np.full(len(table), np.nan)) for name in _FAILED], axis=1)
+    targets = np.where(np.isnan(failed), positions, failed)
     labels = table["walk"].to_pylist()
     starts = [row for row in range(1, len(labels)) if labels[row] != labels[row - 1]]
     for rows in np.split(np.arange(len(labels)), starts):
@@ -91,16 +87,14 @@ def _episodes(table: pa.Table, dataset: str) -> Iterator[Episode]:
 
 def _info(column: pa.ChunkedArray, name: str, dataset: str) -> Shaped[np.ndarray, " rows"]:
     """Return a column as an array for `infos`."""
-    if name in _FAILED:  # NaN except where a move failed
-        return column.to_numpy()
     kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
-    is_text = pa.types.is_string(kind) or pa.types.is_large_string(kind)
-    valid = is_text or pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
+    is_number = pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
+    valid = is_number or pa.types.is_string(kind) or pa.types.is_large_string(kind)
     check(valid, f"expected numbers or text, found {kind}; leave the column out", source=dataset, field=name)
-    values = np.asarray(column.to_pylist(), dtype=object) if is_text else column.to_numpy()
     message = "a Minari dataset has no empty cells; fill it, or leave the column out"
-    check_rows(column.is_valid().to_numpy(), message, dataset, name)
-    return values
+    # these two are empty, then NaN, except where a move failed
+    check_rows(column.is_valid().to_numpy() | (name in _FAILED), message, dataset, name)
+    return column.to_numpy()
 
 
 def _check_space(space: Any, dataset: str) -> None:
@@ -124,10 +118,10 @@ def _places(observations: Any) -> dict[str, Any]:
 
 def _labels(episodes: Sequence[Episode], dataset: str) -> list[Any]:
     """Return the label of each walk, or, unless all episodes have one, Minari's numbers of the episodes."""
-    labels = [episode.metadata.get("walk") for episode in episodes]
-    if any(label is None for label in labels):
+    # `tolist` makes Python's own numbers and text of NumPy's
+    labels = [np.asarray(episode.metadata.get("walk")).tolist() for episode in episodes]
+    if None in labels:
         return list(range(len(labels)))
-    labels = [label.item() if isinstance(label, np.generic) else label for label in labels]
     twice = [label for label, count in Counter(labels).items() if count > 1]
     check(not twice, f"expected different walks, found {twice} more than once", source=dataset, field="walk")
     return labels
@@ -138,30 +132,22 @@ def _table(episode: Episode, label: object) -> pa.Table:
     rows = len(episode.rewards) + 1
     seen = _places(episode.observations).items()
     places = {name: _plane(values, rows, episode.source, name) for name, values in seen}
-    positions, goal = places["achieved_goal"], _goal(episode, places.get("desired_goal"))
+    positions, goals = places["achieved_goal"], places.get("desired_goal")
     columns = {"walk": pa.array([label] * rows), "step": np.arange(rows), "x": positions[:, 0], "y": positions[:, 1]}
-    if goal is not None:
-        columns |= {"goal_x": np.full(rows, goal[0]), "goal_y": np.full(rows, goal[1])}
-    return pa.table(columns | _columns(episode.infos, rows))
-
-
-def _goal(episode: Episode, goals: Float[np.ndarray, "rows 2"] | None) -> Float[np.ndarray, " 2"] | None:
-    """Return the goal of an episode, if it has one."""
+    if goals is None and episode.metadata.get("goal") is not None:
+        goals = _plane([episode.metadata["goal"]], 1, episode.source, "goal")
     if goals is not None:
         changed = (goals != goals[0]).any(axis=1)
         message = f"expected one goal, found another at step {int(np.argmax(changed))}"
         check(not changed.any(), message, source=episode.source, field="desired_goal")
-        return goals[0]
-    goal = episode.metadata.get("goal")
-    return None if goal is None else _plane([goal], 1, episode.source, "goal")[0]
+        columns |= {"goal_x": np.full(rows, goals[0, 0]), "goal_y": np.full(rows, goals[0, 1])}
+    return pa.table(columns | _columns(episode.infos, rows))
 
 
 def _plane(values: Any, rows: int, source: str, field: str) -> Float[np.ndarray, "rows 2"]:
     """Return x and y, the first two numbers of each row."""
-    try:
+    with input_errors("expected numbers", TypeError, ValueError, source=source, field=field):
         array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"expected numbers: {error}", source=source, field=field) from error
     message = f"expected x and y in each of {rows} rows, found shape {array.shape}"
     check(array.ndim == 2 and len(array) == rows and array.shape[1] >= 2, message, source=source, field=field)
     step = int(np.argmin(np.isfinite(array[:, :2]).all(axis=1)))
@@ -174,10 +160,9 @@ def _columns(infos: Mapping[str, Any], rows: int) -> dict[str, pa.Array]:
     """Return the infos with one number or text for every position; text is stored as bytes."""
     columns = {}
     for name, values in infos.items():
-        if name in _OWN or not isinstance(values, np.ndarray) or values.shape != (rows,):
-            continue
-        if values.dtype.kind in "biuf":
+        fits = name not in _OWN and isinstance(values, np.ndarray) and values.shape == (rows,)
+        if fits and values.dtype.kind in "biuf":
             columns[name] = pa.array(values)
-        elif all(isinstance(each, str | bytes) for each in values):
-            columns[name] = pa.array([each.decode() if isinstance(each, bytes) else str(each) for each in values])
+        elif fits and all(isinstance(each, str | bytes) for each in values):
+            columns[name] = pa.array(values).cast(pa.string())
     return columns
