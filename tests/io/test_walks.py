@@ -182,7 +182,7 @@ def test_read_walks_names_bad_rows(tmp_path, line, column, value, message):
         ("\n\n", "the file is empty"),
         ("walk,step,x,y\n", "expected at least one walk, found a table without rows"),
         ("walk,step,x\n0,0,0\n", "field 'y': the column is missing; found walk, step, x"),
-        ("walk;step;x;y\n0;0;0;0\n", "field 'walk': the column is missing"),
+        ("walk;step;x;y\n0;0;0;0\n", "field 'walk, step, x, y': the column is missing"),
         ("walk,step,x,y,x\n0,0,0,0,0\n", "field 'x': the column appears more than once"),
         ("walk,step,x,y,goal_x\n0,0,0,0,0\n0,1,0,0,0\n", "field 'goal_y': the column is missing"),
         ("walk,step,x,y,failed_y\n0,0,0,0,0\n0,1,0,0,0\n", "field 'failed_x': the column is missing"),

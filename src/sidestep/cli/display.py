@@ -21,7 +21,8 @@ _HEADINGS = {
     "mean_free": "mean on\nfree cells",
     "max_probability": "highest",
     "legal_fraction": "legal\npaths",
-    "excess_length": "excess\nlength",
+    "excess_length": "excess\nlength\n(cells)",
+    "regret": "regret\n(cells)",
     "arriving_fraction": "arrive",
     "heldout_log_likelihood": "held-out\nnats a move",
 }
@@ -117,7 +118,7 @@ def stage_progress() -> Iterator[Callable[[str, int, int], None]]:
 
 
 def print_scores(rows: Mapping[str, Mapping[str, Any]], columns: Sequence[str] = _MAP_SCORES) -> None:
-    """Print a table of scores with a row for each name.
+    """Print a table of scores with a row for each name, or one of a single name with a row for each score.
 
     Args:
         rows: The numbers of each row by key; a dash stands for None.
@@ -126,8 +127,11 @@ def print_scores(rows: Mapping[str, Mapping[str, Any]], columns: Sequence[str] =
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("", *(_HEADINGS.get(key, key) for key in columns))
-    for name, scores in rows.items():
-        cells = (scores.get(key) for key in columns)
+    names, headings = [*rows], [_HEADINGS.get(key, key) for key in columns]
+    numbers = [[scores.get(key) for key in columns] for scores in rows.values()]
+    if len(rows) == 1:  # all scores in a row do not fit into a narrow terminal
+        names, headings, numbers = [each.replace("\n", " ") for each in headings], names, zip(*numbers, strict=True)
+    table = Table("", *headings)
+    for name, cells in zip(names, numbers, strict=True):
         table.add_row(name, *("–" if number is None else f"{number:.3f}" for number in cells))
     Console(highlight=False, width=None if sys.stdout.isatty() else 140).print(table)

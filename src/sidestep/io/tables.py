@@ -82,16 +82,15 @@ def check_rows(
 
 
 def check_columns(table: pa.Table, names: Sequence[str], source: str) -> None:
-    """Raise `InputError` for the first of these columns that is not in a table.
+    """Raise `InputError` for columns that are not in a table.
 
     Args:
         table: The table.
         names: The columns that it must have.
         source: Its name, for the error.
     """
-    for name in names:
-        message = f"the column is missing; found {', '.join(table.column_names)}"
-        check(name in table.column_names, message, source=source, field=name)
+    missing = ", ".join(name for name in names if name not in table.column_names)
+    check(not missing, f"the column is missing; found {', '.join(table.column_names)}", source=source, field=missing)
 
 
 def number_column(table: pa.Table, name: str, source: str) -> Float[np.ndarray, " rows"]:
