@@ -29,5 +29,5 @@ def evaluate(
     add_to_summary(folder, out or folder, None, {"true_map": str(true_map), **limits, **scores})
     print_scores({str(folder): scores})
     if scores["auc"] is None:
-        found = f"no obstacle or no free cell to score, and {(truth.known == -1).sum()} unknown cells"
-        print_notes(f"note: there is no ranking, because the true map has {found}")
+        content = f"no obstacle or no free cell to score, and {(truth.known == -1).sum()} unknown cells"
+        print_notes(f"note: there is no ranking, because the true map has {content}")
