@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from sidestep.errors import InputError
+from sidestep.errors import InputError, input_errors
 
 
 def read_whole(path: str | Path) -> bytes:
@@ -89,10 +89,8 @@ def write_json(path: str | Path, data: Any) -> None:
     Raises:
         InputError: for NaN, infinity and other data that JSON cannot represent; None is a missing value.
     """
-    try:
+    with input_errors("cannot be written as JSON", TypeError, ValueError, source=path):
         text = json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False, default=_plain)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"cannot be written as JSON: {error}", source=path) from error
     write_whole(path, lambda file: file.write(text.encode() + b"\n"))
 
 
@@ -120,10 +118,8 @@ def read_array(path: str | Path, kinds: str) -> np.ndarray:
         InputError: for a file without such an array.
     """
     content = read_whole(path)
-    try:
+    with input_errors("expected a NumPy array", Exception, source=path):  # NumPy raises errors of many kinds
         array = np.load(io.BytesIO(content), allow_pickle=False)
-    except Exception as error:  # NumPy raises errors of many kinds
-        raise InputError(f"expected a NumPy array: {error}", source=path) from error
     if not isinstance(array, np.ndarray) or array.dtype.kind not in kinds:
         raise InputError("expected a NumPy array of numbers", source=path)
     return array

@@ -264,6 +264,9 @@ class TableDynamics(Dynamics):
 
     model: TransitionModel
 
+    def __init__(self, model: TransitionModel):
+        self.model = model
+
     @property
     def parameters(self) -> Tree:
         """The parameters θ of the model."""

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sidestep._files import read_array, read_whole, write_whole
-from sidestep.errors import InputError, check
+from sidestep.errors import InputError, check, input_errors
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 
 MOST_PIXELS = 100_000_000
@@ -260,11 +260,9 @@ def _number(value: object, key: str, path: Path) -> float:
 def _image_path(name: Any, path: Path) -> Path:
     """Return the path of the image, which must be in the folder of the YAML file or below, links followed."""
     check(isinstance(name, str) and name, f"expected the name of an image, found {name!r}", source=path, field="image")
-    try:
+    with input_errors("expected the name of an image", OSError, RuntimeError, ValueError, source=path, field="image"):
         folder = path.parent.resolve()
         image = (folder / name).resolve()
-    except (OSError, RuntimeError, ValueError) as error:
-        raise InputError(f"expected the name of an image: {error}", source=path, field="image") from error
     message = f"expected an image inside the folder of the YAML file, found {name!r}"
     check(not Path(name).is_absolute() and image.is_relative_to(folder), message, source=path, field="image")
     check(image.is_file(), f"there is no image {name!r}", source=path, field="image")

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sidestep.errors import InputError, check, check_positive
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph
-from sidestep.tabular.grid import Grid
+from sidestep.tabular.grid import Cell, Grid
 
 
 class Task(eqx.Module):
@@ -190,7 +190,9 @@ def state_at(world: Grid | Graph, place: int | tuple[float, float], field: str) 
         place = world.state(place)
     check(0 <= place < states, f"expected a state in 0…{states - 1}, found {place}", field=field)
     if isinstance(world, Grid):
-        check(world.known.flat[place] != 1, f"the {field} (state {place}) lies in a known obstacle", field=field)
+        x, y = world.centers(np.array([place]))[0]
+        message = f"the {field} lies in a known obstacle (state {place}, the cell around x = {x:g} m, y = {y:g} m)"
+        check(world.known.flat[place] != Cell.OCCUPIED, message, field=field)
     return int(place)
 
 
