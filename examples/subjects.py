@@ -1,7 +1,12 @@
 """Choices of six subjects in a two-step task: their beliefs about transitions, a β of each, and a comparison of models.
 
 States: 0 is the first choice, 1 and 2 are the second ones, 3 pays 1 and 4 pays nothing. Every action has two outcomes.
-To fit your own data, replace `trajectories`: the states and actions of each trial, and the subject as its `task`.
+To fit your own data, replace `trajectories`, one for each trial: the states, one more than actions because the last
+outcome is a state too, the actions, and the subject (0, 1, …) as its `task`. From a table of trials with pandas:
+
+    for (subject, _), rows in table.groupby(["subject", "trial"]):
+        states = np.append(rows["state"], rows["next_state"].iloc[-1])
+        trajectories.append(ss.Trajectory(states, rows["action"].to_numpy(), task=subject))
 """
 
 import jax
@@ -52,11 +57,12 @@ for name, model in models.items():
         print(f"  subject {subject}: β {behavior.beta:.1f}, log-likelihood of choices {likelihood.actions:.1f}")
     print(f"  lapse {fit.behavior.behavior_of().lapse:.3f}, the same for all")
 
-# beliefs of one subject, from choices alone: a fit of this subject's trials only
+# beliefs of one subject, from choices alone: a fit of this subject's trials only. Choices alone do not tell a larger β
+# from beliefs in less certain outcomes, so β is the one that the last fit found
 alone = ss.fit(
     models["separate"],
     ss.gather([trajectory._replace(task=0) for trajectory in trajectories if trajectory.task == 2], [task]),
-    ss.behavior_model(start, ["beta"]),
+    ss.behavior_model(fit.behavior.behavior_of(2)),
     prior=ss.Normal(0.0, 2.0),
     terms=("actions",),
 )

@@ -126,6 +126,8 @@ def test_fit_with_persons_pools_their_betas():
     assert betas[0] == pytest.approx(20, rel=0.25)
     assert betas[1] == pytest.approx(6, rel=0.25)
     assert betas[1] < betas[2] < betas[0]
+    with pytest.raises(InputError, match=r"field 'person': expected a person in 0…2, found 3"):
+        result.behavior_of(3)
     assert float(result.behavior_of().beta) == pytest.approx(np.exp(np.mean(np.log(betas))), rel=1e-9)
 
 

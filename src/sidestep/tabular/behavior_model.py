@@ -104,10 +104,15 @@ class BehaviorModel(eqx.Module):
 
         Returns:
             The behavior, with the learned β and lapse.
+
+        Raises:
+            InputError: For a person that does not exist.
         """
         log_beta, logit_lapse = self.parameters.log_beta, self.parameters.logit_lapse
         beta, lapse = self.behavior.beta, self.behavior.lapse
         if log_beta is not None:
+            exists = person is None or isinstance(person, jax.Array) or person in range(len(log_beta))
+            check(exists, f"expected a person in 0…{len(log_beta) - 1}, found {person!r}", field="person")
             beta = jnp.exp(log_beta.mean() if person is None else log_beta[person])
         if logit_lapse is not None:
             lapse = jax.nn.sigmoid(logit_lapse)
@@ -156,6 +161,10 @@ def behavior_model(
     aimed_at: Int[Array | np.ndarray, "states actions"] | None = None,
 ) -> BehaviorModel:
     """Return a model of agents that behave as `behavior` describes, except for what is learned.
+
+    Each learned number has a normal prior around its start: log β (of the mean person), the logits of a lapse and of a
+    discount with standard deviation 1. The log β of one person differs from that of the mean person with standard
+    deviation ½. Where choices say little, the result is the start; two starts show that.
 
     Args:
         behavior: The known behavior, and the start of a learned β and lapse (.05 if it has no lapse).

@@ -28,6 +28,8 @@ def simulate(
 ) -> list[Trajectory]:
     """Return trajectories of agents that know a world and pursue tasks in it.
 
+    An agent acts until its task ends. For a task without an end, use `plan` and then `roll_out`.
+
     Args:
         key: Of the random choices.
         world: The transition model that the agents plan with and that their moves follow.
