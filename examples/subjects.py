@@ -47,8 +47,8 @@ index[1:3, :, 0] = [[1, 2], [3, 4]]
 models = {"separate": ss.TabularModel(graph, jnp.zeros(successors.shape)), "tied": ss.TiedModel(graph, index)}
 
 by_subject = np.array([trajectory.task for trajectory in trajectories])
-for name, model in models.items():
-    fit = ss.fit(model, data, unknown, prior=ss.Normal(0.0, 2.0))
+fits = {name: ss.fit(model, data, unknown, prior=ss.Normal(0.0, 2.0)) for name, model in models.items()}
+for name, fit in fits.items():
     print(f"{name}: {fit.message}; log-likelihood {fit.final.actions + fit.final.transitions:.1f} nats")
     print(f"  P(common) of the first choices: {fit.model.probabilities()[0, [0, 1], [0, 1]].round(2)}")
     for subject in range(subjects):
@@ -58,11 +58,11 @@ for name, model in models.items():
     print(f"  lapse {fit.behavior.behavior_of().lapse:.3f}, the same for all")
 
 # beliefs of one subject, from choices alone: a fit of this subject's trials only. Choices alone do not tell a larger β
-# from beliefs in less certain outcomes, so β is the one that the last fit found
+# from beliefs in less certain outcomes, so β is the one that the fit of all subjects found
 alone = ss.fit(
     models["separate"],
     ss.gather([trajectory._replace(task=0) for trajectory in trajectories if trajectory.task == 2], [task]),
-    ss.behavior_model(fit.behavior.behavior_of(2)),
+    ss.behavior_model(fits["tied"].behavior.behavior_of(2)),
     prior=ss.Normal(0.0, 2.0),
     terms=("actions",),
 )
