@@ -96,10 +96,9 @@ def write_json(path: str | Path, data: Any) -> None:
 
 def read_json(path: str | Path) -> Any:
     """Return the data in a JSON file; raise `InputError` for a file that is missing or not JSON."""
-    try:
-        return json.loads(read_whole(path))
-    except ValueError as error:
-        raise InputError(f"expected JSON: {error}", source=path) from error
+    content = read_whole(path)
+    with input_errors("expected JSON", ValueError, source=path):
+        return json.loads(content)
 
 
 def write_array(path: str | Path, array: np.ndarray) -> None:

@@ -15,7 +15,7 @@ from sidestep.cli.drawing import draw, prepared_drawing
 from sidestep.tabular.grid import Grid
 
 with prepared_drawing():
-    draw("figure_plan", Path("plan.png"), Grid.unknown(2, 2), np.full((2, 2), 0.5), np.array([0, 1]))
+    draw("figure_plan", Path("plan.png"), Grid.unknown(2, 2), np.full((2, 2), 0.5), np.array([0, 1])).result()
 assert "matplotlib" not in sys.modules  # the second process has drawn
 """
 

@@ -12,7 +12,10 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from subprocess import DEVNULL, PIPE, Popen
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
 
 
 @contextmanager
@@ -29,17 +32,26 @@ def prepared_drawing() -> Iterator[None]:
             _worker.cache_clear()
 
 
-def draw(name: str, path: Path, *arguments: Any) -> None:
-    """Draw a figure and save it as a PNG.
+def draw(name: str, path: Path, *arguments: Any) -> "Future[None]":
+    """Begin to draw a figure and to save it as a PNG.
 
     Args:
         name: The name of a function in `sidestep.plotting.maps` that returns a figure.
         path: The file.
         *arguments: The arguments of that function.
 
-    Raises:
-        InputError: Where the file system refuses.
+    Returns:
+        The drawing: its `result()` waits for the picture, and raises `InputError` where the file system refuses.
     """
+    from concurrent.futures import ThreadPoolExecutor
+
+    with_one_thread = ThreadPoolExecutor(max_workers=1)
+    drawing = with_one_thread.submit(_draw, name, path, *arguments)
+    with_one_thread.shutdown(wait=False)
+    return drawing
+
+
+def _draw(name: str, path: Path, *arguments: Any) -> None:
     if "matplotlib" not in sys.modules:
         worker = _worker()
         _worker.cache_clear()

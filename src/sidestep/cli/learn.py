@@ -52,5 +52,6 @@ def save_learned(learned: "LearnedMap", folder: "Path", **entries: object) -> No
     seen = None if learning.sensor is None else seen_cells(learning.sensor, learned.grid)
     paths = learning.demonstrations.paths()
     goals = np.flatnonzero(np.asarray(learning.demonstrations.tasks.terminal).any(axis=0))
-    draw("figure_fit", folder / "learned.png", learned.grid, paths, learned.blocked, objective, seen, goals)
+    picture = draw("figure_fit", folder / "learned.png", learned.grid, paths, learned.blocked, objective, seen, goals)
     learned.save(folder, **entries)
+    picture.result()

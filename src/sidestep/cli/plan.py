@@ -17,25 +17,29 @@ def plan(
 ) -> None:
     """Plan a path in a learned map: path.csv, path.png, summary.json."""
     import numpy as np
-    import pyarrow as pa
 
     from sidestep.cli.display import print_lines
     from sidestep.cli.drawing import draw
-    from sidestep.io.tables import write_table
     from sidestep.maps.learned_map import add_to_summary, load_map
 
     out = out or folder / "plan"
     first, last = position_of(start, "--start"), position_of(goal, "--goal")
     learned = load_map(folder)
     path = learned.plan(first, last, bump_cost=bump_cost)
+    picture = draw("figure_plan", out / "path.png", learned.grid, learned.blocked, path.states)
+    # these imports take as long as the drawing
+    import pyarrow as pa
+
+    from sidestep.io.tables import write_table
+
     x, y = path.positions.T
     steps = np.arange(len(path.states))
     write_table(out / "path.csv", pa.table({"step": steps, "x": x, "y": y, "blocked": path.blocked}))
-    draw("figure_plan", out / "path.png", learned.grid, learned.blocked, path.states)
     moves, likeliest = len(path.states) - 1, float(path.blocked.max())
     settings = {"command": "plan", "start": first, "goal": last, "bump_cost": bump_cost}
     risk = {"max_probability_blocked": likeliest, "probability_free": float(np.prod(1 - path.blocked))}
     summary = {**settings, "moves": moves, "length_metres": path.length, **risk}
     add_to_summary(folder, out, "plan", summary)
+    picture.result()
     print_lines(f"{moves} moves, {path.length:g} m; the likeliest obstacle on the way has P(blocked) = {likeliest:.3f}")
     print_lines(f"path in {out}")

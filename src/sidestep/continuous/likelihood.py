@@ -26,7 +26,7 @@ from sidestep.continuous.planner import Planner, PlannerState, PlanProgress, che
 from sidestep.continuous.policies import Agent, FinitePolicy, GaussianPolicy, Policy, Starts
 from sidestep.continuous.rollouts import q_estimates
 from sidestep.continuous.tasks import check_tasks, task_at, task_features
-from sidestep.errors import InputError, check, check_count, check_positive
+from sidestep.errors import InputError, check, check_count, check_positive, input_errors
 from sidestep.inference.priors import Prior
 from sidestep.tabular.backups import LogSumExp
 from sidestep.tabular.demonstrations import Demonstrations
@@ -291,8 +291,6 @@ def _check_choices(demos: Demonstrations, policy: Policy) -> None:
 def _check_shapes(dynamics: Dynamics, state: jax.ShapeDtypeStruct, action: jax.ShapeDtypeStruct) -> None:
     """Refuse states or actions of shapes that the dynamics cannot take."""
     expected = f"expected states and actions that the dynamics can take, found shapes {state.shape} and {action.shape}"
-    try:
+    with input_errors(expected, TypeError, ValueError, IndexError, source=None, field="demonstrations"):
         following = jax.eval_shape(dynamics.sample, jax.random.key(0), state, action).shape
-    except (TypeError, ValueError, IndexError) as error:
-        raise InputError(expected, field="demonstrations") from error
     check(following == state.shape, f"{expected}, which lead to {following}", field="demonstrations")

@@ -18,7 +18,7 @@ import numpy as np
 
 from sidestep._files import read_whole, write_whole
 from sidestep._typing import Tree
-from sidestep.errors import InputError, check
+from sidestep.errors import InputError, check, input_errors
 
 History = Sequence[Sequence[int | float]]
 
@@ -94,20 +94,17 @@ class Saver:
         if not path.exists():
             return like, [], optional
         file = io.BytesIO(read_whole(path))
-        try:
+        with input_errors("not a checkpoint", ValueError, TypeError, KeyError, source=path):
             header = json.loads(file.readline())
             saved_key, history = header["fit"], header["history"]
-        except (ValueError, TypeError, KeyError) as error:
-            raise InputError("not a checkpoint", source=path) from error
         message = "belongs to a fit of other data or with other settings; start without resuming to replace it"
         check(saved_key == self.key, message, source=path)
-        try:
+        # what is not an array raises errors of many kinds
+        with input_errors("not a checkpoint: the arrays cannot be read", Exception, source=path):
             if header.get("optional") != _shapes(optional):
                 return eqx.tree_deserialise_leaves(file, like), history, optional
             state, optional = eqx.tree_deserialise_leaves(file, (like, optional))
             return state, history, optional
-        except Exception as error:  # what is not an array raises errors of many kinds
-            raise InputError("not a checkpoint: the arrays cannot be read", source=path) from error
 
     def save(self, state: Tree, history: History, optional: Tree = ()) -> None:
         """Write the checkpoint as a whole, unless the last save is too recent.

@@ -273,19 +273,17 @@ def _gray(path: Path) -> tuple[Float[np.ndarray, "rows columns"], Bool[np.ndarra
     """Return the gray value of each pixel on a scale of 0 to 255, and which pixels are fully transparent."""
     from PIL import Image
 
-    try:
-        # Pillow warns of large images and of oddities in headers without naming the file.
-        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=("PPM", "PNG")) as image:
-            width, height = image.size
-            if not 0 < width * height <= MOST_PIXELS:
-                raise ValueError(f"{width:,} by {height:,} pixels, but from 1 to {MOST_PIXELS:,} can be read")
-            if image.mode == "F":
-                raise ValueError("the pixels are fractions, as in PFM")
-            sixteen_bits = image.mode.startswith("I")
-            if not sixteen_bits and (image.mode not in ("1", "L") or "transparency" in image.info):
-                channels = np.asarray(image.convert("RGBA"))
-                return channels[..., :3].mean(axis=-1), channels[..., 3] == 0
-            gray = np.asarray(image if sixteen_bits else image.convert("L"), dtype=np.float64)
-            return gray * (255 / 65535) if sixteen_bits else gray, np.zeros(gray.shape, dtype=bool)
-    except Exception as error:  # Decoders raise errors of any kind on broken files.
-        raise InputError(f"expected an image in PGM or PNG format: {error}", source=path) from error
+    # decoders raise errors of any kind on broken files; Pillow warns of large images and of odd headers without a name
+    reading = input_errors("expected an image in PGM or PNG format", Exception, source=path)
+    with reading, warnings.catch_warnings(action="ignore"), Image.open(path, formats=("PPM", "PNG")) as image:
+        width, height = image.size
+        if not 0 < width * height <= MOST_PIXELS:
+            raise ValueError(f"{width:,} by {height:,} pixels, but from 1 to {MOST_PIXELS:,} can be read")
+        if image.mode == "F":
+            raise ValueError("the pixels are fractions, as in PFM")
+        sixteen_bits = image.mode.startswith("I")
+        if not sixteen_bits and (image.mode not in ("1", "L") or "transparency" in image.info):
+            channels = np.asarray(image.convert("RGBA"))
+            return channels[..., :3].mean(axis=-1), channels[..., 3] == 0
+        gray = np.asarray(image if sixteen_bits else image.convert("L"), dtype=np.float64)
+        return gray * (255 / 65535) if sixteen_bits else gray, np.zeros(gray.shape, dtype=bool)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sidestep._files import read_array, read_json, write_array, write_json
-from sidestep.errors import InputError, check
+from sidestep.errors import check, input_errors
 from sidestep.io.maps import read_map, write_map
 from sidestep.robots.planners import ModelPlanner
 from sidestep.robots.robot import BUMP_COST, risk_averse_robot
@@ -235,13 +235,11 @@ def add_to_summary(folder: Path, out: Path, key: str | None, summary: dict[str, 
 def _settings(path: Path) -> tuple[Connectivity, Reward]:
     """Read the connectivity and the reward that a map was learned with."""
     summary = read_json(path)
-    try:
+    message = "expected connectivity and settings.reward with discount and step_cost, as `sidestep learn` writes"
+    with input_errors(message, KeyError, TypeError, ValueError, source=path):
         connectivity, reward = summary["connectivity"], summary["settings"]["reward"]
         discount = float(reward["discount"])
         step_cost = None if reward["step_cost"] is None else float(reward["step_cost"])
-    except (KeyError, TypeError, ValueError) as error:
-        message = "expected connectivity and settings.reward with discount and step_cost, as `sidestep learn` writes"
-        raise InputError(message, source=path) from error
     check(connectivity in (4, 8), f"expected 4 or 8, found {connectivity!r}", source=path, field="connectivity")
     check(0 < discount <= 1, f"expected a number in (0, 1], found {discount}", source=path, field="discount")
     positive = step_cost is None or 0 < step_cost < np.inf
