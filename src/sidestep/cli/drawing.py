@@ -45,9 +45,9 @@ def draw(name: str, path: Path, *arguments: Any) -> "Future[None]":
     """
     from concurrent.futures import ThreadPoolExecutor
 
-    with_one_thread = ThreadPoolExecutor(max_workers=1)
-    drawing = with_one_thread.submit(_draw, name, path, *arguments)
-    with_one_thread.shutdown(wait=False)
+    thread = ThreadPoolExecutor(max_workers=1)
+    drawing = thread.submit(_draw, name, path, *arguments)
+    thread.shutdown(wait=False)
     return drawing
 
 

@@ -27,7 +27,7 @@ def plan(
     learned = load_map(folder)
     path = learned.plan(first, last, bump_cost=bump_cost)
     picture = draw("figure_plan", out / "path.png", learned.grid, learned.blocked, path.states)
-    # these imports take as long as the drawing
+    # imported while the second process draws
     import pyarrow as pa
 
     from sidestep.io.tables import write_table
