@@ -28,18 +28,14 @@ settings.load_profile("sidestep")
 
 
 def pytest_configure():
-    """Keep what JAX compiles from run to run; numba's code is kept anyway.
+    """Keep what is compiled from run to run.
 
-    Not by `keep_compiled_code`, which also keeps programs of `keep_program`: they are not traced again, and so not
-    checked again by beartype. A test that runs a command turns this on for the tests after it in its process.
+    Kept programs are not traced again, and so not checked again by beartype; but they belong to the files of the
+    package, so whatever changes is checked.
     """
-    from sidestep._cache import cache_folder
+    from sidestep._cache import keep_compiled_code
 
-    folder = cache_folder()
-    if folder is not None:
-        jax.config.update("jax_compilation_cache_dir", str(folder / "jax"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    keep_compiled_code()
 
 
 @pytest.fixture(scope="module", autouse=True)
