@@ -30,8 +30,8 @@ settings.load_profile("sidestep")
 def pytest_configure():
     """Keep what is compiled from run to run.
 
-    Kept programs are not traced again, and so not checked again by beartype; but they belong to the files of the
-    package, so whatever changes is checked.
+    Kept programs are not traced again, and so not checked again by beartype. But they belong to the files of the
+    package, and no program is kept for classes of the tests; so whatever changes is traced and checked.
     """
     from sidestep._cache import keep_compiled_code
 

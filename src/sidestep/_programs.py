@@ -6,7 +6,8 @@ executable (`jax.experimental.serialize_executable`); `python -m benchmarks star
 
 An entry belongs to the files of this package, to the versions of JAX and of the other traced libraries, to the kind of
 processor, and to the types of all arguments. A function that calls back into Python cannot be stored; where there are
-several devices, no program is. An entry that is damaged, or that XLA refuses, is replaced.
+several devices, or for arguments of classes from elsewhere, no program is. An entry that is damaged, or that XLA
+refuses, is replaced.
 """
 
 import hashlib
@@ -27,6 +28,8 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 _Program = tuple[Callable[..., Any], Any]
 """A function of arrays that returns a tuple of arrays, and the structure of the result."""
 _TRACED_LIBRARIES = ("jax", "jaxlib", "equinox", "optax", "numpy")
+_OWNERS = {"builtins", "sidestep", *_TRACED_LIBRARIES}
+"""Programs are kept only for arguments of these packages' classes: no key tells whether the code of others changed."""
 _compiling = Lock()
 """Held while a setting of JAX is another one."""
 
@@ -56,7 +59,8 @@ def keep_program(function: _Function) -> _Function:
         key = structure, others, *((a.shape, a.dtype, bool(getattr(a, "weak_type", False))) for a in arrays)
         if key not in programs:
             text = f"{_package()} {function.__module__}.{function.__qualname__} {key}"
-            if " at 0x" in text:  # an address is another one in every process
+            known = all(kind.__module__.partition(".")[0] in _OWNERS for kind in _kinds(structure))
+            if not known or " at 0x" in text:  # an address is another one in every process
                 return compiled(*arguments)
             path = folder / "programs" / f"{function.__qualname__}-{hashlib.sha256(text.encode()).hexdigest()}"
             programs[key] = _load(path) or _compile(path, function, arrays, structure, others)
@@ -64,6 +68,12 @@ def keep_program(function: _Function) -> _Function:
         return jax.tree.unflatten(result, call(*arrays))
 
     return cast(_Function, run)
+
+
+def _kinds(structure: Any) -> set[type]:
+    """Return the classes of all nodes of a tree."""
+    node = structure.node_data()
+    return set().union([node[0]] if node else [], *map(_kinds, structure.children()))
 
 
 def _load(path: Path) -> _Program | None:

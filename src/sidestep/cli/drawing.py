@@ -45,10 +45,7 @@ def draw(name: str, path: Path, *arguments: Any) -> "Future[None]":
     """
     from concurrent.futures import ThreadPoolExecutor
 
-    thread = ThreadPoolExecutor(max_workers=1)
-    drawing = thread.submit(_draw, name, path, *arguments)
-    thread.shutdown(wait=False)
-    return drawing
+    return ThreadPoolExecutor(max_workers=1).submit(_draw, name, path, *arguments)
 
 
 def _draw(name: str, path: Path, *arguments: Any) -> None:

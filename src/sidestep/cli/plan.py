@@ -33,8 +33,7 @@ def plan(
     from sidestep.io.tables import write_table
 
     x, y = path.positions.T
-    steps = np.arange(len(path.states))
-    write_table(out / "path.csv", pa.table({"step": steps, "x": x, "y": y, "blocked": path.blocked}))
+    write_table(out / "path.csv", pa.table({"step": np.arange(len(x)), "x": x, "y": y, "blocked": path.blocked}))
     moves, likeliest = len(path.states) - 1, float(path.blocked.max())
     settings = {"command": "plan", "start": first, "goal": last, "bump_cost": bump_cost}
     risk = {"max_probability_blocked": likeliest, "probability_free": float(np.prod(1 - path.blocked))}
