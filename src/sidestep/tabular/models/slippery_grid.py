@@ -22,7 +22,7 @@ from sidestep.tabular.models.base import TransitionModel
 from sidestep.tabular.models.categorical import Logits, logit_array
 from sidestep.tabular.models.obstacle_grid import blocked_of, chances_of_moves
 
-_DIRECTIONS = np.array([[STEPS.tolist().index(way) for way in ([i, j], [j, -i], [-j, i])] for i, j in STEPS.tolist()])
+DIRECTIONS = np.array([[STEPS.tolist().index(way) for way in ([i, j], [j, -i], [-j, i])] for i, j in STEPS.tolist()])
 """Each direction, and the two at right angles to it."""
 
 
@@ -66,7 +66,7 @@ class SlipperyGrid(TransitionModel):
         numbered = terrain.min() >= -1 and len(kinds) and kinds[-1] == len(kinds) - 1
         check(numbered, "expected all the kinds 0…n−1, and −1 where moves do not slip", field="terrain")
         entered, staying = np.split(grid_successors(grid), [1], axis=-1)
-        successors = np.concatenate([entered[:, _DIRECTIONS[: grid.connectivity], 0], staying], axis=-1)
+        successors = np.concatenate([entered[:, DIRECTIONS[: grid.connectivity], 0], staying], axis=-1)
         self.graph = Graph(to_jax(successors, np.int32), to_jax(grid.lengths[None]))
         self.known, self.terrain = to_jax(grid.known), to_jax(terrain.ravel(), np.int32)
         cells, slips = logit_array(logits, (grid.size,)), logit_array(slip, (len(kinds),))
@@ -89,5 +89,5 @@ class SlipperyGrid(TransitionModel):
         ahead, aside = jax.nn.sigmoid(-slip), jax.nn.sigmoid(slip) / 2
         directions = jnp.stack([ahead, aside, aside], axis=-1)[:, None, :, None]
         of_moves = chances_of_moves(cells, self.known, self.graph.actions)
-        outcomes = directions * of_moves[:, _DIRECTIONS[: self.graph.actions]]
+        outcomes = directions * of_moves[:, DIRECTIONS[: self.graph.actions]]
         return jnp.concatenate([outcomes[..., 0], outcomes[..., 1].sum(axis=-1, keepdims=True)], axis=-1)

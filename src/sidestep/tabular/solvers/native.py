@@ -21,7 +21,7 @@ from functools import cache, partial
 from inspect import unwrap
 from itertools import pairwise
 from pathlib import Path
-from types import FunctionType
+from types import CellType, FunctionType
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -285,8 +285,10 @@ def _with_dispatchers(function: FunctionType) -> FunctionType:
     """Return a function with the dispatchers of the native functions that it calls, as numba has to see them."""
     used = {name: function.__globals__.get(name) for name in function.__code__.co_names}
     called = {name: each.dispatcher() for name, each in used.items() if isinstance(each, NativeFunction)}
+    values = [cell.cell_contents for cell in function.__closure__ or ()]
+    cells = [CellType(each.dispatcher() if isinstance(each, NativeFunction) else each) for each in values]
     names = function.__globals__ | called
-    copy = FunctionType(function.__code__, names, function.__name__, function.__defaults__, function.__closure__)
+    copy = FunctionType(function.__code__, names, function.__name__, function.__defaults__, tuple(cells))
     copy.__qualname__ = function.__qualname__
     return copy
 
@@ -300,8 +302,8 @@ class _CodeCache:
     """Machine code kept in files, one for each function, signature and machine (numba's `_Cache` interface).
 
     Differs from numba's own, which keeps an index for each function: (1) several processes may write at once, (2) each
-    file has a checksum, and a damaged one is compiled anew, (3) code is stale when any module beside the function's
-    has changed, for that may be where an inlined function comes from, (4) where nothing can be written, nothing is.
+    file has a checksum, and a damaged one is compiled anew, (3) code is stale when any module beside the function, or
+    beside one that it calls, has changed, (4) where nothing can be written, nothing is.
     """
 
     def __init__(self, function: FunctionType, folder: Path):
@@ -329,11 +331,24 @@ class _CodeCache:
         import numba
 
         function = self._function
-        cells = [cell.cell_contents for cell in function.__closure__ or ()]
         versions = (numba.__version__, np.__version__, platform.python_version(), code_generator.magic_tuple())
-        key = (_sources(Path(function.__code__.co_filename).parent), function.__code__.co_code, cells, signature)
+        key = ([_sources(folder) for folder in sorted(_folders(function))], _code_of(function), signature)
         digest = hashlib.sha256(repr((key, versions)).encode()).hexdigest()
         return Path(self.cache_path) / f"{function.__qualname__.split('.')[-1]}-{digest[:32]}.code"
+
+
+def _code_of(function: FunctionType) -> tuple[Any, ...]:
+    """Return the code of a function and the values that it closes over."""
+    values = [cell.cell_contents for cell in function.__closure__ or ()]
+    return function.__code__.co_code, [_code_of(each.py_func) if hasattr(each, "py_func") else each for each in values]
+
+
+def _folders(function: FunctionType) -> set[Path]:
+    """Return the folders of a function and of the native functions that it calls: their code is part of its own."""
+    values = [cell.cell_contents for cell in function.__closure__ or ()]
+    used = [*(function.__globals__.get(name) for name in function.__code__.co_names), *values]
+    called = [_folders(each.py_func) for each in used if hasattr(each, "py_func")]
+    return {Path(function.__code__.co_filename).parent}.union(*called)
 
 
 @cache

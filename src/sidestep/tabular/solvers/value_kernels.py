@@ -168,7 +168,17 @@ def _shift_farther(i, actions, width, process, values, history, shift_from, reac
 def _solve_state(
     i, actions, width, process, backup, guess, repeat_value, reachable_above, neg_inf, scratch
 ):  # pragma: no cover
-    """Return the root of the state's own equation, by one Newton step from a guess (see `base`).
+    """Return the root of the state's own equation; c(a) is in the scratch already."""
+    for a in range(actions):
+        scratch.exit_weights[a] = process.one_minus_discount
+        for m in range(width):
+            scratch.exit_weights[a] += process.discounted_probs[i, a, m]
+    return own_root(actions, backup, guess, repeat_value, reachable_above, neg_inf, scratch)
+
+
+@inlined(fastmath=_FAST)
+def own_root(actions, backup, guess, repeat_value, reachable_above, neg_inf, scratch):  # pragma: no cover
+    """Return the root of a state's own equation, by one Newton step from a guess (see `base`).
 
     For the log-sum-exp, a step from far above the root ends below it, perhaps far below, where actions that never leave
     seemed to matter most; so another step follows.
@@ -177,10 +187,6 @@ def _solve_state(
     value = repeat_value
     if guess > reachable_above:
         value = max(guess, repeat_value) if above else min(guess, repeat_value)
-    for a in range(actions):
-        scratch.exit_weights[a] = process.one_minus_discount
-        for m in range(width):
-            scratch.exit_weights[a] += process.discounted_probs[i, a, m]
     # a break would make numba count references again (see `Scratch`)
     again = True
     for _ in range(_NEWTON_STEPS):

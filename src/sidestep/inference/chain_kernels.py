@@ -1,0 +1,453 @@
+"""A Markov chain over barriers, as native code (numba): proposals, values after a proposal, and the acceptance.
+
+`sampler` describes the chain. The native code does three things for a proposal that the prior has accepted:
+
+1. **Local value iteration.** A changed barrier changes the transitions of a few states. These are solved anew, each by
+   a Newton step on its own equation (`value_kernels.own_root`), and the states with an action that leads to a state
+   that has changed by more than a tolerance follow, first in, first out. This is asynchronous value iteration with an
+   active list; it differs from prioritized sweeping (Moore & Atkeson 1993) by the order.
+2. **The likelihood.** The log-probabilities of the choices in solved states are computed anew, and the probabilities
+   of the transitions out of changed states.
+3. **Undoing.** The old values are kept until the proposal is accepted, and restored otherwise.
+"""
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from sidestep.tabular.solvers.native import NativeBackup, NativeFunction, compiled, inlined
+from sidestep.tabular.solvers.value_kernels import Scratch, own_root
+
+_FAST = {"contract", "reassoc", "nsz", "arcp"}
+MAX_CHANGED = 8
+"""The most barriers that a proposal changes."""
+
+
+class World(NamedTuple):
+    """The barriers of a model, and what depends on which, as native code reads them.
+
+    Attributes:
+        successors, attempts, needed: As in `Barriers`.
+        passing: o(i) of a barrier that is open, and of one that is closed.
+        gated: The states with an action that needs barrier i are `gated[gated_begin[i] : gated_begin[i + 1]]`.
+        before: The states with an action that may lead to s are `before[before_begin[s] : before_begin[s + 1]]`.
+    """
+
+    successors: np.ndarray
+    attempts: np.ndarray
+    needed: np.ndarray
+    passing: np.ndarray
+    gated_begin: np.ndarray
+    gated: np.ndarray
+    before_begin: np.ndarray
+    before: np.ndarray
+
+
+class Evidence(NamedTuple):
+    """The tasks and the moves that were observed.
+
+    Attributes:
+        reward: R(s, a) of each task; an axis of length 1 holds for all states or all actions.
+        solved: Whether each task goes on in each state and a terminal state can be reached from there.
+        discount, beta, lapse, tolerance: Of each task; the tolerance is one of values.
+        choice_row: The row of `choices` for each task and state; −1 where no action was observed.
+        choices: The weight of each action there.
+        moved: The weight of the transitions by each attempt.
+        stayed: The weight of those that stayed, by each action.
+        has_transitions: Whether transitions out of each state were observed.
+    """
+
+    reward: np.ndarray
+    solved: np.ndarray
+    discount: np.ndarray
+    beta: np.ndarray
+    lapse: np.ndarray
+    tolerance: np.ndarray
+    choice_row: np.ndarray
+    choices: np.ndarray
+    moved: np.ndarray
+    stayed: np.ndarray
+    has_transitions: np.ndarray
+
+
+class MRFTerms(NamedTuple):
+    """The prior of the barriers as native code reads it (see `mrf.BinaryMRF`).
+
+    Attributes:
+        field: The log-odds of each barrier by itself.
+        weights: Of lines, pairs, blocks and isolated cells.
+        rows, columns: Of the grid; 0 where barriers are no cells.
+    """
+
+    field: np.ndarray
+    weights: np.ndarray
+    rows: int
+    columns: int
+
+
+class Chain(NamedTuple):
+    """The state of a chain, changed in place.
+
+    Attributes:
+        closed: z, whether each barrier is closed (0 or 1).
+        probs: The probability of each attempt's success.
+        values: V of each task.
+        row_log_likelihood: The log-likelihood of the choices in each row.
+        totals: The log-likelihood of all choices and of all transitions.
+    """
+
+    closed: np.ndarray
+    probs: np.ndarray
+    values: np.ndarray
+    row_log_likelihood: np.ndarray
+    totals: np.ndarray
+
+
+class Workspace(NamedTuple):
+    """Memory of a chain: the active list, what has to be undone, and which states are in it.
+
+    Attributes:
+        queue: The active list, a ring.
+        queued: Whether each state is in it.
+        sources: The states whose transitions a proposal changes.
+        marked: The number of the proposal that last marked each state as a source.
+        log_task, log_state, log_value: Old values.
+        logged: The number of the proposal that last logged each task's state.
+        log_row, log_row_value: Old log-likelihoods of rows.
+        changed: The barriers that a proposal changes.
+        counters: The number of the proposal, the sizes of both logs and of `sources`, and the number of backups.
+    """
+
+    queue: np.ndarray
+    queued: np.ndarray
+    sources: np.ndarray
+    marked: np.ndarray
+    log_task: np.ndarray
+    log_state: np.ndarray
+    log_value: np.ndarray
+    logged: np.ndarray
+    log_row: np.ndarray
+    log_row_value: np.ndarray
+    changed: np.ndarray
+    counters: np.ndarray
+
+
+PROPOSAL, LOGGED, LOGGED_ROWS, SOURCES, BACKUPS = range(5)
+"""The places of `Workspace.counters`."""
+
+
+# The prior
+
+
+@inlined()
+def _at(closed, row, column, rows, columns):  # pragma: no cover
+    """Return whether a cell is closed; cells outside the map are open."""
+    if row < 0 or row >= rows or column < 0 or column >= columns:
+        return 0
+    return closed[row * columns + column]
+
+
+@compiled(fastmath=_FAST)
+def _shape_terms(closed, row, column, rows, columns, weights):  # pragma: no cover
+    """Return the terms of log p(z) that depend on a cell beside its neighbors: lines, pairs, blocks, isolated."""
+    total = 0.0
+    for k in range(5):
+        r, c = row + (k == 1) - (k == 2), column + (k == 3) - (k == 4)
+        if _at(closed, r, c, rows, columns):
+            left, right = _at(closed, r, c - 1, rows, columns), _at(closed, r, c + 1, rows, columns)
+            up, down = _at(closed, r - 1, c, rows, columns), _at(closed, r + 1, c, rows, columns)
+            total += weights[0] * (1 - (1 - left * right) * (1 - up * down))
+            if left + right + up + down == 0:
+                total += weights[3]
+            if k == 0:
+                total += weights[1] * (left + right + up + down)
+    for i in range(2):
+        for j in range(2):
+            r, c = row - i, column - j
+            if (
+                _at(closed, r, c, rows, columns)
+                and _at(closed, r, c + 1, rows, columns)
+                and _at(closed, r + 1, c, rows, columns)
+                and _at(closed, r + 1, c + 1, rows, columns)
+            ):
+                total += weights[2]
+    return total
+
+
+@compiled(fastmath=_FAST)
+def flip_prior(closed, i, prior):  # pragma: no cover
+    """Flip a barrier; return the change of log p(z)."""
+    sign = 1 - 2 * closed[i]
+    change = sign * prior.field[i]
+    if prior.rows > 0:
+        row, column = i // prior.columns, i % prior.columns
+        change -= _shape_terms(closed, row, column, prior.rows, prior.columns, prior.weights)
+        closed[i] = 1 - closed[i]
+        change += _shape_terms(closed, row, column, prior.rows, prior.columns, prior.weights)
+    else:
+        closed[i] = 1 - closed[i]
+    return change
+
+
+# Proposals
+
+
+@compiled()
+def _propose(rng, free, is_free, closed, prior, kinds, changed):  # pragma: no cover
+    """Fill in the barriers of a proposal; return their number, 0 where the proposal is no change.
+
+    A proposal and its reverse are equally probable. `kinds` are the cumulative probabilities of a flip and of a move.
+    """
+    kind = rng.random()
+    i = free[int(rng.random() * len(free))]
+    if kind < kinds[0] or prior.rows == 0:
+        changed[0] = i
+        return 1
+    row, column = i // prior.columns, i % prior.columns
+    if kind < kinds[1]:
+        way = int(rng.random() * 8)
+        way += way >= 4
+        r, c = row + way // 3 - 1, column + way % 3 - 1
+        if r < 0 or r >= prior.rows or c < 0 or c >= prior.columns:
+            return 0
+        j = r * prior.columns + c
+        if not is_free[j] or closed[i] == closed[j]:
+            return 0
+        changed[0], changed[1] = i, j
+        return 2
+    length, down = 2 + int(rng.random() * (MAX_CHANGED - 2)), rng.random() < 0.5
+    for step in range(length):
+        r, c = row + step * down, column + step * (not down)
+        if r >= prior.rows or c >= prior.columns:
+            return 0
+        j = r * prior.columns + c
+        if not is_free[j] or closed[j] != closed[i]:
+            return 0
+        changed[step] = j
+    return length
+
+
+# The likelihood
+
+
+@inlined(fastmath=_FAST)
+def _transition_log_likelihood(s, actions, width, probs, evidence):  # pragma: no cover
+    """Return the log-likelihood of the observed transitions out of a state."""
+    total = 0.0
+    for a in range(actions):
+        success = 0.0
+        for k in range(width):
+            success += probs[s, a, k]
+            if evidence.moved[s, a, k] > 0:
+                total += evidence.moved[s, a, k] * np.log(probs[s, a, k])
+        if evidence.stayed[s, a] > 0:
+            total += evidence.stayed[s, a] * np.log(max(1 - success, 1e-300))
+    return total
+
+
+@inlined(fastmath=_FAST)
+def _choice_log_likelihood(actions, lapse, beta, counts, advantages):  # pragma: no cover
+    """Return the log-likelihood of the observed choices in a state from the advantages of its actions."""
+    best = advantages[0]
+    for a in range(1, actions):
+        best = max(best, advantages[a])
+    total = 0.0
+    for a in range(actions):
+        total += np.exp(max(beta * (advantages[a] - best), -700.0))
+    result = 0.0
+    for a in range(actions):
+        if counts[a] > 0:
+            chosen = beta * (advantages[a] - best) - np.log(total)
+            if lapse > 0:
+                chosen = np.log((1 - lapse) * np.exp(max(chosen, -700.0)) + lapse / actions)
+            result += counts[a] * chosen
+    return result
+
+
+@cache
+def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunction]:
+    """Return the native code that computes the likelihood of a chain, and that which makes its proposals."""
+
+    @inlined(fastmath=_FAST)
+    def fill(task, s, world, evidence, chain, neg_inf, scratch):  # pragma: no cover
+        """Fill in c(a) and l(a) of a state (see `base`); return its repeat-action value."""
+        discount = evidence.discount[task]
+        row = s if evidence.reward.shape[1] > 1 else 0
+        repeat_value = neg_inf
+        for a in range(actions):
+            exit_value = evidence.reward[task, row, a if evidence.reward.shape[2] > 1 else 0]
+            weight = 1 - discount
+            for k in range(width):
+                j = world.successors[s, a, k]
+                if j != s:
+                    move = discount * chain.probs[s, a, k]
+                    exit_value += move * chain.values[task, j]
+                    weight += move
+            scratch.exit_values[a] = exit_value
+            scratch.exit_weights[a] = weight
+            if weight > 0:
+                repeat_value = max(repeat_value, exit_value / weight)
+        return repeat_value
+
+    @compiled(fastmath=_FAST)
+    def settle(task, count, world, evidence, chain, work, kind, tie, neg_inf, scratch):  # pragma: no cover
+        """Solve the states in the active list, and those that depend on what changes, until nothing does."""
+        beta, tolerance = evidence.beta[task], evidence.tolerance[task]
+        backup = NativeBackup(kind, beta, tie)
+        reachable_above = -np.sqrt(-neg_inf)
+        states, head = chain.values.shape[1], 0
+        while count > 0:
+            s = work.queue[head]
+            head = head + 1 if head + 1 < states else 0
+            count -= 1
+            work.queued[s] = False
+            work.counters[BACKUPS] += 1
+            old = chain.values[task, s]
+            repeat_value = fill(task, s, world, evidence, chain, neg_inf, scratch)
+            value = neg_inf
+            if repeat_value > reachable_above:
+                value = own_root(actions, backup, old, repeat_value, reachable_above, neg_inf, scratch)
+            if work.logged[task, s] != work.counters[PROPOSAL]:
+                at = work.counters[LOGGED]
+                work.log_task[at], work.log_state[at], work.log_value[at] = task, s, old
+                work.logged[task, s] = work.counters[PROPOSAL]
+                work.counters[LOGGED] += 1
+            if abs(value - old) > tolerance:
+                chain.values[task, s] = value
+                for at in range(world.before_begin[s], world.before_begin[s + 1]):
+                    j = world.before[at]
+                    if evidence.solved[task, j] and not work.queued[j]:
+                        work.queued[j] = True
+                        tail = head + count
+                        work.queue[tail if tail < states else tail - states] = j
+                        count += 1
+
+    @compiled(fastmath=_FAST)
+    def choices_in(task, s, world, evidence, chain, neg_inf, scratch):  # pragma: no cover
+        """Return the log-likelihood of the choices in a state for a task."""
+        fill(task, s, world, evidence, chain, neg_inf, scratch)
+        for a in range(actions):
+            scratch.advantages[a] = scratch.exit_values[a] - scratch.exit_weights[a] * chain.values[task, s]
+        counts = evidence.choices[evidence.choice_row[task, s]]
+        return _choice_log_likelihood(actions, evidence.lapse[task], evidence.beta[task], counts, scratch.advantages)
+
+    @compiled(fastmath=_FAST)
+    def refresh_probs(s, world, chain):  # pragma: no cover
+        """Compute the probabilities of the attempts out of a state from the barriers."""
+        for a in range(actions):
+            for k in range(width):
+                success = world.attempts[s, a, k]
+                for n in range(world.needed.shape[3]):
+                    i = world.needed[s, a, k, n]
+                    if i >= 0:
+                        success *= world.passing[i, chain.closed[i]]
+                chain.probs[s, a, k] = success
+
+    @compiled()
+    def compute_likelihood(world, evidence, chain, neg_inf):  # pragma: no cover
+        """Compute the probabilities and the log-likelihoods of a chain from its barriers and values."""
+        scratch = Scratch(np.empty(actions), np.empty(actions), np.empty(actions))
+        tasks, states = chain.values.shape
+        chain.totals[:] = 0.0
+        for s in range(states):
+            refresh_probs(s, world, chain)
+            if evidence.has_transitions[s]:
+                chain.totals[1] += _transition_log_likelihood(s, actions, width, chain.probs, evidence)
+        for task in range(tasks):
+            for s in range(states):
+                row = evidence.choice_row[task, s]
+                if row >= 0:
+                    chain.row_log_likelihood[row] = choices_in(task, s, world, evidence, chain, neg_inf, scratch)
+                    chain.totals[0] += chain.row_log_likelihood[row]
+
+    @compiled(fastmath=_FAST)
+    def change_transitions(count, world, evidence, chain, work):  # pragma: no cover
+        """Compute what depends on changed barriers directly; return the change of the transitions' log-likelihood."""
+        work.counters[SOURCES] = 0
+        change = 0.0
+        for n in range(count):
+            i = work.changed[n]
+            for at in range(world.gated_begin[i], world.gated_begin[i + 1]):
+                s = world.gated[at]
+                if work.marked[s] != work.counters[PROPOSAL]:
+                    work.marked[s] = work.counters[PROPOSAL]
+                    work.sources[work.counters[SOURCES]] = s
+                    work.counters[SOURCES] += 1
+                    if evidence.has_transitions[s]:
+                        change -= _transition_log_likelihood(s, actions, width, chain.probs, evidence)
+                    refresh_probs(s, world, chain)
+                    if evidence.has_transitions[s]:
+                        change += _transition_log_likelihood(s, actions, width, chain.probs, evidence)
+        return change
+
+    @compiled(fastmath=_FAST)
+    def change_choices(task, world, evidence, chain, work, kind, tie, neg_inf, scratch):  # pragma: no cover
+        """Solve a task after a change of transitions; return the change of the choices' log-likelihood."""
+        first, count = work.counters[LOGGED], 0
+        for n in range(work.counters[SOURCES]):
+            s = work.sources[n]
+            if evidence.solved[task, s]:
+                work.queue[count] = s
+                work.queued[s] = True
+                count += 1
+        settle(task, np.int64(count), world, evidence, chain, work, kind, tie, neg_inf, scratch)
+        change = 0.0
+        for at in range(first, work.counters[LOGGED]):
+            s = work.log_state[at]
+            row = evidence.choice_row[task, s]
+            if row >= 0:
+                place, old = work.counters[LOGGED_ROWS], chain.row_log_likelihood[row]
+                work.log_row[place], work.log_row_value[place] = row, old
+                work.counters[LOGGED_ROWS] += 1
+                chain.row_log_likelihood[row] = choices_in(task, s, world, evidence, chain, neg_inf, scratch)
+                change += chain.row_log_likelihood[row] - old
+        return change
+
+    @compiled()
+    def undo(count, world, chain, work):  # pragma: no cover
+        """Restore what a proposal has changed."""
+        for n in range(count):
+            chain.closed[work.changed[n]] = 1 - chain.closed[work.changed[n]]
+        for n in range(work.counters[SOURCES]):
+            refresh_probs(work.sources[n], world, chain)
+        for at in range(work.counters[LOGGED]):
+            chain.values[work.log_task[at], work.log_state[at]] = work.log_value[at]
+        for at in range(work.counters[LOGGED_ROWS]):
+            chain.row_log_likelihood[work.log_row[at]] = work.log_row_value[at]
+
+    @compiled()
+    def sweep(
+        rng, proposals, heat, free, is_free, world, evidence, prior, kinds, chain, work, kind, tie, neg_inf
+    ):  # pragma: no cover
+        """Make proposals and accept or reject each; return the number that were accepted."""
+        scratch = Scratch(np.empty(actions), np.empty(actions), np.empty(actions))
+        tasks, accepted = chain.values.shape[0], 0
+        for _ in range(proposals):
+            count = _propose(rng, free, is_free, chain.closed, prior, kinds, work.changed)
+            if count == 0:
+                continue
+            gain = 0.0
+            for n in range(count):
+                gain += flip_prior(chain.closed, work.changed[n], prior)
+            if np.log(rng.random()) * heat > gain:
+                for n in range(count):
+                    chain.closed[work.changed[n]] = 1 - chain.closed[work.changed[n]]
+                continue
+            work.counters[PROPOSAL] += 1
+            work.counters[LOGGED] = 0
+            work.counters[LOGGED_ROWS] = 0
+            threshold = np.log(rng.random()) * heat
+            of_transitions = change_transitions(count, world, evidence, chain, work)
+            of_choices = 0.0
+            for task in range(tasks):
+                of_choices += change_choices(task, world, evidence, chain, work, kind, tie, neg_inf, scratch)
+            if of_transitions + of_choices >= threshold:
+                chain.totals[0] += of_choices
+                chain.totals[1] += of_transitions
+                accepted += 1
+            else:
+                undo(count, world, chain, work)
+        return accepted
+
+    return compute_likelihood, sweep
