@@ -22,6 +22,7 @@ BENCHMARKS = {
     "planning": "plans and soft values, beside other planners",
     "fits": "large maps end to end: hide walls, simulate walks, learn, score",
     "rollouts": "roll-outs of continuous worlds: speed, and the noise of gradient estimators",
+    "enumeration": "the sampler and the mean field against the exact posterior of small worlds",
     "people": "walls learned from real walks in the twelve Tartarus mazes",
     "baselines": "all methods of `sidestep compare`: walls, held-out actions, robots with new goals",
     "towns": "one-way streets from taxi trips in Shanghai, buildings from drives in MAGELLAN's towns",

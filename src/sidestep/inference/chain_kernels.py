@@ -110,7 +110,7 @@ class Workspace(NamedTuple):
     Attributes:
         queue: The active list, a ring.
         queued: Whether each state is in it.
-        sources: The states whose transitions a proposal changes.
+        sources: The states with transitions that a proposal changes.
         marked: The number of the proposal that last marked each state as a source.
         log_task, log_state, log_value: Old values.
         logged: The number of the proposal that last logged each task's state.

@@ -49,7 +49,7 @@ class Progress(NamedTuple):
 
 
 class Status(enum.Enum):
-    """Why an optimization stopped; the values are the readable form.
+    """Why an optimization stopped, or whether chains have mixed; the values are the readable form.
 
     Example:
         >>> Status.MAX_ITERATIONS.advice
@@ -60,14 +60,17 @@ class Status(enum.Enum):
     MAX_ITERATIONS = "stopped at max_iterations"
     NO_ASCENT_STEP = "stopped, no step increases the objective"
     PRECISION_LIMIT = "stopped, no step increases the objective in 32-bit numbers"
+    MIXED = "mixed"
+    NOT_MIXED = "chains have not mixed"
 
     @property
     def advice(self) -> str:
-        """What may help; nothing after convergence."""
+        """What may help; nothing after success."""
         return _ADVICE.get(self, "")
 
 
 _ADVICE = {
+    Status.NOT_MIXED: "more sweeps let the chains agree",
     Status.MAX_ITERATIONS: "a larger max_iterations of the optimizer lets it continue",
     Status.NO_ASCENT_STEP: (
         "the objective has a kink here (as with HardMax), or the solver's tolerance does not resolve smaller changes"

@@ -20,7 +20,7 @@ every cell is closed.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Integer
 
 from sidestep.errors import check
 
@@ -66,7 +66,7 @@ class BinaryMRF:
         """Return the weights of lines, pairs, blocks and isolated cells."""
         return np.array([getattr(self, name) for name in SHAPE_TERMS], dtype=np.float64)
 
-    def log_density(self, closed: Bool[np.ndarray, " barriers"] | Int[np.ndarray, " barriers"]) -> float:
+    def log_density(self, closed: Bool[np.ndarray, " barriers"] | Integer[np.ndarray, " barriers"]) -> float:
         """Return log p(z) in nats, up to a constant.
 
         Args:

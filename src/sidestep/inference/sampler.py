@@ -21,362 +21,305 @@ The chain is that of Metropolis et al. (1953), *Equation of state calculations b
 Barriers that walks crossed are open and stay so.
 """
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, TypeVar
 
+import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Key
 
-from sidestep.errors import InputError, check, check_count
-from sidestep.inference.chain_kernels import (
-    BACKUPS,
-    MAX_CHANGED,
-    Chain,
-    Evidence,
-    MRFTerms,
-    Workspace,
-    World,
-    chain_kernels,
-)
+from sidestep.errors import check, check_count
+from sidestep.inference.chains import BarrierProblem, ChainState, barrier_problem
+from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
+from sidestep.inference.diagnostics import effective_sizes, split_rhat
+from sidestep.inference.maximize import Status
 from sidestep.inference.mrf import BinaryMRF
-from sidestep.tabular.backups import Behavior, HardMax
+from sidestep.tabular.backups import Behavior
+from sidestep.tabular.behavior_model import BehaviorModel, behavior_model
 from sidestep.tabular.demonstrations import Demonstrations
-from sidestep.tabular.likelihood import ALL_TERMS, Terms
-from sidestep.tabular.models.barriers import NO_BARRIER, Barriers
 from sidestep.tabular.grid import Cell
-from sidestep.tabular.solvers.base import SolveResult, WarmStart, neg_inf
-from sidestep.tabular.solvers.gauss_seidel import KERNELS
-from sidestep.tabular.solvers.native import HostProcess, NativeBackup, NativeEquation
-from sidestep.tabular.solvers.values import solve_values
+from sidestep.tabular.likelihood import ALL_TERMS, Terms
+from sidestep.tabular.models import TransitionModel
+from sidestep.tabular.models.barriers import barriers_of, with_closed
+from sidestep.tabular.solve import check_proper
+from sidestep.tabular.solvers.native import run_batch
 
-PASSING = (0.997, 0.003)
-"""The probability that an open barrier, and a closed one, lets an agent pass."""
-_FLIPS, _MOVES = 0.6, 0.8
-"""The cumulative probabilities of flips and of moves; the rest are runs."""
+Model = TypeVar("Model", bound=TransitionModel)
+
 _HEAT, _HEATED = 4.0, 1 / 3
-"""The first heat, and the fraction of the sweeps that are heated."""
-_FRESH_SWEEPS = 10
-"""The number of sweeps after which values are solved from nothing."""
-_TOLERANCE = 7e-4
-"""The change of β V that is passed on (nats)."""
-_EXACT = 1e-9
-"""The tolerance of values solved from nothing."""
+"""The first heat, and the fraction of the sweeps that are heated and dropped."""
+_FEWEST, _MOST = 0.05, 0.5
+"""The fractions of closed barriers from which the first and the last chain start."""
+MIN_SWEEPS = 12
+"""The fewest sweeps: two thirds of them have to be 4 draws or more in each half."""
+_SURE = 1e-9
+"""The least distance of the model's P(closed) from 0 and 1."""
+MIXED_RHAT, _MIXED_FRACTION = 1.05, 0.9
+"""Chains have mixed where split-R̂ is at most 1.05 for nine of ten barriers."""
 
 
-class ChainState(NamedTuple):
-    """A chain with everything that its future depends on, and what it has sampled.
+class SweepProgress(NamedTuple):
+    """The state of a sampler after a sweep; means over the chains.
 
     Attributes:
-        chain: The present map, its values and likelihood.
-        work: Memory.
-        random: The generator.
-        samples: The map after each sweep.
-        log_likelihoods: Those of actions and transitions after each sweep.
-        log_priors: log p(z) after each sweep.
+        iteration: The number of sweeps.
+        objective: log L(z) + log p(z), in nats, up to a constant.
+        actions, transitions, prior: Its parts.
+        accepted: The fraction of accepted proposals.
+
+    Example:
+        >>> SweepProgress(1, objective=-3.0, actions=-2.0, transitions=-0.5, prior=-0.5, accepted=0.1).objective
+        -3.0
     """
 
-    chain: Chain
-    work: Workspace
-    random: np.random.Generator
-    samples: Bool[np.ndarray, "sweeps barriers"]
-    log_likelihoods: Float[np.ndarray, "sweeps 2"]
-    log_priors: Float[np.ndarray, " sweeps"]
+    iteration: int
+    objective: float
+    actions: float
+    transitions: float
+    prior: float
+    accepted: float
 
 
 @dataclass(frozen=True, eq=False)
-class BarrierProblem:
-    """What is sampled: the world, the evidence and the prior, as native code reads them.
+class BarrierPosterior(Generic[Model]):
+    """Samples of the barriers of a transition model from their posterior.
 
     Attributes:
-        barriers: The barriers of the model.
-        world: The same with what depends on which.
-        evidence: The tasks and the moves that were observed.
-        prior: The prior of the barriers.
-        free: The barriers that are sampled; the others are known, or walks crossed them.
-        backup: The number of the backup, and the part of the best value within which actions tie.
-        terminal: Where each task ends.
-        terminal_reward: What each task pays there.
+        model: The transition model with the posterior's P(closed).
+        behavior: The behavior model; it is not sampled.
+        samples: Whether each barrier is closed, after each sweep that counts, for each chain.
+        closed: P(closed) of each barrier: (n + ½)/(N + 1) of n samples in N; exactly 0 or 1 where it is known.
+        rhat: Split-R̂ of each barrier.
+        effective_sizes: The number of independent samples that each P(closed) is worth.
+        history: The progress after every sweep, heated ones included.
+        status: `Status.MIXED` if the chains agree, `Status.NOT_MIXED` otherwise.
+
+    Example:
+        >>> import sidestep as ss
+        >>> grid = ss.Grid.unknown(1, 3)
+        >>> shown = ss.gather([ss.Trajectory(np.array([0, 1]), np.array([3]), task=0)], [ss.reach(grid, 1)])
+        >>> prior = BinaryMRF(np.zeros(3), (1, 3))
+        >>> posterior = sample_barriers(ss.ObstacleGrid(grid), shown, ss.Behavior(ss.BoltzmannAverage()), prior=prior)
+        >>> posterior.sample(jax.random.key(0), 2).shape
+        (2, 3)
     """
 
-    barriers: Barriers
-    world: World
-    evidence: Evidence
-    prior: BinaryMRF
-    free: Int[np.ndarray, " free"]
-    backup: tuple[int, float]
-    terminal: Bool[np.ndarray, "tasks states"]
-    terminal_reward: Float[np.ndarray, "tasks #states"]
+    model: Model
+    behavior: BehaviorModel
+    samples: Bool[np.ndarray, "chains draws barriers"]
+    closed: Float[np.ndarray, " barriers"]
+    rhat: Float[np.ndarray, " barriers"]
+    effective_sizes: Float[np.ndarray, " barriers"]
+    history: tuple[SweepProgress, ...]
+    status: Status
 
-    def start(self, closed: Bool[np.ndarray, " barriers"], sweeps: int, random: np.random.Generator) -> ChainState:
-        """Return a chain that starts from a map.
+    @property
+    def converged(self) -> bool:
+        """Whether the chains have mixed."""
+        return self.status is Status.MIXED
 
-        Args:
-            closed: Whether each barrier is closed; known barriers and those that walks crossed are as they are.
-            sweeps: The number of sweeps that it will make.
-            random: The generator of its proposals.
-        """
-        states, actions, attempts = self.barriers.successors.shape
-        tasks, rows = len(self.terminal), len(self.evidence.choices)
-        z = np.where(self.barriers.known == Cell.OCCUPIED, 1, 0).astype(np.uint8)
-        z[self.free] = closed[self.free]
-        values = np.zeros((tasks, states))
-        chain = Chain(z, np.empty((states, actions, attempts)), values, np.zeros(rows), np.zeros(2))
-        size = tasks * states
-        work = Workspace(
-            queue=np.zeros(states, np.int32),
-            queued=np.zeros(states, np.bool_),
-            sources=np.zeros(states, np.int64),
-            marked=np.zeros(states, np.int64),
-            log_task=np.zeros(size, np.int32),
-            log_state=np.zeros(size, np.int64),
-            log_value=np.zeros(size),
-            logged=np.zeros((tasks, states), np.int64),
-            log_row=np.zeros(rows, np.int32),
-            log_row_value=np.zeros(rows),
-            changed=np.zeros(MAX_CHANGED, np.int32),
-            counters=np.zeros(5, np.int64),
-        )
-        return ChainState(
-            chain, work, random, np.zeros((sweeps, len(z)), bool), np.zeros((sweeps, 2)), np.zeros(sweeps)
-        )
+    @property
+    def final(self) -> SweepProgress:
+        """The means over the sweeps that count."""
+        kept = np.array(self.history[-self.samples.shape[1] :]).mean(axis=0).tolist()
+        return SweepProgress(self.history[-1].iteration, *kept[1:])
 
-    def solve(self, state: ChainState) -> None:
-        """Solve all tasks of a chain from nothing, and compute its likelihood.
+    @property
+    def message(self) -> str:
+        """The status with its measure."""
+        sampled = self.samples.any(axis=(0, 1)) & ~self.samples.all(axis=(0, 1))
+        fraction = float((self.rhat <= MIXED_RHAT).mean())
+        size = f", median effective size {np.median(self.effective_sizes[sampled]):.0f}" if sampled.any() else ""
+        return f"{self.status.value} (split-R̂ at most {MIXED_RHAT} for {fraction:.0%} of the barriers{size})"
+
+    def sample(self, key: Key[Array, ""], count: int) -> Bool[np.ndarray, "count barriers"]:
+        """Draw maps from the samples of all chains, with replacement.
 
         Args:
-            state: The chain, changed in place.
-        """
-        compute_likelihood, _ = chain_kernels(*self.barriers.successors.shape[1:])
-        successors, probabilities = _outcomes(self.barriers, self.world, state.chain.closed)
-        kind, tie = self.backup
-        for task, values in enumerate(state.chain.values):
-            reward, discount = self.evidence.reward[task], self.evidence.discount[task]
-            ends, pays = self.terminal[task], self.terminal_reward[task]
-            process = HostProcess(successors, probabilities, reward, pays, ends, discount)
-            backup = NativeBackup(kind, self.evidence.beta[task], np.float64(tie))
-            equation = NativeEquation(process, backup, np.float64(_EXACT))
-            result = _empty_result(len(values))
-            cold = WarmStart(
-                np.full(len(values), neg_inf(values.dtype)), np.zeros(0), np.full(len(values), -1, np.int32)
-            )
-            solve_values(
-                5_000, result, equation, _lower_bound(reward, ends, discount), cold, np.ones(len(values), bool)
-            )
-            values[:] = result.values
-        compute_likelihood(self.world, self.evidence, state.chain, neg_inf(np.dtype(float)))
+            key: The random key.
+            count: The number of maps, at least 1.
 
-    def sweep(self, state: ChainState, number: int, sweeps: int) -> None:
-        """Make one proposal for each free barrier.
-
-        Args:
-            state: The chain, changed in place.
-            number: The number of this sweep, from 0.
-            sweeps: The number of all sweeps.
+        Returns:
+            Whether each barrier is closed, in each map.
         """
-        if number % _FRESH_SWEEPS == 0:
-            self.solve(state)
-        _, sweep = chain_kernels(*self.barriers.successors.shape[1:])
-        prior = MRFTerms(self.prior.field, self.prior.weights, *(self.prior.shape or (0, 0)))
-        is_free = np.zeros(len(state.chain.closed), bool)
-        is_free[self.free] = True
-        kinds, (kind, tie) = np.array([_FLIPS, _MOVES]), self.backup
-        arguments = (self.free, is_free, self.world, self.evidence, prior, kinds, state.chain, state.work)
-        sweep(state.random, len(self.free), heat(number, sweeps), *arguments, kind, tie, neg_inf(np.dtype(float)))
-        state.samples[number] = state.chain.closed
-        state.log_likelihoods[number] = state.chain.totals
-        state.log_priors[number] = self.prior.log_density(state.chain.closed)
+        check_count(count, 1, "count")
+        every = self.samples.reshape(-1, self.samples.shape[-1])
+        return every[np.asarray(jax.random.randint(key, (count,), 0, len(every)))]
+
+    def summary(self) -> dict[str, Any]:
+        """Return the posterior's numbers: log-likelihoods and log prior in nats, and how well the chains agree.
+
+        Returns:
+            Plain numbers and texts.
+        """
+        final = self.final
+        return {
+            "posterior": "sample",
+            "objective": final.objective,
+            "log_likelihood_actions": final.actions,
+            "log_likelihood_transitions": final.transitions,
+            "log_prior": final.prior,
+            "chains": self.samples.shape[0],
+            "draws": self.samples.shape[1],
+            "iterations": final.iteration,
+            "accepted": final.accepted,
+            "largest_rhat": float(self.rhat.max()) if np.isfinite(self.rhat).all() else None,
+            "fraction_mixed": float((self.rhat <= MIXED_RHAT).mean()),
+            "smallest_effective_size": float(self.effective_sizes.min()),
+            "converged": self.converged,
+            "message": self.message,
+        }
+
+
+def sample_barriers(
+    model: Model,
+    demonstrations: Demonstrations,
+    behavior: Behavior | BehaviorModel,
+    *,
+    prior: BinaryMRF,
+    tempering: float = 1.0,
+    terms: Terms = ALL_TERMS,
+    sweeps: int = 300,
+    chains: int = 2,
+    seed: int = 0,
+    report: Callable[[SweepProgress], None] | None = None,
+    checkpoint: str | Path | Checkpoint | None = None,
+    resume: bool = False,
+) -> BarrierPosterior[Model]:
+    """Sample the barriers of a transition model from their posterior after demonstrations.
+
+    Args:
+        model: An `ObstacleGrid`, `SlipperyGrid`, `walled_grid` or `road_network`; slips stay as they are.
+        demonstrations: Trajectories of agents that know the true dynamics.
+        behavior: The behavior of the agents, or a fitted `BehaviorModel`; it stays as it is.
+        prior: The prior of the barriers.
+        tempering: κ in (0, 1], a factor of the actions' log-likelihood.
+        terms: The parts of the likelihood that count.
+        sweeps: The number of sweeps of each chain, at least 12; a sweep is a proposal for each unknown barrier.
+        chains: The number of chains, at least 2.
+        seed: The seed. The result does not depend on the number of cores.
+        report: Called with a `SweepProgress` after every sweep.
+        checkpoint: The file that is kept up to date with the state of the chains.
+        resume: Continue from the checkpoint. The result is that of an uninterrupted run, to the last bit.
+
+    Returns:
+        The samples after the first third of the sweeps, P(closed), and whether the chains have mixed.
+
+    Raises:
+        InputError: For a model without barriers, a prior of another size, settings out of range, and a checkpoint
+            that belongs to another problem.
+        ImproperTask: For tasks without finite values.
+        NotConverged: Where values do not converge.
+
+    References:
+        Metropolis et al. (1953); Christen & Fox (2005), *Markov chain Monte Carlo using an approximation*.
+    """
+    check_count(sweeps, MIN_SWEEPS, "sweeps")
+    check_count(chains, 2, "chains")
+    check(0 < tempering <= 1, f"expected a number in (0, 1], found {tempering}", field="tempering")
+    agents = behavior if isinstance(behavior, BehaviorModel) else behavior_model(behavior)
+    barriers = barriers_of(model)
+    fits = len(prior.field) == len(barriers.known)
+    check(fits, f"expected {len(barriers.known)} barriers, found {len(prior.field)}", field="prior")
+    check_proper(demonstrations.tasks, agents.behavior_of(), model.graph.actions)
+    problem = barrier_problem(barriers, demonstrations, agents, prior, tempering=tempering, terms=terms)
+    states = start_chains(problem, sweeps, chains, seed)
+    saver = Saver(checkpoint, fingerprint((problem, sweeps, chains, seed)))
+    done = _load(saver, states) if resume else 0
+    free = max(1, len(problem.free))
+    for number in range(done, sweeps):
+        run_sweep(problem, states, number, heat(number, sweeps))
+        if report is not None:
+            report(_progress(states, number, free))
+        saver.save([_saved(state) for state in states], [[number + 1]])
+    history = tuple(_progress(states, number, free) for number in range(sweeps))
+    samples = np.stack([state.samples for state in states])[:, heated_sweeps(sweeps) :]
+    count = samples.shape[0] * samples.shape[1]
+    known = barriers.known != Cell.UNKNOWN
+    closed = np.where(known, samples[0, 0], (samples.sum(axis=(0, 1)) + 0.5) / (count + 1))
+    rhat = split_rhat(samples)
+    mixed = (rhat[problem.free] <= MIXED_RHAT).mean() >= _MIXED_FRACTION if len(problem.free) else True
+    status = Status.MIXED if mixed else Status.NOT_MIXED
+    learned = with_closed(model, np.clip(closed, _SURE, 1 - _SURE))
+    return BarrierPosterior(learned, agents, samples, closed, rhat, effective_sizes(samples), history, status)
+
+
+def heated_sweeps(sweeps: int) -> int:
+    """Return the number of sweeps that are heated and dropped.
+
+    Args:
+        sweeps: The number of all sweeps.
+    """
+    return math.ceil(sweeps * _HEATED)
 
 
 def heat(number: int, sweeps: int) -> float:
-    """Return the heat of a sweep: from 4 to 1 over the first third, 1 from then on."""
-    heated = sweeps * _HEATED
+    """Return the heat of a sweep: from 4 to 1 over the first third, 1 from then on.
+
+    Args:
+        number: The number of the sweep, from 0.
+        sweeps: The number of all sweeps.
+    """
+    heated = heated_sweeps(sweeps)
     return 1.0 if number >= heated else _HEAT ** (1 - number / heated)
 
 
-def barrier_problem(
-    barriers: Barriers,
-    demonstrations: Demonstrations,
-    behaviors: list[Behavior],
-    prior: BinaryMRF,
-    *,
-    tempering: float = 1.0,
-    terms: Terms = ALL_TERMS,
-) -> BarrierProblem:
-    """Return what is sampled, from a model's barriers and demonstrations.
-
-    Args:
-        barriers: The barriers.
-        demonstrations: The moves and tasks.
-        behaviors: The behavior of the agents in each task.
-        prior: The prior of the barriers.
-        tempering: The weight of the actions' log-likelihood, in (0, 1].
-        terms: The parts of the likelihood that count.
-    """
-    tasks = demonstrations.tasks
-    terminal = np.array(tasks.terminal)
-    passing = np.where(
-        (barriers.known == Cell.UNKNOWN)[:, None], PASSING, np.where(barriers.known == Cell.FREE, 1.0, 0.0)[:, None]
-    )
-    states = np.arange(len(barriers.successors))
-    needed = barriers.needed
-    state, _, _, place = np.nonzero(needed != NO_BARRIER)
-    gated_begin, gated = _grouped(needed[needed != NO_BARRIER], state, len(barriers.known))
-    leads = (barriers.attempts > 0) & (barriers.successors != states[:, None, None])
-    before_begin, before = _grouped(barriers.successors[leads], np.nonzero(leads)[0], len(states))
-    world = World(
-        barriers.successors.astype(np.int32), barriers.attempts, needed.astype(np.int32), passing,
-        gated_begin, gated, before_begin, before,
-    )  # fmt: skip
-    moved, stayed = _transitions(barriers, demonstrations)
-    crossed = _crossed(barriers, demonstrations, moved)
-    if "transitions" not in terms:
-        moved, stayed, crossed = np.zeros_like(moved), np.zeros_like(stayed), np.zeros_like(crossed)
-    choice_row, choices = _choices(demonstrations, barriers.successors.shape[1])
-    weight = tempering if "actions" in terms else 0.0
-    beta = np.array([float(each.beta) for each in behaviors])
-    evidence = Evidence(
-        reward=np.array(tasks.reward, np.float64),
-        solved=_solvable(barriers, terminal),
-        discount=np.array(tasks.discount, np.float64),
-        beta=beta,
-        lapse=np.array([0.0 if each.lapse is None else float(each.lapse) for each in behaviors]),
-        tolerance=_TOLERANCE / beta,
-        choice_row=choice_row,
-        choices=weight * choices,
-        moved=moved,
-        stayed=stayed,
-        has_transitions=moved.any(axis=(1, 2)) | stayed.any(axis=1),
-    )
-    backup = behaviors[0].backup
-    if type(backup) not in KERNELS:
-        raise InputError(f"expected one of {', '.join(kind.__name__ for kind in KERNELS)}", field="backup")
-    tie = backup.tie if isinstance(backup, HardMax) else 0.0
-    free = np.flatnonzero((barriers.known == Cell.UNKNOWN) & ~crossed).astype(np.int64)
-    rewards = np.array(tasks.terminal_reward, np.float64)
-    return BarrierProblem(barriers, world, evidence, prior, free, (KERNELS[type(backup)], tie), terminal, rewards)
-
-
-def run_chains(
-    problem: BarrierProblem,
-    sweeps: int,
-    chains: int = 2,
-    seed: int = 0,
-    report: Callable[[int], None] = lambda _: None,
-) -> list[ChainState]:
-    """Run chains side by side.
+def start_chains(problem: BarrierProblem, sweeps: int, chains: int, seed: int) -> list[ChainState]:
+    """Return chains that start from few to many closed barriers, each with a generator of its own.
 
     Args:
         problem: What is sampled.
-        sweeps: The number of sweeps of each chain, at least 3.
+        sweeps: The number of sweeps that they will make.
         chains: Their number.
-        seed: The seed; each chain has a generator of its own, so the number of cores changes nothing.
-        report: Called after each sweep of all chains, with its number.
-
-    Returns:
-        The chains, with their samples.
+        seed: The seed.
     """
-    check_count(sweeps, 3, "sweeps")
-    fractions = np.linspace(0.05, 0.5, chains) if chains > 1 else np.array([0.05])
     states = []
-    for fraction, sequence in zip(fractions, np.random.SeedSequence(seed).spawn(chains), strict=True):
+    sequences = np.random.SeedSequence(seed).spawn(chains)
+    for fraction, sequence in zip(np.linspace(_FEWEST, _MOST, chains), sequences, strict=True):
         random = np.random.Generator(np.random.PCG64(sequence))
         states.append(problem.start(random.random(len(problem.barriers.known)) < fraction, sweeps, random))
-    with ThreadPoolExecutor(chains) as pool:
-        for number in range(sweeps):
-            list(pool.map(lambda state: problem.sweep(state, number, sweeps), states))
-            report(number)
     return states
 
 
-def _outcomes(barriers: Barriers, world: World, closed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return successors and probabilities with staying as the last outcome."""
-    passing = np.append(world.passing[np.arange(len(closed)), closed], 1.0)
-    success = barriers.attempts * passing[barriers.needed].prod(axis=-1)
-    stay = np.broadcast_to(np.arange(len(success))[:, None, None], (*success.shape[:2], 1))
-    successors = np.concatenate([world.successors, stay], axis=-1).astype(np.int32)
-    return successors, np.concatenate([success, 1 - success.sum(axis=-1, keepdims=True)], axis=-1)
+def run_sweep(problem: BarrierProblem, states: Sequence[ChainState], number: int, heat: float) -> None:
+    """Make a sweep of every chain, on all cores.
+
+    Args:
+        problem: What is sampled.
+        states: The chains, changed in place.
+        number: The number of the sweep, from 0.
+        heat: T, where the chains sample the posterior to the power 1/T.
+    """
+    run_batch(lambda index: problem.sweep(states[index[0]], number, heat), [(at,) for at in range(len(states))])
 
 
-def _empty_result(states: int) -> SolveResult:
-    values, order = np.empty(states), np.empty(states, np.int32)
-    arrays: tuple[Any, ...] = (values, order, np.empty((), np.int64), np.empty(()), np.empty((), bool))
-    return SolveResult(*arrays)
+def _progress(states: Sequence[ChainState], number: int, free: int) -> SweepProgress:
+    actions, transitions = np.mean([state.log_likelihoods[number] for state in states], axis=0).tolist()
+    prior = float(np.mean([state.log_priors[number] for state in states]))
+    accepted = float(np.mean([state.accepted[number] for state in states])) / free
+    return SweepProgress(number + 1, actions + transitions + prior, actions, transitions, prior, accepted)
 
 
-def _lower_bound(reward: np.ndarray, terminal: np.ndarray, discount: float) -> np.floating:
-    """As `base.lower_bound`."""
-    worst = np.broadcast_to(reward.max(axis=-1), terminal.shape)[~terminal].min(initial=0.0)
-    return np.float64(worst / (1 - discount) if discount < 1 else neg_inf(np.dtype(float)))
+def _saved(state: ChainState) -> tuple[Any, ...]:
+    """Return the arrays on which the future of a chain depends, its generator as four words among them."""
+    words = [state.random.bit_generator.state["state"][name] for name in ("state", "inc")]
+    generator = np.array([word >> shift & (2**64 - 1) for word in words for shift in (64, 0)], np.uint64)
+    samples = state.samples, state.log_likelihoods, state.log_priors, state.accepted
+    return tuple(state.chain), state.work.counters, *samples, generator
 
 
-def _grouped(keys: np.ndarray, items: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distinct items of each key, one group after another, and where each group begins."""
-    pairs = np.unique(np.stack([keys, items], axis=1), axis=0)
-    begin = np.searchsorted(pairs[:, 0], np.arange(groups + 1))
-    return begin.astype(np.int64), pairs[:, 1].astype(np.int64)
-
-
-def _solvable(barriers: Barriers, terminal: np.ndarray) -> np.ndarray:
-    """Return whether each task goes on in each state and can end from there, were all unknown barriers open."""
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import breadth_first_order
-
-    closed = np.append(barriers.known == Cell.OCCUPIED, False)
-    possible = (barriers.attempts > 0) & ~closed[barriers.needed].any(axis=-1)
-    state = np.nonzero(possible)[0]
-    size = len(possible)
-    solvable = np.zeros(terminal.shape, bool)
-    for task, ends in enumerate(terminal):
-        # one more state leads to every end
-        rows = np.concatenate([barriers.successors[possible], np.full(ends.sum(), size)])
-        columns = np.concatenate([state, np.flatnonzero(ends)])
-        graph = csr_array((np.ones(len(rows)), (rows, columns)), shape=(size + 1, size + 1))
-        reached = breadth_first_order(graph, size, return_predecessors=False)
-        solvable[task, reached[reached < size]] = True
-    return solvable & ~terminal
-
-
-def _transitions(barriers: Barriers, demonstrations: Demonstrations) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights of observed transitions by each attempt, and of those that stayed."""
-    moved = np.zeros(barriers.successors.shape)
-    stayed = np.zeros(barriers.successors.shape[:2])
-    s, a, after, weight = (
-        np.asarray(each)
-        for each in (demonstrations.states, demonstrations.actions, demonstrations.next_states, demonstrations.weights)
-    )
-    stays = s == after
-    np.add.at(stayed, (s[stays], a[stays]), weight[stays])
-    s, a, after, weight = (each[~stays] for each in (s, a, after, weight))
-    leads = (barriers.successors[s, a] == after[:, None]) & (barriers.attempts[s, a] > 0)
-    check(leads.any(axis=-1).all(), "expected transitions that the model allows", field="demonstrations")
-    np.add.at(moved, (s, a, leads.argmax(axis=-1)), weight)
-    return moved, stayed
-
-
-def _crossed(barriers: Barriers, demonstrations: Demonstrations, moved: np.ndarray) -> np.ndarray:
-    """Return the barriers that agents crossed, and where these are cells, those that agents were in."""
-    crossed = np.zeros(len(barriers.known) + 1, bool)
-    crossed[barriers.needed[moved > 0]] = True
-    crossed = crossed[:-1]
-    if barriers.shape is not None:
-        counts = np.asarray(demonstrations.weights) > 0
-        for each in (demonstrations.states, demonstrations.next_states):
-            crossed[np.asarray(each)[counts]] = True
-    return crossed
-
-
-def _choices(demonstrations: Demonstrations, actions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the row of each task and state in which actions were observed, and the weight of each action there."""
-    task, s, a, weight = (
-        np.asarray(each)
-        for each in (demonstrations.task, demonstrations.states, demonstrations.actions, demonstrations.weights)
-    )
-    shape = np.asarray(demonstrations.tasks.terminal).shape
-    row, flat = np.full(shape, -1, np.int32), task.astype(np.int64) * shape[1] + s
-    distinct, which = np.unique(flat, return_inverse=True)
-    row.reshape(-1)[distinct] = np.arange(len(distinct))
-    choices = np.zeros((len(distinct), actions))
-    np.add.at(choices, (which, a), weight)
-    return row, choices
+def _load(saver: Saver, states: Sequence[ChainState]) -> int:
+    """Fill in the chains from a checkpoint; return the number of sweeps that they have made."""
+    saved, history, _ = saver.load([_saved(state) for state in states])
+    if not history:
+        return 0
+    for state, arrays in zip(states, saved, strict=True):
+        for into, array in zip(jax.tree.leaves(_saved(state))[:-1], jax.tree.leaves(arrays)[:-1], strict=True):
+            into[...] = array
+        high, low, inc_high, inc_low = (int(word) for word in arrays[-1])
+        words = {"state": high << 64 | low, "inc": inc_high << 64 | inc_low}
+        state.random.bit_generator.state = {**state.random.bit_generator.state, "state": words}
+    return int(history[0][0])

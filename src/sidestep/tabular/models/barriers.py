@@ -11,7 +11,7 @@ these models, so that binary variables can be sampled for all of them by the sam
 """
 
 from functools import singledispatch
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -24,6 +24,8 @@ from sidestep.tabular.models.base import TransitionModel
 from sidestep.tabular.models.categorical import FIXED, IMPOSSIBLE, TiedModel
 from sidestep.tabular.models.obstacle_grid import ObstacleGrid
 from sidestep.tabular.models.slippery_grid import DIRECTIONS, SlipperyGrid
+
+Model = TypeVar("Model", bound=TransitionModel)
 
 NO_BARRIER = -1
 """The entry of `Barriers.needed` for no barrier."""
@@ -114,7 +116,7 @@ def _barriers_of_cells(blank: Grid, known: Int[np.ndarray, "rows columns"]) -> B
     return Barriers(successors, inside.astype(np.float64)[..., None], needed, known.ravel(), known.shape)
 
 
-def with_closed(model: TransitionModel, closed: Float[np.ndarray, " barriers"]) -> TransitionModel:
+def with_closed(model: Model, closed: Float[np.ndarray, " barriers"]) -> Model:
     """Return a model with other probabilities that its barriers are closed.
 
     Args:

@@ -144,7 +144,7 @@ def call_host(function: Callable[..., None], arguments: tuple[Any, ...], shapes:
             inputs = jax.tree.unflatten(argument_structure, [array[task] for array in arrays])
             function(result, *eqx.combine(inputs, others))
 
-        _run_batch(call_one, list(np.ndindex(batch)))
+        run_batch(call_one, list(np.ndindex(batch)))
         if sum(result.nbytes for result in into) >= _MIN_BYTES_TO_TRIM:
             _memory_trimmer()(0)
 
@@ -157,7 +157,8 @@ def shapes_of(arrays: Any) -> Any:
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(jnp.shape(leaf), leaf.dtype), arrays)
 
 
-def _run_batch(call_one: Callable[[tuple[int, ...]], None], tasks: Sequence[tuple[int, ...]]) -> None:
+def run_batch(call_one: Callable[[tuple[int, ...]], None], tasks: Sequence[tuple[int, ...]]) -> None:
+    """Call a function for each task of a batch, in parallel; a single task may use all cores itself."""
     if len(tasks) == 1:
         call_one(tasks[0])
         return

@@ -1,0 +1,135 @@
+"""The sampler and the mean field against the exact posterior of small random worlds.
+
+    python -m benchmarks enumeration --worlds 50
+
+Each world is a grid of 16 to 30 cells, of which at most 14 are unknown and were not walked on, or as many borders that
+may be walls. True obstacles come from the prior at random weights, agents from the model. Rewards, backups, moves and β
+differ between worlds. The exact posterior is that of all maps (`enumerate_barriers`).
+
+Records: `world`, `kind`, `unknown`, `walks`, `method`, `error` (the mean over unknown barriers of the absolute error of
+P(closed)), `largest_error`, `status`, `seconds`.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+
+import sidestep as ss
+from benchmarks import Record, groups, option, print_table
+from sidestep.inference.chains import PASSING, crossed_barriers
+from sidestep.inference.enumeration import enumerate_barriers
+from sidestep.inference.mean_field import MeanField
+from sidestep.inference.mrf import BinaryMRF
+from sidestep.inference.sampler import sample_barriers
+from sidestep.tabular.likelihood import ALL_TERMS
+from sidestep.tabular.models.barriers import barriers_of, with_closed
+
+MOST_UNKNOWN = 14
+KINDS = ("4 moves", "8 moves", "borders")
+REWARDS = (ss.Reward(0.95), ss.Reward(1.0, 1.0))
+BACKUPS = (ss.BoltzmannAverage(), ss.LogSumExp(), ss.HardMax())
+
+
+@dataclass
+class Options:
+    """The options of this benchmark."""
+
+    worlds: int = option(50, "how many worlds", quick=3)
+    sweeps: int = option(2000, "sweeps of each chain")
+    chains: int = option(2, "chains", least=2)
+    seed: int = option(0, "the seed of the first world", least=0)
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A world with few unknown barriers, walks in it, and the prior of its barriers."""
+
+    kind: str
+    model: ss.TransitionModel
+    demonstrations: ss.Demonstrations
+    behavior: ss.Behavior
+    prior: BinaryMRF
+    unknown: np.ndarray
+
+
+def random_world(seed: int) -> World:
+    """Return the world of a seed: drawn again until no more than `MOST_UNKNOWN` barriers are open questions."""
+    random = np.random.default_rng(seed)
+    while True:
+        kind, reward = KINDS[seed % len(KINDS)], REWARDS[random.integers(len(REWARDS))]
+        shape = tuple(random.integers(3, 6, 2).tolist()) if kind == "borders" else (4, int(random.integers(4, 8)))
+        known = np.where(random.random(shape) < 0.4, ss.Cell.FREE, ss.Cell.UNKNOWN).astype(np.int64)
+        if kind == "borders":
+            known[:] = ss.Cell.FREE
+        grid = ss.Grid(known, connectivity=8 if kind == "8 moves" else 4)
+        model = ss.walled_grid(grid) if kind == "borders" else ss.ObstacleGrid(grid)
+        barriers = barriers_of(model)
+        closed = (random.random(len(barriers.known)) < 0.35) & (barriers.known == ss.Cell.UNKNOWN)
+        true_model = with_closed(model, np.where(closed, PASSING[0], PASSING[1]))
+        places = np.arange(grid.size) if kind == "borders" else np.flatnonzero(~closed)
+        goals = random.choice(places, 2, replace=False)
+        backup = BACKUPS[random.integers(len(BACKUPS))]
+        behavior = ss.Behavior(backup, random.uniform(4, 10) if reward.step_cost is None else random.uniform(1.5, 4))
+        starts = [random.choice(places[places != goal], int(random.integers(1, 5))) for goal in goals]
+        tasks = [reward.reach(grid, int(goal)) for goal in goals]
+        try:
+            walks = ss.simulate(jax.random.key(seed), true_model, tasks, starts, behavior)
+        except ss.SidestepError:  # no way from a start to its goal
+            continue
+        demonstrations = ss.gather([walk for walk in walks if len(walk.actions)], tasks)
+        unknown = (barriers.known == ss.Cell.UNKNOWN) & ~crossed_barriers(barriers, demonstrations, ALL_TERMS)
+        if not 2 <= unknown.sum() <= MOST_UNKNOWN:
+            continue
+        weights = dict(zip(("lines", "pairs", "blocks", "isolated"), random.uniform(-1.5, 1.5, 4), strict=True))
+        field = np.full(len(barriers.known), random.uniform(-2, 0))
+        prior = BinaryMRF(field) if kind == "borders" else BinaryMRF(field, grid.shape, **weights)
+        return World(kind, model, demonstrations, behavior, prior, unknown)
+
+
+def measure(options: Options) -> Iterator[Record]:
+    """Yield a record for each world and method."""
+    for seed in range(options.seed, options.seed + options.worlds):
+        world = random_world(seed)
+        problem = world.model, world.demonstrations, world.behavior
+        exact = enumerate_barriers(*problem, world.prior).closed
+
+        def record(method: str, closed: np.ndarray, status: str, started: float) -> Record:
+            errors = np.abs(closed - exact)[world.unknown]
+            walks, seconds = world.demonstrations.trajectories, time.perf_counter() - started
+            return {
+                **{"world": seed, "kind": world.kind, "unknown": len(errors), "walks": walks, "method": method},
+                **{"error": errors.mean(), "largest_error": errors.max(), "status": status, "seconds": seconds},
+            }
+
+        started = time.perf_counter()
+        sampled = sample_barriers(
+            *problem, prior=world.prior, sweeps=options.sweeps, chains=options.chains, seed=seed
+        )
+        yield record("sample", sampled.closed, sampled.status.value, started)
+        started = time.perf_counter()
+        known = barriers_of(world.model).known
+        shaped = known if world.prior.shape is None else known.reshape(world.prior.shape)
+        fit = ss.fit(*problem, prior=MeanField(world.prior, shaped))
+        closed = np.asarray(jax.nn.sigmoid(fit.model.parameters))
+        yield record("mean field", closed, fit.status.value, started)
+
+
+def show(records: Sequence[Record], options: Options) -> None:
+    """Print the errors of each method over all worlds."""
+    rows = [
+        {
+            **label,
+            "worlds": len(own),
+            "mean": np.mean([each["error"] for each in own]),
+            "worst": max(each["error"] for each in own),
+            "largest": max(each["largest_error"] for each in own),
+            "seconds": np.median([each["seconds"] for each in own]),
+        }
+        for label, own in groups(records, "method")
+    ]
+    columns = {"method": "method", "worlds": "worlds", "mean error": "mean .4f", "worst world": "worst .4f"}
+    columns |= {"largest error of a barrier": "largest .3f", "median seconds": "seconds .2f"}
+    print_table(f"absolute error of P(closed), {options.sweeps} sweeps", rows, columns)

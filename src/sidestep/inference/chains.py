@@ -1,0 +1,335 @@
+"""A Metropolis chain over the barriers of a model: its state, its evidence, and its sweeps.
+
+`sampler` describes the chain, `chain_kernels` holds its native code. Values are solved from nothing every ten sweeps by
+the solver of `sidestep.tabular.solvers.values`, and followed by local value iteration between.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from sidestep.errors import InputError, NotConverged, check
+from sidestep.inference.chain_kernels import (
+    MAX_CHANGED,
+    Chain,
+    Evidence,
+    MRFTerms,
+    Workspace,
+    World,
+    chain_kernels,
+)
+from sidestep.inference.mrf import BinaryMRF
+from sidestep.tabular.backups import HardMax
+from sidestep.tabular.behavior_model import BehaviorModel
+from sidestep.tabular.demonstrations import Demonstrations
+from sidestep.tabular.grid import Cell
+from sidestep.tabular.likelihood import ALL_TERMS, Terms
+from sidestep.tabular.models.barriers import NO_BARRIER, Barriers
+from sidestep.tabular.solvers.base import SolveResult, WarmStart, neg_inf
+from sidestep.tabular.solvers.gauss_seidel import KERNELS
+from sidestep.tabular.solvers.native import HostProcess, NativeBackup, NativeEquation
+from sidestep.tabular.solvers.values import solve_values
+
+PASSING = (0.997, 0.003)
+"""The probability that an open barrier, and a closed one, lets an agent pass."""
+_FLIPS, _MOVES = 0.6, 0.8
+"""The cumulative probabilities of flips and of moves; the rest are runs."""
+_FRESH_SWEEPS = 10
+"""The number of sweeps after which values are solved from nothing."""
+_NEG_INF = neg_inf(jnp.dtype(float))
+_TOLERANCE = 7e-4
+"""The change of β V that is passed on (nats)."""
+_EXACT, _MAX_SWEEPS = 1e-9, 5_000
+"""The tolerance of values solved from nothing, and the most sweeps."""
+
+
+class ChainState(NamedTuple):
+    """A chain with everything that its future depends on, and what it has sampled.
+
+    Attributes:
+        chain: The present map, its values and likelihood.
+        work: Memory.
+        random: The generator.
+        samples: The map after each sweep.
+        log_likelihoods: Those of actions and transitions after each sweep.
+        log_priors: log p(z) after each sweep.
+        accepted: The number of accepted proposals in each sweep.
+    """
+
+    chain: Chain
+    work: Workspace
+    random: np.random.Generator
+    samples: Bool[np.ndarray, "sweeps barriers"]
+    log_likelihoods: Float[np.ndarray, "sweeps 2"]
+    log_priors: Float[np.ndarray, " sweeps"]
+    accepted: Int[np.ndarray, " sweeps"]
+
+
+@dataclass(frozen=True, eq=False)
+class BarrierProblem:
+    """What is sampled: the world, the evidence and the prior, as native code reads them.
+
+    Attributes:
+        barriers: The barriers of the model.
+        world: The same with what depends on which.
+        evidence: The tasks and the moves that were observed.
+        prior: The prior of the barriers.
+        free: The barriers that are sampled; the others are known, or walks crossed them.
+        backup: The number of the backup, and the part of the best value within which actions tie.
+        terminal: Where each task ends.
+        terminal_reward: What each task pays there.
+    """
+
+    barriers: Barriers
+    world: World
+    evidence: Evidence
+    prior: BinaryMRF
+    free: Int[np.ndarray, " free"]
+    backup: tuple[int, float]
+    terminal: Bool[np.ndarray, "tasks states"]
+    terminal_reward: Float[np.ndarray, "tasks #states"]
+
+    def start(self, closed: Bool[np.ndarray, " barriers"], sweeps: int, random: np.random.Generator) -> ChainState:
+        """Return a chain that starts from a map.
+
+        Args:
+            closed: Whether each barrier is closed; known barriers and those that walks crossed are as they are.
+            sweeps: The number of sweeps that it will make.
+            random: The generator of its proposals.
+        """
+        states, actions, attempts = self.barriers.successors.shape
+        tasks, rows = len(self.terminal), len(self.evidence.choices)
+        z = np.where(self.barriers.known == Cell.OCCUPIED, 1, 0).astype(np.uint8)
+        z[self.free] = closed[self.free]
+        values = np.zeros((tasks, states))
+        chain = Chain(z, np.empty((states, actions, attempts)), values, np.zeros(rows), np.zeros(2))
+        size = tasks * states
+        work = Workspace(
+            queue=np.zeros(states, np.int32),
+            queued=np.zeros(states, np.bool_),
+            sources=np.zeros(states, np.int64),
+            marked=np.zeros(states, np.int64),
+            log_task=np.zeros(size, np.int32),
+            log_state=np.zeros(size, np.int64),
+            log_value=np.zeros(size),
+            logged=np.zeros((tasks, states), np.int64),
+            log_row=np.zeros(rows, np.int32),
+            log_row_value=np.zeros(rows),
+            changed=np.zeros(MAX_CHANGED, np.int32),
+            counters=np.zeros(5, np.int64),
+        )
+        return ChainState(
+            chain,
+            work,
+            random,
+            samples=np.zeros((sweeps, len(z)), bool),
+            log_likelihoods=np.zeros((sweeps, 2)),
+            log_priors=np.zeros(sweeps),
+            accepted=np.zeros(sweeps, np.int64),
+        )
+
+    def solve(self, state: ChainState) -> None:
+        """Solve all tasks of a chain from nothing, and compute its likelihood.
+
+        Args:
+            state: The chain, changed in place.
+        """
+        compute_likelihood, _ = chain_kernels(*self.barriers.successors.shape[1:])
+        successors, probabilities = _outcomes(self.barriers, self.world, state.chain.closed)
+        kind, tie = self.backup
+        for task, values in enumerate(state.chain.values):
+            reward, discount = self.evidence.reward[task], np.float64(self.evidence.discount[task])
+            ends, pays = self.terminal[task], self.terminal_reward[task]
+            backup = NativeBackup(kind, np.float64(self.evidence.beta[task]), np.float64(tie))
+            process = HostProcess(successors, probabilities, reward, pays, ends, discount)
+            values[:] = _solved(NativeEquation(process, backup, np.float64(_EXACT)))
+        compute_likelihood(self.world, self.evidence, state.chain, _NEG_INF)
+
+    def sweep(self, state: ChainState, number: int, heat: float) -> None:
+        """Make one proposal for each free barrier.
+
+        Args:
+            state: The chain, changed in place.
+            number: The number of this sweep, from 0.
+            heat: T, where the chain samples the posterior to the power 1/T.
+        """
+        if number % _FRESH_SWEEPS == 0:
+            self.solve(state)
+        _, sweep = chain_kernels(*self.barriers.successors.shape[1:])
+        prior = MRFTerms(self.prior.field, self.prior.weights, *(self.prior.shape or (0, 0)))
+        is_free = np.zeros(len(state.chain.closed), bool)
+        is_free[self.free] = True
+        kinds, (kind, tie) = np.array([_FLIPS, _MOVES]), self.backup
+        arguments = (self.free, is_free, self.world, self.evidence, prior, kinds, state.chain, state.work)
+        state.accepted[number] = sweep(state.random, len(self.free), heat, *arguments, kind, tie, _NEG_INF)
+        state.samples[number] = state.chain.closed
+        state.log_likelihoods[number] = state.chain.totals
+        state.log_priors[number] = self.prior.log_density(state.chain.closed)
+
+
+def barrier_problem(
+    barriers: Barriers,
+    demonstrations: Demonstrations,
+    agents: BehaviorModel,
+    prior: BinaryMRF,
+    *,
+    tempering: float = 1.0,
+    terms: Terms = ALL_TERMS,
+) -> BarrierProblem:
+    """Return what is sampled, from a model's barriers and demonstrations.
+
+    Args:
+        barriers: The barriers.
+        demonstrations: The moves and tasks.
+        agents: The behavior of the agents.
+        prior: The prior of the barriers.
+        tempering: The weight of the actions' log-likelihood, in (0, 1].
+        terms: The parts of the likelihood that count.
+    """
+    tasks = agents.tasks_of(demonstrations.tasks)
+    terminal = np.array(tasks.terminal)
+    persons = [None] * len(terminal) if agents.person is None else np.asarray(agents.person).tolist()
+    behaviors = [agents.behavior_of(person) for person in persons]
+    passing = np.where(
+        (barriers.known == Cell.UNKNOWN)[:, None], PASSING, np.where(barriers.known == Cell.FREE, 1.0, 0.0)[:, None]
+    )
+    states = np.arange(len(barriers.successors))
+    needed = barriers.needed
+    state = np.nonzero(needed != NO_BARRIER)[0]
+    gated_begin, gated = _grouped(needed[needed != NO_BARRIER], state, len(barriers.known))
+    leads = (barriers.attempts > 0) & (barriers.successors != states[:, None, None])
+    before_begin, before = _grouped(barriers.successors[leads], np.nonzero(leads)[0], len(states))
+    world = World(
+        barriers.successors.astype(np.int32), barriers.attempts, needed.astype(np.int32), passing,
+        gated_begin, gated, before_begin, before,
+    )  # fmt: skip
+    moved, stayed = _transitions(barriers, demonstrations, terms)
+    crossed = crossed_barriers(barriers, demonstrations, terms)
+    choice_row, choices = _choices(demonstrations, barriers.successors.shape[1])
+    weight = tempering if "actions" in terms else 0.0
+    beta = np.array([float(each.beta) for each in behaviors])
+    evidence = Evidence(
+        reward=np.array(tasks.reward, np.float64),
+        solved=_solvable(barriers, terminal),
+        discount=np.array(tasks.discount, np.float64),
+        beta=beta,
+        lapse=np.array([0.0 if each.lapse is None else float(each.lapse) for each in behaviors]),
+        tolerance=_TOLERANCE / beta,
+        choice_row=choice_row,
+        choices=weight * choices,
+        moved=moved,
+        stayed=stayed,
+        has_transitions=np.asarray(moved.any(axis=(1, 2)) | stayed.any(axis=1)),
+    )
+    backup = behaviors[0].backup
+    if type(backup) not in KERNELS:
+        raise InputError(f"expected one of {', '.join(kind.__name__ for kind in KERNELS)}", field="backup")
+    tie = backup.tie if isinstance(backup, HardMax) else 0.0
+    free = np.flatnonzero((barriers.known == Cell.UNKNOWN) & ~crossed).astype(np.int64)
+    rewards = np.array(tasks.terminal_reward, np.float64)
+    return BarrierProblem(barriers, world, evidence, prior, free, (KERNELS[type(backup)], tie), terminal, rewards)
+
+
+def _outcomes(barriers: Barriers, world: World, closed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return successors and probabilities with staying as the last outcome."""
+    passing = np.append(world.passing[np.arange(len(closed)), closed], 1.0)
+    success = barriers.attempts * passing[barriers.needed].prod(axis=-1)
+    stay = np.broadcast_to(np.arange(len(success))[:, None, None], (*success.shape[:2], 1))
+    successors = np.concatenate([world.successors, stay], axis=-1).astype(np.int32)
+    return successors, np.concatenate([success, 1 - success.sum(axis=-1, keepdims=True)], axis=-1)
+
+
+def _solved(equation: NativeEquation) -> Float[np.ndarray, " states"]:
+    """Return the values of a task, solved from nothing."""
+    process, states = equation.process, len(equation.process.terminal)
+    worst = np.broadcast_to(process.reward.max(axis=-1), states)[~process.terminal].min(initial=0.0)
+    # as `base.lower_bound`
+    bound = np.float64(worst / (1 - process.discount) if process.discount < 1 else _NEG_INF)
+    arrays: Any = np.empty(states), np.empty(states, np.int32), *(np.empty((), kind) for kind in (int, float, bool))
+    start: Any = np.full(states, _NEG_INF), np.zeros(0), np.full(states, -1, np.int32)
+    result = SolveResult(*arrays)
+    solve_values(_MAX_SWEEPS, result, equation, bound, WarmStart(*start), np.ones(states, bool))
+    if not result.converged:
+        raise NotConverged(f"the values of a task did not converge in {_MAX_SWEEPS} sweeps")
+    return arrays[0]
+
+
+def _grouped(keys: np.ndarray, items: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distinct items of each key, one group after another, and where each group begins."""
+    pairs = np.unique(np.stack([keys, items], axis=1), axis=0)
+    begin = np.searchsorted(pairs[:, 0], np.arange(groups + 1))
+    return begin.astype(np.int64), pairs[:, 1].astype(np.int64)
+
+
+def _solvable(barriers: Barriers, terminal: np.ndarray) -> np.ndarray:
+    """Return whether each task goes on in each state and can end from there, were all unknown barriers open."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import breadth_first_order
+
+    closed = np.append(barriers.known == Cell.OCCUPIED, False)
+    possible = (barriers.attempts > 0) & ~closed[barriers.needed].any(axis=-1)
+    state = np.nonzero(possible)[0]
+    size = len(possible)
+    solvable = np.zeros(terminal.shape, bool)
+    for task, ends in enumerate(terminal):
+        # one more state leads to every end
+        rows = np.concatenate([barriers.successors[possible], np.full(ends.sum(), size)])
+        columns = np.concatenate([state, np.flatnonzero(ends)])
+        graph = csr_array((np.ones(len(rows)), (rows, columns)), shape=(size + 1, size + 1))
+        reached = breadth_first_order(graph, size, return_predecessors=False)
+        solvable[task, reached[reached < size]] = True
+    return solvable & ~terminal
+
+
+def _transitions(barriers: Barriers, demonstrations: Demonstrations, terms: Terms) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights of observed transitions by each attempt, and of those that stayed."""
+    moved, stayed = np.zeros(barriers.successors.shape), np.zeros(barriers.successors.shape[:2])
+    if "transitions" not in terms:
+        return moved, stayed
+    s, a, after, weight = (
+        np.asarray(each)
+        for each in (demonstrations.states, demonstrations.actions, demonstrations.next_states, demonstrations.weights)
+    )
+    stays = s == after
+    np.add.at(stayed, (s[stays], a[stays]), weight[stays])
+    s, a, after, weight = (each[~stays] for each in (s, a, after, weight))
+    leads = (barriers.successors[s, a] == after[:, None]) & (barriers.attempts[s, a] > 0)
+    check(leads.any(axis=-1).all(), "expected transitions that the model allows", field="demonstrations")
+    np.add.at(moved, (s, a, leads.argmax(axis=-1)), weight)
+    return moved, stayed
+
+
+def crossed_barriers(barriers: Barriers, demonstrations: Demonstrations, terms: Terms) -> Bool[np.ndarray, " barriers"]:
+    """Return the barriers that agents crossed, and where these are cells, those that agents were in; they are open.
+
+    Args:
+        barriers: The barriers.
+        demonstrations: The moves; those of weight 0 do not count.
+        terms: The parts of the likelihood that count; without transitions nothing is crossed.
+    """
+    crossed = np.zeros(len(barriers.known) + 1, bool)
+    if "transitions" in terms:
+        crossed[barriers.needed[_transitions(barriers, demonstrations, terms)[0] > 0]] = True
+        if barriers.shape is not None:
+            counts = np.asarray(demonstrations.weights) > 0
+            for each in (demonstrations.states, demonstrations.next_states):
+                crossed[np.asarray(each)[counts]] = True
+    return crossed[:-1] & (barriers.known == Cell.UNKNOWN)
+
+
+def _choices(demonstrations: Demonstrations, actions: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the row of each task and state in which actions were observed, and the weight of each action there."""
+    task, s, a, weight = (
+        np.asarray(each)
+        for each in (demonstrations.task, demonstrations.states, demonstrations.actions, demonstrations.weights)
+    )
+    shape = np.asarray(demonstrations.tasks.terminal).shape
+    row, flat = np.full(shape, -1, np.int32), task.astype(np.int64) * shape[1] + s
+    distinct, which = np.unique(flat, return_inverse=True)
+    row.reshape(-1)[distinct] = np.arange(len(distinct))
+    choices = np.zeros((len(distinct), actions))
+    np.add.at(choices, (which, a), weight)
+    return row, choices

@@ -1,0 +1,73 @@
+"""The mean-field approximation of the posterior of barriers.
+
+Barriers are taken as independent, q(z) = Π_i Bernoulli(σ(θ_i)), and θ maximizes
+
+    log L(σ(θ)) + E_q[log p(z)] + H(q),                H(q) = Σ_i H(σ(θ_i)),
+
+with L the likelihood of a model with these probabilities as its dynamics. With E_q[log L(z)] instead this would be
+variational inference (Jordan et al. 1999); L at the means is what `sidestep.fit` computes with one solve a task. Both
+sums over q are exact, because every shape term is a product of different barriers. So the approximation is a prior:
+`fit(..., prior=MeanField(prior, known))` finds θ, and its P(closed) is σ(θ).
+
+Strong shape terms have several optima, and where one of several barriers explains a detour, one is chosen or all are
+half closed. `sample_barriers` has neither fault.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from sidestep.inference.mrf import BinaryMRF
+from sidestep.inference.priors import Prior
+from sidestep.tabular.arrays import to_jax
+from sidestep.tabular.grid import Cell
+
+
+class MeanField(Prior):
+    """E_q[log p(z)] + H(q) of a binary Markov random field, as a log density of the logits of an obstacle grid.
+
+    Attributes:
+        field: η of each barrier (see `BinaryMRF`).
+        weights: Those of lines, pairs, blocks and isolated cells.
+        known: The state of each cell as in `Grid.known`, or of each barrier; known ones are part of the shapes.
+
+    Example:
+        >>> import numpy as np
+        >>> from sidestep.inference.mrf import BinaryMRF
+        >>> prior = MeanField(BinaryMRF(np.zeros(3), (1, 3)), np.array([[-1, 0, 1]]))
+        >>> round(float(prior.log_density(jnp.zeros(3))), 3)  # the entropy of one cell, ln 2
+        0.693
+    """
+
+    field: Float[Array, " barriers"]
+    weights: Float[Array, " 4"]
+    known: Int[Array, "*shape"]
+
+    def __init__(self, prior: BinaryMRF, known: Int[Array, "*shape"]):
+        self.field, self.weights = to_jax(prior.field, jnp.result_type(float)), to_jax(prior.weights, jnp.result_type(float))
+        self.known = to_jax(known)
+
+    def log_density(self, parameters: Float[Array, " parameters"]) -> Float[Array, ""]:
+        """Return E_q[log p(z)] + H(q) in nats, over unknown barriers and the shapes that they are part of."""
+        logits = parameters[: self.known.size]
+        unknown = self.known.reshape(-1) == Cell.UNKNOWN
+        closed = jnp.where(unknown, jax.nn.sigmoid(logits), (self.known.reshape(-1) == Cell.OCCUPIED).astype(logits.dtype))
+        # H = ln(1 + exp θ) − θ σ(θ)
+        entropy = jax.nn.softplus(logits) - logits * jax.nn.sigmoid(logits)
+        independent = jnp.sum(jnp.where(unknown, self.field.astype(logits.dtype) * closed + entropy, 0.0))
+        if self.known.ndim != 2:
+            return independent
+        return independent + self.weights.astype(logits.dtype) @ _expected_shapes(closed.reshape(self.known.shape))
+
+
+def _expected_shapes(closed: Float[Array, "rows columns"]) -> Float[Array, " 4"]:
+    """Return the expected numbers of lines, pairs, blocks and isolated cells of independent cells."""
+    padded = jnp.pad(closed, 1)
+    inner, up, down = padded[1:-1, 1:-1], padded[:-2, 1:-1], padded[2:, 1:-1]
+    left, right = padded[1:-1, :-2], padded[1:-1, 2:]
+    lines = jnp.sum(inner * (1 - (1 - left * right) * (1 - up * down)))
+    pairs = jnp.sum(inner * right) + jnp.sum(inner * down)
+    blocks = jnp.sum(closed[:-1, :-1] * closed[:-1, 1:] * closed[1:, :-1] * closed[1:, 1:])
+    isolated = jnp.sum(inner * (1 - up) * (1 - down) * (1 - left) * (1 - right))
+    return jnp.stack([lines, pairs, blocks, isolated])
