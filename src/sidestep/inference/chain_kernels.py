@@ -267,7 +267,7 @@ def _choice_log_likelihood(actions, lapse, beta, counts, advantages):  # pragma:
 
 @cache
 def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunction]:
-    """Return the native code that computes the likelihood of a chain, and that which makes its proposals."""
+    """Return the native code that computes everything in a chain from its barriers, and that which makes proposals."""
 
     @inlined(fastmath=_FAST)
     def fill(task, s, world, evidence, chain, neg_inf, scratch):  # pragma: no cover
@@ -345,8 +345,8 @@ def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunct
                 chain.probs[s, a, k] = success
 
     @compiled()
-    def compute_likelihood(world, evidence, chain, neg_inf):  # pragma: no cover
-        """Compute the probabilities and the log-likelihoods of a chain from its barriers and values."""
+    def refresh(world, evidence, chain, work, kind, tie, neg_inf):  # pragma: no cover
+        """Compute the probabilities, values and log-likelihoods of a chain from its barriers and values nearby."""
         scratch = Scratch(np.empty(actions), np.empty(actions), np.empty(actions))
         tasks, states = chain.values.shape
         chain.totals[:] = 0.0
@@ -355,6 +355,15 @@ def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunct
             if evidence.has_transitions[s]:
                 chain.totals[1] += _transition_log_likelihood(s, actions, width, chain.probs, evidence)
         for task in range(tasks):
+            work.counters[PROPOSAL] += 1
+            work.counters[LOGGED] = 0
+            count = 0
+            for s in range(states):
+                if evidence.solved[task, s]:
+                    work.queue[count] = s
+                    work.queued[s] = True
+                    count += 1
+            settle(task, np.int64(count), world, evidence, chain, work, kind, tie, neg_inf, scratch)
             for s in range(states):
                 row = evidence.choice_row[task, s]
                 if row >= 0:
@@ -450,4 +459,4 @@ def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunct
                 undo(count, world, chain, work)
         return accepted
 
-    return compute_likelihood, sweep
+    return refresh, sweep

@@ -38,10 +38,12 @@ PASSING = (0.997, 0.003)
 _FLIPS, _MOVES = 0.6, 0.8
 """The cumulative probabilities of flips and of moves; the rest are runs."""
 _FRESH_SWEEPS = 10
-"""The number of sweeps after which values are solved from nothing."""
+"""The number of sweeps after which all values are solved anew."""
 _NEG_INF = neg_inf(jnp.dtype(float))
 _TOLERANCE = 7e-4
 """The change of β V that is passed on (nats)."""
+_FINER = 0.01
+"""The factor of that tolerance where all values are solved anew."""
 _EXACT, _MAX_SWEEPS = 1e-9, 5_000
 """The tolerance of values solved from nothing, and the most sweeps."""
 
@@ -132,12 +134,14 @@ class BarrierProblem:
         )
 
     def solve(self, state: ChainState) -> None:
-        """Solve all tasks of a chain from nothing, and compute its likelihood.
+        """Solve all tasks of a chain from nothing.
 
         Args:
             state: The chain, changed in place.
+
+        Raises:
+            NotConverged: Where values do not converge.
         """
-        compute_likelihood, _ = chain_kernels(*self.barriers.successors.shape[1:])
         successors, probabilities = _outcomes(self.barriers, self.world, state.chain.closed)
         kind, tie = self.backup
         for task, values in enumerate(state.chain.values):
@@ -146,7 +150,16 @@ class BarrierProblem:
             backup = NativeBackup(kind, np.float64(self.evidence.beta[task]), np.float64(tie))
             process = HostProcess(successors, probabilities, reward, pays, ends, discount)
             values[:] = _solved(NativeEquation(process, backup, np.float64(_EXACT)))
-        compute_likelihood(self.world, self.evidence, state.chain, _NEG_INF)
+
+    def refresh(self, state: ChainState) -> None:
+        """Solve all tasks of a chain from the values that it has, and compute its likelihood anew.
+
+        Args:
+            state: The chain, changed in place.
+        """
+        refresh, _ = chain_kernels(*self.barriers.successors.shape[1:])
+        exact = self.evidence._replace(tolerance=_FINER * self.evidence.tolerance)
+        refresh(self.world, exact, state.chain, state.work, *self.backup, _NEG_INF)
 
     def sweep(self, state: ChainState, number: int, heat: float) -> None:
         """Make one proposal for each free barrier.
@@ -156,8 +169,10 @@ class BarrierProblem:
             number: The number of this sweep, from 0.
             heat: T, where the chain samples the posterior to the power 1/T.
         """
-        if number % _FRESH_SWEEPS == 0:
+        if number == 0:
             self.solve(state)
+        if number % _FRESH_SWEEPS == 0:
+            self.refresh(state)
         _, sweep = chain_kernels(*self.barriers.successors.shape[1:])
         prior = MRFTerms(self.prior.field, self.prior.weights, *(self.prior.shape or (0, 0)))
         is_free = np.zeros(len(state.chain.closed), bool)
