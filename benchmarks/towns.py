@@ -381,7 +381,7 @@ def show(records: Sequence[Record], options: Options) -> None:
     for label, own in groups(records, "trips"):
         error = float(np.std([record["gain"] for record in own], ddof=1) / np.sqrt(len(own))) if len(own) > 1 else None
         rows.append({**label, "draws": len(own), **{key: mean_over(own, key) for key in keys}, "±": error})
-    columns = {"trips": "trips", "draws": "draws", "unused": "unused .0f", "closed": "closed fraction .3f"}
+    columns = {"trips": "trips", "draws": "draws", "unused": "unused .0f", "closed": "closed_fraction .3f"}
     columns |= {key.replace("_", "\n"): f"{key} .3f" for key in ("P(closed)", "gain", "±", *keys[4:])}
     print_table(f"one-way streets of Shanghai, {described(changed(STREETS, options.set))}", rows, columns)
     if not all(record["converged"] for record in records):
