@@ -12,7 +12,7 @@ P(closed)), `largest_error`, `status`, `seconds`.
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 import numpy as np
@@ -24,6 +24,7 @@ from sidestep.inference.enumeration import enumerate_barriers
 from sidestep.inference.mean_field import MeanField
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.inference.sampler import sample_barriers
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.likelihood import ALL_TERMS
 from sidestep.tabular.models.barriers import barriers_of, with_closed
 
@@ -96,25 +97,28 @@ def measure(options: Options) -> Iterator[Record]:
         problem = world.model, world.demonstrations, world.behavior
         exact = enumerate_barriers(*problem, world.prior).closed
 
-        def record(method: str, closed: np.ndarray, status: str, started: float) -> Record:
-            errors = np.abs(closed - exact)[world.unknown]
-            walks, seconds = world.demonstrations.trajectories, time.perf_counter() - started
-            return {
-                **{"world": seed, "kind": world.kind, "unknown": len(errors), "walks": walks, "method": method},
-                **{"error": errors.mean(), "largest_error": errors.max(), "status": status, "seconds": seconds},
-            }
-
         started = time.perf_counter()
-        sampled = sample_barriers(
-            *problem, prior=world.prior, sweeps=options.sweeps, chains=options.chains, seed=seed
-        )
-        yield record("sample", sampled.closed, sampled.status.value, started)
+        sampled = sample_barriers(*problem, prior=world.prior, sweeps=options.sweeps, chains=options.chains, seed=seed)
+        seconds = time.perf_counter() - started
+        yield _record(seed, world, exact, "sample", sampled.closed) | {
+            "status": sampled.status.value,
+            "seconds": seconds,
+        }
         started = time.perf_counter()
-        known = barriers_of(world.model).known
+        known = to_jax(barriers_of(world.model).known)
         shaped = known if world.prior.shape is None else known.reshape(world.prior.shape)
         fit = ss.fit(*problem, prior=MeanField(world.prior, shaped))
         closed = np.asarray(jax.nn.sigmoid(fit.model.parameters))
-        yield record("mean field", closed, fit.status.value, started)
+        seconds = time.perf_counter() - started
+        yield _record(seed, world, exact, "mean field", closed) | {"status": fit.status.value, "seconds": seconds}
+
+
+def _record(seed: int, world: World, exact: np.ndarray, method: str, closed: np.ndarray) -> Record:
+    errors, walks = np.abs(closed - exact)[world.unknown], world.demonstrations.trajectories
+    return {
+        **{"world": seed, "kind": world.kind, "unknown": len(errors), "walks": walks, "method": method},
+        **{"error": errors.mean(), "largest_error": errors.max()},
+    }
 
 
 def show(records: Sequence[Record], options: Options) -> None:

@@ -35,7 +35,9 @@ from sidestep.worlds.offices import office
 from sidestep.worlds.walks import simulate_walks
 
 SHORTEST = Reward(discount=1.0, step_cost=1.0)
-CONFIG = MapConfig(SHORTEST, BehaviorConfig("logsumexp", beta=5.0), PriorConfig(mean=0.0, variance=4.0, wall_prior=1.0))
+CONFIG = MapConfig(
+    SHORTEST, BehaviorConfig("logsumexp", beta=5.0), PriorConfig("normal", mean=0.0, variance=4.0, wall_prior=1.0)
+)
 
 
 @dataclass

@@ -14,7 +14,7 @@ averaged over draws. The picture has a reliability diagram for each number of wa
 
 Records: `problem`, `walks` (asked for), `drawn`, `draw`, `method`, the scores of `sidestep.evaluation` (for all cells,
 and for relevant obstacles: those that a walk had to avoid), `reliability` (the bins of the calibration error, None
-where there is none), `seconds`, `converged`, `failure`, `moves`, `iterations`, `objective`, `largest_gradient`, and the
+where there is none), `seconds`, `converged`, `failure`, `moves`, `iterations`, `objective`, `largest_gradient`, `message`, and the
 fields of the configuration.
 """
 
@@ -137,9 +137,8 @@ def learn_by(
         learned = learn_map(grid, maze.walks, config)
         assert learned.learning is not None
         fit = learned.learning.fit
-        fitted.update(
-            iterations=fit.final.iteration, objective=fit.final.objective, largest_gradient=fit.final.gradient
-        )
+        summary = fit.summary()
+        fitted.update({key: summary.get(key) for key in ("iterations", "objective", "largest_gradient", "message")})
         result = model_result(learned.model, demonstrations, config)
         return result._replace(behavior=fit.behavior.behavior_of(), converged=fit.converged, planner=learned.robot())
 

@@ -61,7 +61,9 @@ from sidestep.tabular.models import TiedModel, closed, road_network
 from sidestep.tabular.reward import Reward
 
 # Drives are long, so a step has a cost rather than the goal a reward; the prior is the paper's: buildings are no lines.
-DRIVES = MapConfig(Reward(1.0, 1.0), BehaviorConfig(beta=0.3), PriorConfig(mean=-2.0, variance=2.0, wall_prior=0.0))
+DRIVES = MapConfig(
+    Reward(1.0, 1.0), BehaviorConfig(beta=0.3), PriorConfig("normal", mean=-2.0, variance=2.0, wall_prior=0.0)
+)
 FEATURES = ("100 m", "link", "to one side", "to the other", "sharp", "U-turn")
 """What a turn onto a link may cost: the link's length, that it is one, and how the turn bends."""
 KINDS = (0, 1, 1, 2, 2, 2, 3, 3)

@@ -106,12 +106,18 @@ def write_array(path: str | Path, array: np.ndarray) -> None:
     write_whole(path, lambda file: np.save(file, array, allow_pickle=False))
 
 
-def read_array(path: str | Path, kinds: str) -> np.ndarray:
-    """Return the array in a `.npy` file.
+def write_arrays(path: str | Path, **arrays: np.ndarray) -> None:
+    """Write arrays of numbers by name as a compressed `.npz` file atomically."""
+    write_whole(path, lambda file: np.savez_compressed(file, allow_pickle=False, **arrays))
+
+
+def read_array(path: str | Path, kinds: str, name: str | None = None) -> np.ndarray:
+    """Return the array in a `.npy` file, or one of those in a `.npz` file.
 
     Args:
         path: the file.
-        kinds: the accepted kinds of its dtype ("f" floats, "iu" whole numbers).
+        kinds: the accepted kinds of its dtype ("f" floats, "iu" whole numbers, "b" truth values).
+        name: the name of the array in a `.npz` file.
 
     Raises:
         InputError: for a file without such an array.
@@ -119,8 +125,9 @@ def read_array(path: str | Path, kinds: str) -> np.ndarray:
     content = read_whole(path)
     with input_errors("expected a NumPy array", Exception, source=path):  # NumPy raises errors of many kinds
         array = np.load(io.BytesIO(content), allow_pickle=False)
+        array = array if name is None else array[name]
     if not isinstance(array, np.ndarray) or array.dtype.kind not in kinds:
-        raise InputError("expected a NumPy array of numbers", source=path)
+        raise InputError("expected a NumPy array of numbers", source=path, field=name)
     return array
 
 

@@ -69,7 +69,9 @@ def test_visit_counts_equals_one_over_visits_plus_one():
 
 
 def test_transitions_only_leaves_unvisited_cells_at_the_prior(walks):
-    blocked = np.asarray(transitions_only(BLANK, walks, MapConfig(prior=PriorConfig(wall_prior=0.0))).model.blocked)
+    blocked = np.asarray(
+        transitions_only(BLANK, walks, MapConfig(prior=PriorConfig("normal", wall_prior=0.0))).model.blocked
+    )
     prior = 1 / (1 + np.exp(-MapConfig().prior.mean))
     np.testing.assert_allclose(blocked[WALL == 1], prior, atol=1e-4)
     assert blocked[WALL == 0].max() < prior

@@ -189,7 +189,7 @@ def test_commands_with_eight_directions_parquet_and_fixed_policy_gradient(office
 @pytest.mark.parametrize("config", [
     MapConfig(Reward(1.0, 1.0), BehaviorConfig(beta=3.0)),
     MapConfig(behavior=BehaviorConfig("mellowmax", horizon=12)),
-    MapConfig(prior=PriorConfig(wall_prior=0.0), fit=FitConfig("transitions")),
+    MapConfig(prior=PriorConfig("normal", wall_prior=0.0), fit=FitConfig("transitions")),
 ])  # fmt: skip
 def test_learn_map_with_other_configurations_converges(office, config):
     learned = learn_map(BLANK, read_walks(office / "walks.csv"), config)

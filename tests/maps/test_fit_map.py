@@ -17,7 +17,7 @@ from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.tasks import Task, reach
 
 GRID = Grid.unknown(1, 4)
-CONFIG = MapConfig(prior=PriorConfig(1.0, 2.5, wall_prior=0.0), fit=FitConfig("transitions"))
+CONFIG = MapConfig(prior=PriorConfig("normal", mean=1.0, variance=2.5, wall_prior=0.0), fit=FitConfig("transitions"))
 
 
 def walks(*lengths: int) -> Demonstrations[Task]:

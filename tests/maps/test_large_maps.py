@@ -24,7 +24,9 @@ pytestmark = pytest.mark.slow
 
 TRUTH = office(20, 24, seed=0)
 UNKNOWN = TRUTH.forget()
-SMALL = MapConfig(Reward(1.0, 1.0), BehaviorConfig("logsumexp", 5.0), PriorConfig(0.5, 4.0, wall_prior=0.0))
+SMALL = MapConfig(
+    Reward(1.0, 1.0), BehaviorConfig("logsumexp", 5.0), PriorConfig("normal", mean=0.5, variance=4.0, wall_prior=0.0)
+)
 LARGE = replace(SMALL, fit=FitConfig(large_map=1))
 FIRST_STEP = replace(SMALL, fit=FitConfig(large_map=1, max_iterations=1))
 

@@ -64,7 +64,7 @@ def test_select_behavior_of_long_walks_with_step_costs_selects_them():
 
 @pytest.mark.parametrize(("config", "message"), [
     # two cells from all walks an agent pays for some 5·10⁸ moves that fail: values do not converge
-    (MapConfig(prior=PriorConfig(mean=20.0)), "converge"),
+    (MapConfig(prior=PriorConfig("normal", mean=20.0)), "converge"),
     # by log-sum-exp, four actions are worth log(4)/β, more than they cost
     (MapConfig(behavior=BehaviorConfig("logsumexp", 10.0)), "an endless path is worth more"),
 ])  # fmt: skip

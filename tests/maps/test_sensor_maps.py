@@ -144,7 +144,7 @@ def test_learn_with_a_sensor_map_of_one_half_infers_the_other_half_from_behavior
     wall = FLAT.known == Cell.OCCUPIED
     variance = np.full(FLAT.shape, np.nan)
     variance[UPPER] = 0.5
-    config = MapConfig(prior=PriorConfig(0.5, 4.0, wall_prior=0.0))
+    config = MapConfig(prior=PriorConfig("normal", mean=0.5, variance=4.0, wall_prior=0.0))
     alone = learn_map(FLAT.forget(), walks, config).blocked
     np.testing.assert_allclose(alone[UPPER], expit(0.5), atol=0.01)  # no walk depends on them
     write_walks(tmp_path / "walks.csv", walks)

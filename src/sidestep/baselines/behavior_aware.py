@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from sidestep.baselines.interface import ModelResult, model_result
+from sidestep.baselines.interface import ModelResult, model_result, with_normal_prior
 from sidestep.evaluation.metrics import visit_ranking
 from sidestep.maps.config import MapConfig
-from sidestep.maps.fit import fit_map
+from sidestep.maps.fit import infer_map
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
@@ -21,22 +21,22 @@ _UNVISITED = 0.98
 
 
 def behavior_aware(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
-    """Learn P(blocked) from actions and transitions, by the fit of `learn_map`.
+    """Learn P(blocked) from actions and transitions, by the posterior of `learn_map`.
 
     Args:
         grid: The known map.
         demonstrations: The walks on it.
-        config: The configuration of the fit.
+        config: The configuration.
 
     Returns:
-        The learned model and behavior, P(blocked) of each cell, and whether the fit converged.
+        The learned model and behavior, P(blocked) of each cell, and whether the fit converged or the chains mixed.
 
     Raises:
-        InputError: As `fit_map` does.
+        InputError: As `infer_map` does.
     """
-    fit = fit_map(ObstacleGrid(grid, config.prior.mean), demonstrations, config)
-    result = model_result(fit.model, demonstrations, config)
-    return result._replace(behavior=fit.behavior.behavior_of(), converged=fit.converged)
+    posterior = infer_map(ObstacleGrid(grid, config.prior.first_logit), demonstrations, config)
+    result = model_result(posterior.model, demonstrations, config)
+    return result._replace(behavior=posterior.behavior.behavior_of(), converged=posterior.converged)
 
 
 def transitions_only(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
@@ -50,6 +50,7 @@ def transitions_only(grid: Grid, demonstrations: Demonstrations, config: MapConf
     Returns:
         The learned model and P(blocked) of each cell, and whether the fit converged.
     """
+    config = with_normal_prior(config)
     return behavior_aware(grid, demonstrations, replace(config, fit=replace(config.fit, terms="transitions")))
 
 

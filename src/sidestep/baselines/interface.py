@@ -1,6 +1,7 @@
 """The interface of methods: a function of a map, demonstrations and a configuration, and its result."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -82,6 +83,16 @@ class ModelResult(NamedTuple):
         tasks = stack_tasks([self.reward.reach(self.model.blank, int(goal)) for goal in goals])
         moves = eqx.tree_at(lambda moves: moves.tasks, demonstrations, tasks)
         return np.asarray(log_policies(self.model, moves, self.behavior, options=self.options))
+
+
+def with_normal_prior(config: MapConfig) -> MapConfig:
+    """Return a configuration of a baseline: the mode of the posterior after a normal prior of logits.
+
+    Args:
+        config: The configuration of the comparison.
+    """
+    prior = replace(config.prior, kind="normal")
+    return replace(config, prior=prior, posterior=replace(config.posterior, method="mode"))
 
 
 def model_result(

@@ -34,7 +34,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from sidestep.baselines.interface import ModelResult, model_result
+from sidestep.baselines.interface import ModelResult, model_result, with_normal_prior
 from sidestep.errors import NotConverged
 from sidestep.inference.fit import fit
 from sidestep.inference.optimizers import LBFGS
@@ -124,7 +124,8 @@ def joint_estimation(grid: Grid, demonstrations: Demonstrations, config: MapConf
     Returns:
         The learned map, with the costs in the reward.
     """
-    model, agents = ObstacleGrid(grid, config.prior.mean), cost_behavior_model(grid, config)
+    config = with_normal_prior(config)
+    model, agents = ObstacleGrid(grid, config.prior.first_logit), cost_behavior_model(grid, config)
     fit = fit_map(model, demonstrations, config, behavior=agents)
     result = model_result(fit.model, demonstrations, config)
     reward = CostlyReward(config.reward.discount, config.reward.step_cost, costs=np.asarray(fit.behavior.costs))

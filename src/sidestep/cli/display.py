@@ -9,8 +9,9 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from sidestep.inference.maximize import Progress as FitProgress
+    from sidestep.inference.sampler import SweepProgress
 
-    FitCallback = Callable[[FitProgress], None]
+    FitCallback = Callable[[FitProgress | SweepProgress], None]
 
 _HEADINGS = {
     "auc": "AUC",
@@ -97,9 +98,8 @@ def fit_progress(iterations: int) -> "Iterator[tuple[FitCallback, Callable[[str]
     with _bar("at most", left="left; {task.fields[state]}") as bar:
         task = bar.add_task("learning", total=iterations, state="compiling")
 
-        def report(progress: "FitProgress") -> None:
-            state = f"objective {progress.objective:.3f}, largest gradient {progress.gradient:.2g}"
-            bar.update(task, completed=progress.iteration, state=state)
+        def report(progress: "FitProgress | SweepProgress") -> None:
+            bar.update(task, completed=progress.iteration, total=progress.total, state=progress.description)
 
         yield report, lambda text: bar.update(task, state=text)
 

@@ -26,16 +26,16 @@ def learn(walks: Walks, map_file: MapFile, out: Folder, options: LearnOptions) -
     checkpoint.unlink(missing_ok=True)
     learning = learned.learning
     assert learning is not None
-    data, final = learning.data, learning.fit.final
+    data = learning.data
     print_lines(f"{data.walks} walks, {data.moves} moves, {data.goals} goals, {data.unknown_cells} unknown cells")
     if data.walks_left_out or data.moves_left_out:
         walks_out, moves_out = data.walks_left_out, data.moves_left_out
         print_lines(f"left out: {walks_out} walks that start at their goal, and {moves_out} moves after the arrival")
     print_lines(*(learning.selection.reasons if learning.selection else ()))
     print_notes(*(f"note: {note}" for note in learning.notes))
-    print_lines(f"objective {final.objective:.4f} after {final.iteration} iterations; {learning.fit.message}")
+    print_lines(learning.fit.description)
     if not learned.converged:
-        print_notes(f"warning: the fit has not converged: {learning.fit.status.advice or learning.fit.message}")
+        print_notes(f"warning: {learning.fit.status.value}: {learning.fit.status.advice or learning.fit.message}")
     print_lines(f"learned map in {out}")
 
 
@@ -49,7 +49,7 @@ def save_learned(learned: "LearnedMap", folder: "Path", **entries: object) -> No
     learning = learned.learning
     assert learning is not None
     objective = np.array([progress.objective for progress in learning.fit.history])
-    seen = None if learning.sensor is None else seen_cells(learning.sensor, learned.grid)
+    seen = None if learning.sensor is None else seen_cells(learning.sensor, learned.grid.known)
     paths = learning.demonstrations.paths()
     goals = np.flatnonzero(np.asarray(learning.demonstrations.tasks.terminal).any(axis=0))
     picture = draw("figure_fit", folder / "learned.png", learned.grid, paths, learned.blocked, objective, seen, goals)

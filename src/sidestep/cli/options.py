@@ -4,11 +4,21 @@ import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast, get_type_hints
 
 from typer import Argument, BadParameter, Option
 
-from sidestep.maps.config import BackupName, BehaviorConfig, FitConfig, MapConfig, PriorConfig, Terms
+from sidestep.maps.config import (
+    BackupName,
+    BehaviorConfig,
+    FitConfig,
+    MapConfig,
+    PosteriorConfig,
+    PosteriorMethod,
+    PriorConfig,
+    PriorKind,
+    Terms,
+)
 from sidestep.tabular.reward import Reward
 
 if TYPE_CHECKING:
@@ -57,11 +67,22 @@ class LearnOptions:
     )
     discount: Discount = Reward.discount
     step_cost: StepCost = Reward.step_cost
-    prior_mean: Annotated[float, Option(help="The prior mean of an unknown cell's logit (0: P=½).")] = PriorConfig.mean
-    prior_variance: Annotated[float, Option(help="The prior variance of unknown cells' logits.")] = PriorConfig.variance
+    prior: Annotated[
+        PriorKind | None, Option(help="binary: a cell is blocked or not; normal: the paper's, of logits.")
+    ] = None
+    posterior: Annotated[
+        Literal["sample", "mean-field", "mode"] | None,
+        Option(help="Samples of maps, or a fit; by default by the prior and the size."),
+    ] = None
+    sweeps: Annotated[int | None, Option(help="The sweeps of each chain of samples; by default by the size.")] = None
+    log_odds: Annotated[
+        float | None, Option(help="The log-odds of a blocked cell far from others (binary prior).", metavar="NATS")
+    ] = PriorConfig.log_odds
+    prior_mean: Annotated[float | None, Option(help="The mean of unknown cells' logits (normal prior).")] = None
+    prior_variance: Annotated[float | None, Option(help="The variance of these logits (normal prior).")] = None
     wall_prior: Annotated[
-        float, Option(help="The weight of a blocked cell between two others, in nats.", metavar="NATS")
-    ] = PriorConfig.wall_prior
+        float | None, Option(help="The worth of a blocked cell between two others (normal prior).", metavar="NATS")
+    ] = None
     sensor_map: Annotated[
         Path | None, Option(help="ROS map (mode scale or raw): P(occupied) where sensors looked.", metavar="MAP.yaml")
     ] = None
@@ -81,9 +102,25 @@ class LearnOptions:
         """Return the configuration."""
         learned = tuple(dict.fromkeys(self.learn or ()))
         behavior = self._part(BehaviorConfig, learn=learned, select=self.select_behavior)
-        prior = PriorConfig(self.prior_mean, self.prior_variance, self.wall_prior)
+        prior, posterior = self._prior(), PosteriorConfig(self._method(), self.sweeps)
         fit = self._part(FitConfig, gradient=self.gradient.replace("-", "_"))
-        return MapConfig(self._part(Reward), behavior, prior, fit, max_walks=self.max_walks, seed=self.seed)
+        return MapConfig(self._part(Reward), behavior, prior, posterior, fit, max_walks=self.max_walks, seed=self.seed)
+
+    def _prior(self) -> PriorConfig:
+        """Return the prior; options of the other kind are refused."""
+        normal = {"mean": self.prior_mean, "variance": self.prior_variance, "wall_prior": self.wall_prior}
+        kind: PriorKind = self.prior or ("normal" if self.posterior == "mode" else PriorConfig.kind)
+        options = normal if kind == "normal" else {"log_odds": self.log_odds}
+        others = {"log_odds": self.log_odds} if kind == "normal" else normal
+        for name, value in others.items():
+            flag = f"--{'' if name in ('log_odds', 'wall_prior') else 'prior-'}{name}".replace("_", "-")
+            message = f"is an option of the {'binary' if kind == 'normal' else 'normal'} prior: add --prior"
+            if value is not None:
+                raise BadParameter(f"{message} {'binary' if kind == 'normal' else 'normal'}", param_hint=flag)
+        return PriorConfig(kind, **{name: value for name, value in options.items() if value is not None})
+
+    def _method(self) -> PosteriorMethod | None:
+        return None if self.posterior is None else cast(PosteriorMethod, self.posterior.replace("-", "_"))
 
     def _part(self, record: type[_Config], **others: Any) -> _Config:
         """Return a record with the options that have the names of its fields."""

@@ -74,6 +74,11 @@ class Fit(eqx.Module, Generic[Model]):
         """Return the objective and its parts at the learned model."""
         return self.history[-1]
 
+    @property
+    def description(self) -> str:
+        """Return the objective and how the optimization ended as text."""
+        return f"objective {self.final.objective:.4f} after {self.final.iteration} iterations; {self.message}"
+
     def summary(self) -> dict[str, Any]:
         """Return the fit's numbers: the objective and its parts in nats, and how the optimizer and the tasks ended.
 

@@ -47,6 +47,16 @@ class Progress(NamedTuple):
     prior: float
     gradient: float
 
+    @property
+    def total(self) -> None:
+        """Return the number of all iterations: it is not known."""
+        return None
+
+    @property
+    def description(self) -> str:
+        """Return the objective and the largest component of its gradient as text."""
+        return f"objective {self.objective:.3f}, largest gradient {self.gradient:.2g}"
+
 
 class Status(enum.Enum):
     """Why an optimization stopped, or whether chains have mixed; the values are the readable form.

@@ -13,7 +13,6 @@ Strong shape terms have several optima, and where one of several barriers explai
 half closed. `sample_barriers` has neither fault.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -45,14 +44,19 @@ class MeanField(Prior):
     known: Int[Array, "*shape"]
 
     def __init__(self, prior: BinaryMRF, known: Int[Array, "*shape"]):
-        self.field, self.weights = to_jax(prior.field, jnp.result_type(float)), to_jax(prior.weights, jnp.result_type(float))
+        self.field, self.weights = (
+            to_jax(prior.field, jnp.result_type(float)),
+            to_jax(prior.weights, jnp.result_type(float)),
+        )
         self.known = to_jax(known)
 
     def log_density(self, parameters: Float[Array, " parameters"]) -> Float[Array, ""]:
         """Return E_q[log p(z)] + H(q) in nats, over unknown barriers and the shapes that they are part of."""
         logits = parameters[: self.known.size]
         unknown = self.known.reshape(-1) == Cell.UNKNOWN
-        closed = jnp.where(unknown, jax.nn.sigmoid(logits), (self.known.reshape(-1) == Cell.OCCUPIED).astype(logits.dtype))
+        closed = jnp.where(
+            unknown, jax.nn.sigmoid(logits), (self.known.reshape(-1) == Cell.OCCUPIED).astype(logits.dtype)
+        )
         # H = ln(1 + exp θ) − θ σ(θ)
         entropy = jax.nn.softplus(logits) - logits * jax.nn.sigmoid(logits)
         independent = jnp.sum(jnp.where(unknown, self.field.astype(logits.dtype) * closed + entropy, 0.0))

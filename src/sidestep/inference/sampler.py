@@ -65,22 +65,29 @@ class SweepProgress(NamedTuple):
     """The state of a sampler after a sweep; means over the chains.
 
     Attributes:
-        iteration: The number of sweeps.
+        iteration: The number of sweeps so far.
+        total: The number of all sweeps.
         objective: log L(z) + log p(z), in nats, up to a constant.
         actions, transitions, prior: Its parts.
         accepted: The fraction of accepted proposals.
 
     Example:
-        >>> SweepProgress(1, objective=-3.0, actions=-2.0, transitions=-0.5, prior=-0.5, accepted=0.1).objective
+        >>> SweepProgress(1, 300, objective=-3.0, actions=-2.0, transitions=-0.5, prior=-0.5, accepted=0.1).objective
         -3.0
     """
 
     iteration: int
+    total: int
     objective: float
     actions: float
     transitions: float
     prior: float
     accepted: float
+
+    @property
+    def description(self) -> str:
+        """Return the objective and the fraction of accepted proposals as text."""
+        return f"objective {self.objective:.3f}, {self.accepted:.1%} of proposals accepted"
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +132,7 @@ class BarrierPosterior(Generic[Model]):
     def final(self) -> SweepProgress:
         """The means over the sweeps that count."""
         kept = np.array(self.history[-self.samples.shape[1] :]).mean(axis=0).tolist()
-        return SweepProgress(self.history[-1].iteration, *kept[1:])
+        return SweepProgress(len(self.history), len(self.history), *kept[2:])
 
     @property
     def message(self) -> str:
@@ -134,6 +141,22 @@ class BarrierPosterior(Generic[Model]):
         fraction = float((self.rhat <= MIXED_RHAT).mean())
         size = f", median effective size {np.median(self.effective_sizes[sampled]):.0f}" if sampled.any() else ""
         return f"{self.status.value} (split-R̂ at most {MIXED_RHAT} for {fraction:.0%} of the barriers{size})"
+
+    @property
+    def description(self) -> str:
+        """Return the number of samples, their mean objective and whether the chains have mixed as text."""
+        chains, draws = self.samples.shape[:2]
+        return f"{draws} samples of each of {chains} chains, mean objective {self.final.objective:.4f}; {self.message}"
+
+    def thinned(self, most: int) -> Bool[np.ndarray, "draws barriers"]:
+        """Return samples at equal distances along each chain.
+
+        Args:
+            most: The most samples of all chains together.
+        """
+        chains, draws = self.samples.shape[:2]
+        step = math.ceil(chains * draws / most)
+        return self.samples[:, step - 1 :: step].reshape(-1, self.samples.shape[-1])
 
     def sample(self, key: Key[Array, ""], count: int) -> Bool[np.ndarray, "count barriers"]:
         """Draw maps from the samples of all chains, with replacement.
@@ -300,7 +323,9 @@ def _progress(states: Sequence[ChainState], number: int, free: int) -> SweepProg
     actions, transitions = np.mean([state.log_likelihoods[number] for state in states], axis=0).tolist()
     prior = float(np.mean([state.log_priors[number] for state in states]))
     accepted = float(np.mean([state.accepted[number] for state in states])) / free
-    return SweepProgress(number + 1, actions + transitions + prior, actions, transitions, prior, accepted)
+    return SweepProgress(
+        number + 1, len(states[0].samples), actions + transitions + prior, actions, transitions, prior, accepted
+    )
 
 
 def _saved(state: ChainState) -> tuple[Any, ...]:

@@ -14,6 +14,18 @@ BackupName = Literal["boltzmann", "max", "logsumexp", "mellowmax"]
 Terms = Literal["both", "actions", "transitions"]
 GradientName = Literal["exact", "fixed_policy"]
 Learnable = Literal["beta", "lapse", "discount"]
+PriorKind = Literal["binary", "normal"]
+PosteriorMethod = Literal["sample", "mean_field", "mode"]
+
+LOG_ODDS = -2.5
+"""The default of `PriorConfig.log_odds`."""
+SHAPE_WEIGHTS = {
+    "sample": {"lines": 2.5, "pairs": 0.0, "blocks": -3.0, "isolated": -1.0},
+    "mean_field": {"lines": 0.5, "pairs": 1.5, "blocks": -3.0, "isolated": -1.0},
+}
+"""The default weights of the shape terms by the method: a mean field cannot follow strong ones."""
+MAX_SAMPLED = 60_000
+"""The number of unknown cells × goals up to which maps are sampled."""
 
 
 @dataclass(frozen=True)
@@ -53,21 +65,74 @@ class BehaviorConfig:
 
 @dataclass(frozen=True)
 class PriorConfig:
-    """The prior over the logits of P(blocked) of unknown cells.
+    """The prior over unknown cells.
 
     Attributes:
-        mean: The mean of each logit; 0 stands for P(blocked) = 1/2.
+        kind: "binary", a cell is blocked or not (`BinaryMRF`); or "normal", the paper's prior of logits of P(blocked).
+        log_odds: η of the binary prior, the log-odds of a blocked cell far from others; None for the default.
+        lines, pairs, blocks, isolated: Its weights in nats (`BinaryMRF`); None for those of `SHAPE_WEIGHTS`.
+        mean: The mean of each logit of the normal prior; 0 stands for P(blocked) = 1/2.
         variance: The variance of each logit, above 0.
         wall_prior: The weight of `WallPrior` in nats, at least 0: the worth of a blocked cell between two others.
 
+    Raises:
+        InputError: For an unknown kind.
+
     Example:
-        >>> PriorConfig(mean=0.0).variance
+        >>> PriorConfig(kind="normal", mean=0.0).variance
         8.0
     """
 
+    kind: PriorKind = "binary"
+    log_odds: float | None = None
+    lines: float | None = None
+    pairs: float | None = None
+    blocks: float | None = None
+    isolated: float | None = None
     mean: float = -1.5
     variance: float = 8.0
     wall_prior: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check_choice(self.kind, PriorKind, "prior")
+
+    @property
+    def first_logit(self) -> float:
+        """Return the logit of P(blocked) at which a fit starts."""
+        if self.kind == "normal":
+            return self.mean
+        return LOG_ODDS if self.log_odds is None else self.log_odds
+
+
+@dataclass(frozen=True)
+class PosteriorConfig:
+    """How the posterior is found.
+
+    Attributes:
+        method: "sample" draws maps, "mean_field" treats cells as independent, "mode" maximizes the posterior of the
+            normal prior. None is "mode" for the normal prior, and for the binary one "sample" on maps up to
+            `MAX_SAMPLED` unknown cells × goals and "mean_field" beyond.
+        sweeps: The number of sweeps of each chain, at least 12; None for a number by the size of the map.
+        chains: The number of chains, at least 2.
+
+    Raises:
+        InputError: For values out of these ranges.
+
+    Example:
+        >>> PosteriorConfig("sample", sweeps=1000).chains
+        2
+    """
+
+    method: PosteriorMethod | None = None
+    sweeps: int | None = None
+    chains: int = 2
+
+    def __post_init__(self) -> None:
+        if self.method is not None:
+            _check_choice(self.method, PosteriorMethod, "posterior")
+        if self.sweeps is not None:
+            check_count(self.sweeps, 12, "sweeps")
+        check_count(self.chains, 2, "chains")
 
 
 @dataclass(frozen=True)
@@ -111,22 +176,33 @@ class MapConfig:
         reward: The reward that agents pursue.
         behavior: How agents choose their actions.
         prior: The prior over unknown cells.
-        fit: How the posterior is maximized.
+        posterior: How their posterior is found.
+        fit: How a posterior is maximized.
         max_walks: Learn from this many walks, drawn by `seed`; None for all.
         seed: The seed of everything random.
 
     Example:
         >>> config = MapConfig(reward=Reward(discount=1.0, step_cost=1.0), behavior=BehaviorConfig(beta=0.5))
-        >>> config.prior.mean
-        -1.5
+        >>> config.prior.kind
+        'binary'
+
+    Raises:
+        InputError: For a method that does not go with the prior.
     """
 
     reward: Reward = field(default_factory=Reward)
     behavior: BehaviorConfig = field(default_factory=BehaviorConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)
+    posterior: PosteriorConfig = field(default_factory=PosteriorConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     max_walks: int | None = None
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        method, kind = self.posterior.method, self.prior.kind
+        expected = "mode" if kind == "normal" else "sample or mean_field"
+        fits = method is None or (method == "mode") == (kind == "normal")
+        check(fits, f"the {kind} prior has {expected}, found {method}", field="posterior")
 
 
 @dataclass(frozen=True)

@@ -1,24 +1,40 @@
-"""The fit of an obstacle grid to demonstrations that a `MapConfig` describes.
+"""The posterior of an obstacle grid after demonstrations, as a `MapConfig` describes it.
 
-The posterior is that of `sidestep.inference.fit`, with two additions. The first cell of every walk counts as evidence
-that it is free (`FreeCellEvidence`), and a blocked cell between two others is more probable (`WallPrior`). The fit
-starts where the transitions alone lead. On large maps every unvisited unknown cell is then almost surely blocked.
+Maps of up to `MAX_SAMPLED` unknown cells × goals are sampled (`sample_barriers`). Larger ones, and those with the
+paper's normal prior, are fitted: the posterior of `sidestep.inference.fit` with the prior of the mean field, or with
+the normal one and `WallPrior`. The first cell of every walk counts as evidence that it is free (`FreeCellEvidence`).
+The fit starts where the transitions alone lead. On large maps every unvisited unknown cell is then almost surely
+blocked. Parameters of the behavior are learned by a fit; maps are sampled with these.
 """
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
+from sidestep.errors import check
 from sidestep.inference.fit import Fit, fit
 from sidestep.inference.maximize import Progress
+from sidestep.inference.mean_field import MeanField
+from sidestep.inference.mrf import SHAPE_TERMS, BinaryMRF
 from sidestep.inference.optimizers import LBFGS, Adam, Optimizer, Rprop
-from sidestep.inference.priors import FreeCellEvidence, Normal, WallPrior
+from sidestep.inference.priors import FreeCellEvidence, Prior, WallPrior
+from sidestep.inference.sampler import BarrierPosterior, sample_barriers
 from sidestep.io.demonstrations import demonstrations_from_moves
 from sidestep.io.gridding import Moves
-from sidestep.maps.config import BehaviorConfig, FitConfig, MapConfig
+from sidestep.maps.config import (
+    MAX_SAMPLED,
+    SHAPE_WEIGHTS,
+    BehaviorConfig,
+    FitConfig,
+    MapConfig,
+    PosteriorMethod,
+    PriorConfig,
+)
+from sidestep.maps.sensors import SensorMap, cell_field, cell_prior
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import BACKUPS, Behavior
 from sidestep.tabular.behavior_model import BehaviorModel, behavior_model
@@ -28,6 +44,11 @@ from sidestep.tabular.likelihood import ALL_TERMS
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.solve import SolveOptions
 
+MapPosterior = Fit[ObstacleGrid] | BarrierPosterior[ObstacleGrid]
+"""What is learned of a map: a fit, or samples."""
+
+_PROPOSALS, _FEWEST_SWEEPS, _MOST_SWEEPS = 6_000_000, 150, 600
+"""The number of sweeps is this number over unknown cells × goals, within these bounds."""
 _BLOCKED_LOGIT = 8.0
 """The first logit of an unvisited cell of a large map: some 3,000 tries, longer than most detours."""
 _TOLERANCE_PER_MOVE = 1e-3
@@ -72,25 +93,125 @@ def behavior_model_of(config: MapConfig, person: Int[np.ndarray, " tasks"] | Non
     return behavior_model(behavior_of(config.behavior), learn, discount=discount, person=person)
 
 
+def posterior_method(config: MapConfig, unknown: int, goals: int) -> PosteriorMethod:
+    """Return how the posterior of a map is found: the configured way, or one by the prior and the size.
+
+    Args:
+        config: The configuration.
+        unknown: The number of unknown cells.
+        goals: The number of tasks.
+    """
+    if config.posterior.method is not None:
+        return config.posterior.method
+    if config.prior.kind == "normal":
+        return "mode"
+    return "sample" if unknown * goals <= MAX_SAMPLED and config.behavior.horizon is None else "mean_field"
+
+
+def sweeps_for(config: MapConfig, unknown: int, goals: int) -> int:
+    """Return the number of sweeps: the configured one, or one by the size.
+
+    Args:
+        config: The configuration.
+        unknown: The number of unknown cells.
+        goals: The number of tasks.
+    """
+    if config.posterior.sweeps is not None:
+        return config.posterior.sweeps
+    return max(_FEWEST_SWEEPS, min(_MOST_SWEEPS, _PROPOSALS // max(1, unknown * goals)))
+
+
+def barrier_prior(
+    config: PriorConfig,
+    known: Int[np.ndarray, "rows columns"],
+    method: PosteriorMethod,
+    sensor: SensorMap | None = None,
+) -> BinaryMRF:
+    """Return the binary prior of the cells of a map.
+
+    Args:
+        config: The configuration of the prior.
+        known: The `Cell` value of each cell.
+        method: The method, for the default weights of shapes.
+        sensor: What sensors saw, if anything.
+    """
+    weights = {name: getattr(config, name) for name in SHAPE_TERMS}
+    weights |= {name: weight for name, weight in SHAPE_WEIGHTS[method].items() if weights[name] is None}
+    return BinaryMRF(cell_field(sensor, known, config).ravel(), known.shape, **weights)
+
+
+def infer_map(
+    model: ObstacleGrid,
+    demonstrations: Demonstrations,
+    config: MapConfig,
+    *,
+    sensor: SensorMap | None = None,
+    behavior: BehaviorModel | None = None,
+    callback: Callable[[Any], None] | None = None,
+    checkpoint: str | Path | None = None,
+    resume: bool = False,
+) -> MapPosterior:
+    """Find the posterior of an obstacle grid after demonstrations: samples of maps, or a fit.
+
+    Args:
+        model: The grid; its parameters are where a fit starts.
+        demonstrations: Moves on the grid, with tasks that have the reward of `config`.
+        config: The configuration; `config.reward` counts only where the discount is learned.
+        sensor: What sensors saw of unknown cells.
+        behavior: The agents; by default those of `config.behavior`. What is learned of them is learned by a fit.
+        callback: Called with the progress of every iteration or sweep.
+        checkpoint: The file that is kept up to date meanwhile.
+        resume: Continue from the checkpoint.
+
+    Returns:
+        Samples or a fit, by `posterior_method`.
+
+    Raises:
+        InputError: For settings or demonstrations that do not fit, as `sidestep.fit` and `sample_barriers` do.
+    """
+    behavior, known = behavior or behavior_model_of(config), np.asarray(model.known)
+    size = int((known == Cell.UNKNOWN).sum()), len(demonstrations.tasks.terminal)
+    method, run = posterior_method(config, *size), {"checkpoint": checkpoint, "resume": resume}
+    if method != "sample":
+        return fit_map(model, demonstrations, config, sensor=sensor, behavior=behavior, callback=callback, **run)
+    message = "maps are sampled without a horizon: expected none, or the posterior mean_field"
+    check(config.behavior.horizon is None, message, field="horizon")
+    if any(leaf is not None for leaf in behavior.parameters):
+        behavior = fit_map(model, demonstrations, config, sensor=sensor, behavior=behavior, callback=callback).behavior
+    return sample_barriers(
+        model,
+        demonstrations,
+        behavior,
+        prior=barrier_prior(config.prior, known, method, sensor),
+        tempering=config.behavior.tempering,
+        terms=ALL_TERMS if config.fit.terms == "both" else (config.fit.terms,),
+        sweeps=sweeps_for(config, *size),
+        chains=config.posterior.chains,
+        seed=config.seed,
+        report=callback,
+        **run,
+    )
+
+
 def fit_map(
     model: ObstacleGrid,
     demonstrations: Demonstrations,
     config: MapConfig,
     *,
-    cell_prior: Normal | None = None,
+    sensor: SensorMap | None = None,
     behavior: BehaviorModel | None = None,
     initialize: bool = True,
     callback: Callable[[Progress], None] | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
 ) -> Fit[ObstacleGrid]:
-    """Fit an obstacle grid to demonstrations.
+    """Fit an obstacle grid to demonstrations, by the mean field of a binary prior or the mode of a normal one.
 
     Args:
         model: The grid; its parameters are where the fit starts.
         demonstrations: Moves on the grid, with tasks that have the reward of `config`.
         config: The configuration; `config.reward` counts only where the discount is learned.
-        cell_prior: The prior of the cells' logits; by default that of `config.prior`.
+        sensor: What sensors saw of unknown cells.
         behavior: The agents; by default those of `config.behavior`.
         initialize: Start where the transitions and first cells lead instead of at `model`.
         callback: Called with the progress of every iteration.
@@ -105,9 +226,7 @@ def fit_map(
     """
     behavior = behavior or behavior_model_of(config)
     weights, unknown = np.asarray(demonstrations.weights), np.asarray(model.known).ravel() == Cell.UNKNOWN
-    prior = cell_prior or Normal(config.prior.mean, config.prior.variance)
-    if config.prior.wall_prior:
-        prior = WallPrior(prior, model.known, config.prior.wall_prior)
+    prior = _prior_of_fit(config.prior, model, sensor)
     if config.fit.terms != "actions":
         # of each unknown cell, the walks that begin there, by their weights
         first = demonstrations.first_moves()
@@ -139,6 +258,13 @@ def fit_map(
         checkpoint=checkpoint,
         resume=resume,
     )
+
+
+def _prior_of_fit(config: PriorConfig, model: ObstacleGrid, sensor: SensorMap | None) -> Prior:
+    if config.kind == "binary":
+        return MeanField(barrier_prior(config, np.asarray(model.known), "mean_field", sensor), model.known)
+    prior = cell_prior(sensor, config)
+    return WallPrior(prior, model.known, config.wall_prior) if config.wall_prior else prior
 
 
 def optimizer_for(config: FitConfig, cells: int, moves: int) -> Optimizer:

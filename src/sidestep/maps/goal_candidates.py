@@ -12,11 +12,11 @@ from sidestep.errors import check
 from sidestep.inference.fit import Fit
 from sidestep.inference.goals import GoalFit, fit_goals
 from sidestep.inference.maximize import Progress
-from sidestep.inference.priors import Normal
 from sidestep.io.demonstrations import connected_regions
 from sidestep.io.gridding import Moves
 from sidestep.maps.config import MapConfig
 from sidestep.maps.fit import behavior_of, fit_map
+from sidestep.maps.sensors import SensorMap
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid
@@ -135,7 +135,7 @@ def fit_with_unknown_goals(
     candidates: GoalCandidates,
     labels: list[object],
     config: MapConfig,
-    cell_prior: Normal | None = None,
+    sensor: SensorMap | None = None,
     callback: Callable[[Progress], None] | None = None,
 ) -> GoalPosterior:
     """Fit a map and the goals of walks by expectation maximization (`sidestep.inference.goals`).
@@ -147,7 +147,7 @@ def fit_with_unknown_goals(
         candidates: The goals that walks may have had.
         labels: The label of every walk.
         config: The configuration.
-        cell_prior: The prior of the cells' logits; by default that of the configuration.
+        sensor: What sensors saw of unknown cells.
         callback: Called with the progress of every iteration of every fit.
 
     Returns:
@@ -162,7 +162,7 @@ def fit_with_unknown_goals(
 
     def learn(current: ObstacleGrid, demonstrations: Demonstrations) -> Fit[ObstacleGrid]:
         first = current is model
-        return fit_map(current, demonstrations, config, cell_prior=cell_prior, initialize=first, callback=callback)
+        return fit_map(current, demonstrations, config, sensor=sensor, initialize=first, callback=callback)
 
     result = fit_goals(model, moves.trajectories(), tasks, behavior_of(config.behavior), learn)
     goals = moves.goals.copy()

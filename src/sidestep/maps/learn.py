@@ -13,21 +13,23 @@ from typing import Any
 import numpy as np
 
 from sidestep.errors import check
-from sidestep.inference.fit import Fit
 from sidestep.inference.maximize import Progress
+from sidestep.inference.sampler import BarrierPosterior, SweepProgress
 from sidestep.io.gridding import Moves, grid_walks
 from sidestep.io.walks import Walks
 from sidestep.maps.annotations import NO_ANNOTATIONS, WalkAnnotations, persons_of
 from sidestep.maps.config import MapConfig
-from sidestep.maps.fit import behavior_model_of, demonstrations_of, fit_map
+from sidestep.maps.fit import MapPosterior, behavior_model_of, demonstrations_of, infer_map
 from sidestep.maps.goal_candidates import GoalPosterior, fit_with_unknown_goals
 from sidestep.maps.learned_map import LearnedMap
 from sidestep.maps.selection import Selection, select_behavior
-from sidestep.maps.sensors import SensorMap, cell_prior, seen_cells
+from sidestep.maps.sensors import SensorMap, first_logits, seen_cells
 from sidestep.tabular.demonstrations import Demonstrations, split_by_person
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid
 
+_KEPT_SAMPLES = 400
+"""The most samples of a learned map."""
 _NEGLIGIBLE_PREFERENCE = 0.05
 """A difference of two actions' log-probabilities (nats) that says next to nothing."""
 
@@ -60,7 +62,7 @@ class Learning:
 
     Attributes:
         config: The configuration, with what the selection chose.
-        fit: The fit: model, behavior, history, convergence.
+        fit: The posterior, as samples or a fit: model, behavior, history, convergence.
         demonstrations: The moves that counted.
         data: Their numbers.
         selection: The selection of the behavior, if there was one.
@@ -74,7 +76,7 @@ class Learning:
     """
 
     config: MapConfig
-    fit: Fit[ObstacleGrid]
+    fit: MapPosterior
     demonstrations: Demonstrations
     data: DataCounts
     selection: Selection | None
@@ -115,7 +117,7 @@ def learn_map(
     *,
     sensor: SensorMap | None = None,
     annotations: WalkAnnotations = NO_ANNOTATIONS,
-    callback: Callable[[Progress], None] | None = None,
+    callback: Callable[[Progress | SweepProgress], None] | None = None,
     notify: Callable[[str], None] | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
@@ -128,7 +130,7 @@ def learn_map(
         config: The reward, behavior, prior and fit; by default those of `sidestep learn`.
         sensor: What sensors saw of unknown cells.
         annotations: The persons of the walks, and candidates for goals that walks do not name.
-        callback: Called with the progress of every iteration of the fit.
+        callback: Called with the progress of every iteration of a fit, or every sweep of a sampler.
         notify: Called with a line of text at each stage of the selection of the behavior.
         checkpoint: A file that is kept up to date while the fit runs.
         resume: Continue from the checkpoint. The result is that of an uninterrupted run.
@@ -156,14 +158,14 @@ def learn_map(
     config = config or MapConfig()
     annotations.check(config.behavior, resume)
     walks = annotations.without_goals(sample_walks(walks, config))
-    moves, prior = grid_walks(walks, grid), cell_prior(sensor, config.prior)
+    moves = grid_walks(walks, grid)
     resumed = resume and checkpoint is not None and Path(checkpoint).exists()
-    selection = select_behavior(grid, moves, config, prior, notify) if config.behavior.select else None
+    selection = select_behavior(grid, moves, config, sensor, notify) if config.behavior.select else None
     config = selection.config if selection else config
-    model = ObstacleGrid(grid, np.broadcast_to(np.asarray(prior.mean), grid.size))
+    model = ObstacleGrid(grid, first_logits(sensor, grid.known, config.prior))
     candidates, goals, names, person = annotations.goal_candidates, None, [], None
     if candidates is not None:
-        goals = fit_with_unknown_goals(model, grid, moves, candidates, walks.labels, config, prior, callback)
+        goals = fit_with_unknown_goals(model, grid, moves, candidates, walks.labels, config, sensor, callback)
         fit, demonstrations = goals.fit.fit, demonstrations_of(goals.moves, grid, config)
     else:
         demonstrations = demonstrations_of(moves, grid, config)
@@ -174,7 +176,7 @@ def learn_map(
             config = replace(config, behavior=replace(config.behavior, learn=learn))
         behavior = behavior_model_of(config, person)
         run: dict[str, Any] = {"callback": callback, "checkpoint": checkpoint, "resume": resume}
-        fit = fit_map(model, demonstrations, config, cell_prior=prior, behavior=behavior, **run)
+        fit = infer_map(model, demonstrations, config, sensor=sensor, behavior=behavior, **run)
     learning = Learning(
         config=config,
         fit=fit,
@@ -189,8 +191,10 @@ def learn_map(
         seconds=round(time.monotonic() - started, 3),
         peak_memory_bytes=peak_memory(),
     )
-    blocked = np.asarray(fit.model.blocked, dtype=np.float64)
-    return LearnedMap(grid, blocked, demonstrations.visited_state_goals(), config.reward, learning)
+    blocked, samples = np.asarray(fit.model.blocked, dtype=np.float64), None
+    if isinstance(fit, BarrierPosterior):
+        samples = fit.thinned(_KEPT_SAMPLES).reshape(-1, *grid.shape)
+    return LearnedMap(grid, blocked, demonstrations.visited_state_goals(), config.reward, learning, samples)
 
 
 def sample_walks(walks: Walks, config: MapConfig) -> Walks:
@@ -229,7 +233,7 @@ def _counts(grid: Grid, moves: Moves, demonstrations: Demonstrations, sensor: Se
         moves_left_out=len(moves.states) - len(demonstrations),
         goals=len(np.unique(demonstrations.visited_state_goals()[:, 1])),
         unknown_cells=int((grid.known == Cell.UNKNOWN).sum()),
-        sensed_cells=int(np.isfinite(seen_cells(sensor, grid)).sum()),
+        sensed_cells=int(np.isfinite(seen_cells(sensor, grid.known)).sum()),
     )
 
 

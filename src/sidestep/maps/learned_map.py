@@ -4,6 +4,7 @@
 |----------------|----------------------------------------------------------------------------------|
 | `map.yaml`, `map.pgm` | the map for ROS (`map_server`, mode scale)                                |
 | `blocked.npy`  | P(blocked) of each cell, row 0 at the top; exactly 0 or 1 where the map knew     |
+| `samples.npz`  | `blocked`: maps from the posterior, where it was sampled                         |
 | `visited.npy`  | the (state, goal) pairs that the walks passed                                    |
 | `posterior.csv`| P(goal) of each walk, where the walks did not name their goals                   |
 | `summary.json` | settings, the final objective and its parts, convergence, time, memory           |
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sidestep._files import read_array, read_json, write_array, write_json
+from sidestep._files import read_array, read_json, write_array, write_arrays, write_json
 from sidestep.errors import check, input_errors
 from sidestep.io.maps import read_map, write_map
 from sidestep.robots.planners import ModelPlanner
@@ -62,6 +63,7 @@ class LearnedMap:
         visited: The (state, goal) pairs that the walks passed.
         reward: The reward that the agents pursued.
         learning: How the map was learned; None for a map that was loaded from a folder.
+        samples: Maps from the posterior: whether each cell is blocked; None where it was not sampled.
 
     Example:
         >>> grid = Grid(np.array([[0, -1, 0]]))
@@ -75,6 +77,7 @@ class LearnedMap:
     visited: Int[np.ndarray, "visits 2"]
     reward: Reward
     learning: "sidestep.maps.learn.Learning | None" = None
+    samples: Bool[np.ndarray, "samples rows columns"] | None = None
 
     @property
     def unknown(self) -> Bool[np.ndarray, "rows columns"]:
@@ -173,6 +176,10 @@ class LearnedMap:
         write_map(folder / "map.yaml", blocked, self.grid)
         write_array(folder / "blocked.npy", blocked)
         write_array(folder / "visited.npy", self.visited)
+        if self.samples is not None:
+            write_arrays(folder / "samples.npz", blocked=self.samples)
+        else:
+            (folder / "samples.npz").unlink(missing_ok=True)  # of an earlier map in this folder
         if self.learning is not None and self.learning.goals is not None:
             from sidestep.maps.goal_candidates import write_goal_posterior
 
@@ -214,7 +221,17 @@ def load_map(folder: str | Path) -> LearnedMap:
     check(fits, message, source=folder / "visited.npy")
     known = np.where(blocked == 0, Cell.FREE, np.where(blocked == 1, Cell.OCCUPIED, Cell.UNKNOWN))
     grid = replace(geometry, known=known.astype(np.int64))
-    return LearnedMap(grid, blocked.astype(np.float64), visited.astype(np.int64), reward)
+    samples = _read_samples(folder / "samples.npz", geometry.shape)
+    return LearnedMap(grid, blocked.astype(np.float64), visited.astype(np.int64), reward, samples=samples)
+
+
+def _read_samples(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "samples rows columns"] | None:
+    if not path.exists():
+        return None
+    samples = read_array(path, kinds="b", name="blocked")
+    message = f"expected maps of shape {shape}, found an array of shape {samples.shape}"
+    check(samples.ndim == 3 and len(samples) and samples.shape[1:] == shape, message, source=path, field="blocked")
+    return samples
 
 
 def add_to_summary(folder: Path, out: Path, key: str | None, summary: dict[str, Any]) -> None:

@@ -26,10 +26,10 @@ from jaxtyping import Float
 
 from sidestep.errors import ImproperTask, NotConverged, check
 from sidestep.inference.calibration import Dispersion, dispersion, effective_sample_ratio, score_statistics
-from sidestep.inference.priors import Normal
 from sidestep.io.gridding import Moves
 from sidestep.maps.config import BehaviorConfig, MapConfig
 from sidestep.maps.fit import demonstrations_of, fit_map
+from sidestep.maps.sensors import SensorMap
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import transition_probabilities
@@ -116,7 +116,7 @@ class Selection:
 
 
 def select_behavior(
-    grid: Grid, moves: Moves, config: MapConfig, cell_prior: Normal | None = None, notify: Notify = None
+    grid: Grid, moves: Moves, config: MapConfig, sensor: SensorMap | None = None, notify: Notify = None
 ) -> Selection:
     """Select the reward, β and tempering that held-out walks support.
 
@@ -124,7 +124,7 @@ def select_behavior(
         grid: The grid.
         moves: The moves of at least two walks.
         config: The configuration from which the selection starts.
-        cell_prior: The prior of the cells' logits; by default that of the configuration.
+        sensor: What sensors saw of unknown cells.
         notify: Called with a line of text for every fit.
 
     Returns:
@@ -144,8 +144,8 @@ def select_behavior(
     def attempt(candidate: MapConfig) -> list[Trial]:
         """Return the trial; nothing where the task has no values, unless it is the configuration's own."""
         try:
-            model, shown = ObstacleGrid(grid, candidate.prior.mean), demonstrations_of(moves, grid, candidate)
-            trials.append(_cross_validate(model, shown, candidate, cell_prior, notify))
+            model, shown = ObstacleGrid(grid, candidate.prior.first_logit), demonstrations_of(moves, grid, candidate)
+            trials.append(_cross_validate(model, shown, candidate, sensor, notify))
             return trials[-1:]
         except (ImproperTask, NotConverged) as error:
             if candidate is config:
@@ -202,7 +202,7 @@ def _other_reward(config: MapConfig) -> MapConfig:
 
 
 def _cross_validate(
-    model: ObstacleGrid, demonstrations: Demonstrations, config: MapConfig, cell_prior: Normal | None, notify: Notify
+    model: ObstacleGrid, demonstrations: Demonstrations, config: MapConfig, sensor: SensorMap | None, notify: Notify
 ) -> Trial:
     """Learn from the complement of each fold, and score the fold."""
     count = demonstrations.trajectories
@@ -213,7 +213,7 @@ def _cross_validate(
         if notify:
             kind, beta = "goal reward" if config.reward.step_cost is None else "step cost", config.behavior.beta
             notify(f"selecting: {kind}, β = {beta:g}, fold {fold + 1} of {fold_of.max() + 1}")
-        fit = fit_map(model, demonstrations.with_only(fold_of != fold), config, cell_prior=cell_prior)
+        fit = fit_map(model, demonstrations.with_only(fold_of != fold), config, sensor=sensor)
         held_out, behavior = demonstrations.with_only(fold_of == fold), fit.behavior.behavior_of()
         of_fold = score_statistics(fit.model, held_out, behavior, options=SolveOptions(horizon=config.behavior.horizon))
         statistics.append(of_fold)

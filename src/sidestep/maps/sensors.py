@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from sidestep.inference.priors import Normal, sensor_prior
 from sidestep.io.maps import read_sensor_map, read_sensor_variance
@@ -73,21 +73,21 @@ def read_sensor(map_file: str | Path, grid: Grid, variance: float | str | Path =
     return SensorMap(probability, read_sensor_variance(variance, grid), str(map_file), str(variance))
 
 
-def seen_cells(sensor: SensorMap | None, grid: Grid) -> Float[np.ndarray, "rows columns"]:
+def seen_cells(sensor: SensorMap | None, known: Int[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
     """Return P(occupied) of the unknown cells that sensors have seen, and NaN elsewhere.
 
     Args:
         sensor: What sensors saw, if anything.
-        grid: The map.
+        known: The `Cell` value of each cell.
     """
     if sensor is None:
-        return np.full(grid.shape, np.nan)
-    seen = np.isfinite(sensor.variance) & (grid.known == Cell.UNKNOWN)
+        return np.full(known.shape, np.nan)
+    seen = np.isfinite(sensor.variance) & (known == Cell.UNKNOWN)
     return np.where(seen, sensor.probability, np.nan)
 
 
 def cell_prior(sensor: SensorMap | None, config: PriorConfig) -> Normal:
-    """Return the prior of the cells' logits; unseen cells have that of the configuration.
+    """Return the normal prior of the cells' logits; unseen cells have that of the configuration.
 
     Args:
         sensor: What sensors saw, if anything.
@@ -95,3 +95,40 @@ def cell_prior(sensor: SensorMap | None, config: PriorConfig) -> Normal:
     """
     elsewhere = Normal(config.mean, config.variance)
     return elsewhere if sensor is None else sensor_prior(sensor.probability, sensor.variance, elsewhere)
+
+
+def cell_field(
+    sensor: SensorMap | None, known: Int[np.ndarray, "rows columns"], config: PriorConfig
+) -> Float[np.ndarray, "rows columns"]:
+    """Return the field of the binary prior: the log-odds of P(occupied) where sensors saw, and η elsewhere.
+
+    A sensor's logit x has a variance v. The field is that of E[σ(x)] ≈ σ(x/√(1 + πv/8)) (MacKay 1992, *The evidence
+    framework applied to classification networks*).
+
+    Args:
+        sensor: What sensors saw, if anything.
+        known: The `Cell` value of each cell.
+        config: The prior of unseen cells.
+    """
+    field = np.full(known.shape, config.first_logit)
+    if sensor is None:
+        return field
+    seen = sensor_prior(sensor.probability, sensor.variance, Normal(0.0, 1.0))
+    mean, variance = (np.asarray(each).reshape(known.shape) for each in (seen.mean, seen.variance))
+    observed = np.isfinite(seen_cells(sensor, known))
+    return np.where(observed, mean / np.sqrt(1 + np.pi * variance / 8), field)
+
+
+def first_logits(
+    sensor: SensorMap | None, known: Int[np.ndarray, "rows columns"], config: PriorConfig
+) -> Float[np.ndarray, " cells"]:
+    """Return the logit of P(blocked) of each cell at which a fit starts: the mean or field of the prior.
+
+    Args:
+        sensor: What sensors saw, if anything.
+        known: The `Cell` value of each cell.
+        config: The prior.
+    """
+    if config.kind == "binary":
+        return cell_field(sensor, known, config).ravel()
+    return np.array(np.broadcast_to(np.asarray(cell_prior(sensor, config).mean, np.float64), known.size))
