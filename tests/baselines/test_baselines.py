@@ -51,6 +51,13 @@ def test_method_finds_a_wall_that_walks_avoid(method, walks):
     assert not WALL.ravel()[path].any()
 
 
+@pytest.mark.parametrize(("name", "expected"), [
+    ("behavior", True), ("transitions", True), ("visits", False), ("costs", False), ("joint", True), ("cloning", False),
+])  # fmt: skip
+def test_methods_that_rank_by_probability_say_so(name, expected, walks):
+    assert METHODS[name](BLANK, walks, MapConfig()).ranks_by_probability is expected
+
+
 def test_visit_counts_equals_one_over_visits_plus_one():
     walk = Trajectory(np.array([0, 1, 2, 1, 2, 7]), np.array([3, 3, 2, 3, 1]), 0)
     demos = gather([walk], [reach(BLANK, 7)])

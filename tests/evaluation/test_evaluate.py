@@ -16,6 +16,7 @@ from sidestep.evaluation.evaluate import (
     plan_paths,
     sample_sizes,
 )
+from sidestep.evaluation.reliability import LEAST_PROBABILITY
 from sidestep.robots.planners import ModelPlanner, PolicyPlanner
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, true_model
@@ -45,10 +46,12 @@ def planner_of(model, reward=Reward()) -> ModelPlanner:  # noqa: B008
 
 @pytest.mark.parametrize("reward", [Reward(), Reward(discount=1.0, step_cost=1.0)])
 def test_evaluate_of_a_perfect_map_has_perfect_scores(reward):
-    assert evaluate_model(true_model(TRUTH), reward).to_dict() == {
-        "auc": 1, "average_precision": 1, "auc_relevant": 1, "average_precision_relevant": 1, "recall": 1,
-        "mean_obstacle": 1, "mean_free": 0, "max_probability": 1, "legal_fraction": 1, "excess_length": 0, "regret": 0,
-        "arriving_fraction": 1,
+    scores = evaluate_model(true_model(TRUTH), reward).to_dict()
+    assert scores.pop("log_loss") == pytest.approx(LEAST_PROBABILITY, rel=1e-3)
+    assert scores == {
+        "auc": 1, "average_precision": 1, "auc_relevant": 1, "average_precision_relevant": 1, "calibration_error": 0,
+        "brier_score": 0, "recall": 1, "mean_obstacle": 1, "mean_free": 0, "max_probability": 1, "legal_fraction": 1,
+        "excess_length": 0, "regret": 0, "arriving_fraction": 1,
     }  # fmt: skip
 
 
@@ -83,6 +86,10 @@ def test_evaluate_ranks_cells_by_probability():
     assert result.auc == pytest.approx(13 / 14)
     assert result.average_precision == pytest.approx((1 + 2 / 3) / 2)
     assert result.auc_relevant == result.average_precision_relevant == 1
+    # bin errors: six free cells at .1, an obstacle at .3, a free cell at .5, an obstacle at .8
+    assert result.calibration_error == pytest.approx((6 * 0.1 + 0.7 + 0.5 + 0.2) / 9)
+    assert result.brier_score == pytest.approx((6 * 0.01 + 0.49 + 0.25 + 0.04) / 9)
+    assert result.log_loss == pytest.approx(-np.log([*[0.9] * 6, 0.3, 0.5, 0.8]).mean())
     assert result.recall == pytest.approx(1 / 2)
     assert result.mean_obstacle == pytest.approx(0.55)
     assert result.mean_free == pytest.approx((6 * 0.1 + 0.5) / 7)

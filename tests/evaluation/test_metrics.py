@@ -116,10 +116,25 @@ def test_score_map_equals_scores_worked_out():
     assert scores.average_precision == pytest.approx((1 + 2 / 3 + 3 / 4) / 3)
     assert scores.auc_relevant == pytest.approx(2 / 3)
     assert scores.average_precision_relevant == pytest.approx(1 / 2)
+    # .9 and .3 .5 and .6 .1 .2, all in bins of their own
+    assert scores.calibration_error == pytest.approx((0.1 + 0.7 + 0.5 + 0.6 + 0.1 + 0.2) / 6)
+    assert scores.brier_score == pytest.approx((0.01 + 0.49 + 0.25 + 0.36 + 0.01 + 0.04) / 6)
+    assert scores.log_loss == pytest.approx(-np.log([0.9, 0.3, 0.5, 0.4, 0.9, 0.8]).mean())
     assert scores.recall == pytest.approx(2 / 3)  # .5 counts
     assert scores.mean_obstacle == pytest.approx(1.7 / 3)
     assert scores.mean_free == pytest.approx(0.3)
     assert scores.max_probability == 0.9  # neither the unknown cell nor the one that is not scored
+
+
+def test_score_map_of_visit_counts_has_a_ranking_and_no_calibration():
+    """Counts are no probabilities, also where the scored ones are 0 and 1 only by chance."""
+    everywhere = np.ones((1, 3), dtype=bool)
+    scores = score_map(np.array([[0.0, -4.0, -1.0]]), grid_of("#.."), everywhere, everywhere)
+    assert scores.auc == scores.average_precision == 1
+    assert scores.calibration_error is scores.brier_score is scores.log_loss is None
+    unvisited = score_map(np.array([[1.0, 0.0, -4.0]]), grid_of("#.."), np.array([[True, True, False]]), everywhere)
+    assert unvisited.auc == 1
+    assert unvisited.calibration_error is unvisited.brier_score is unvisited.log_loss is None
 
 
 def test_score_map_without_cells_to_average_is_none():

@@ -22,6 +22,7 @@ class AlwaysRight:
     log_policy: float
     ranking: np.ndarray | None = None
     converged: bool = False
+    ranks_by_probability: bool = False
     planner = PolicyPlanner(GRID, lambda goal: np.tile([0.0, 0.0, 0.0, 1.0], (4, 1)))  # noqa: ARG005
 
     def log_policies(self, demonstrations):
@@ -64,3 +65,23 @@ def test_run_study_without_paths_scores_cells_only():
     assert record.evaluation.mean_free == pytest.approx(0.25)
     assert record.evaluation.legal_fraction is None
     assert record.result is ranked
+
+
+@pytest.mark.parametrize("ranks_by_probability", [True, False])
+def test_run_study_scores_calibration_of_probabilities_only(ranks_by_probability):
+    """Costs of cells may happen to lie in [0, 1], and are no probabilities all the same."""
+    blocked = np.array([[0.1, 0.2, 0.3, 0.4]])
+    result = AlwaysRight(0.0, blocked, ranks_by_probability=ranks_by_probability)
+    (record,) = run_study([problem("one")], {"ranked": lambda *_: result}, paths=False)
+    row = record.to_dict()
+    assert row["mean_free"] == pytest.approx(0.25)
+    assert "reliability" not in row
+    scores = [row[name] for name in ("calibration_error", "brier_score", "log_loss")]
+    if ranks_by_probability:
+        assert record.reliability is not None
+        assert record.reliability.calibration_error == row["calibration_error"]
+        # no cell is an obstacle
+        assert scores == [pytest.approx(0.25), pytest.approx(0.075), pytest.approx(-np.log1p(-blocked).mean())]
+    else:
+        assert record.reliability is None
+        assert scores == [None, None, None]

@@ -49,6 +49,7 @@ class ClonedPolicy:
         intercepts: The intercept of every action.
         converged: Whether the regression converged.
         ranking: None, since cells are not ranked.
+        ranks_by_probability: False, for the same reason.
         heatmap: None, since cells are not ranked.
     """
 
@@ -57,6 +58,7 @@ class ClonedPolicy:
     intercepts: Float[np.ndarray, " actions"]
     converged: bool
     ranking: None = None
+    ranks_by_probability: bool = False
     heatmap: None = None
 
     def policy(self, goal: int) -> Float[np.ndarray, "states actions"]:

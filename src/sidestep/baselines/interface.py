@@ -60,6 +60,11 @@ class ModelResult(NamedTuple):
     options: SolveOptions = SolveOptions()
 
     @property
+    def ranks_by_probability(self) -> bool:
+        """Whether the ranking is P(blocked)."""
+        return np.allclose(self.ranking, self.model.blocked)
+
+    @property
     def heatmap(self) -> _Cells:
         """P(blocked), or the ranking from 0 to 1 if P(blocked) is constant or the ranking is no probability."""
         blocked = np.asarray(self.model.blocked, dtype=np.float64)

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Integer
 from scipy.sparse import csr_array
 
 from sidestep.errors import check
+from sidestep.evaluation.reliability import brier_score, log_loss, reliability, scored_probabilities
 from sidestep.tabular.graph import check_states, free_cells, walkable_graph
 from sidestep.tabular.grid import Cell, Grid
 
@@ -27,6 +28,10 @@ class MapScores:
         average_precision: The average precision of the same ranking.
         auc_relevant: The area under the ROC curve with the relevant obstacles as the only obstacles.
         average_precision_relevant: The average precision with these.
+        calibration_error: The expected calibration error of P(blocked) in ten bins (`sidestep.evaluation.reliability`).
+            This and the next two are None also for a ranking with numbers outside [0, 1], which is no probability.
+        brier_score: The mean squared error of P(blocked).
+        log_loss: The mean of −ln P over cells, P being the probability of what a cell is, in nats.
         recall: The fraction of obstacles with P(blocked) of at least 1/2.
         mean_obstacle: The mean of P(blocked) over obstacles.
         mean_free: The mean of P(blocked) over free cells.
@@ -37,6 +42,9 @@ class MapScores:
     average_precision: float | None = None
     auc_relevant: float | None = None
     average_precision_relevant: float | None = None
+    calibration_error: float | None = None
+    brier_score: float | None = None
+    log_loss: float | None = None
     recall: float | None = None
     mean_obstacle: float | None = None
     mean_free: float | None = None
@@ -66,7 +74,8 @@ def score_map(blocked: Float[np.ndarray, "rows columns"], truth: Grid, scored: _
         relevant: The relevant obstacles (`relevant_obstacles`).
 
     Returns:
-        Scores in [0, 1] if `blocked` has probabilities; None where a mean or a ranking has no cells.
+        Scores in [0, 1] if `blocked` has probabilities, but for the log loss, which is 0 or more; None where a mean or
+        a ranking has no cells.
 
     Raises:
         InputError: For arrays of another shape than the map and for numbers that are not finite.
@@ -79,7 +88,10 @@ def score_map(blocked: Float[np.ndarray, "rows columns"], truth: Grid, scored: _
     on_obstacles, on_free = blocked[obstacle], blocked[free]
     ranking = *ranking_scores(on_obstacles, on_free), *ranking_scores(blocked[obstacle & relevant], on_free)
     highest = float(blocked[obstacle | free].max()) if (obstacle | free).any() else None
-    return MapScores(*ranking, _mean(on_obstacles >= 0.5), _mean(on_obstacles), _mean(on_free), highest)
+    calibration, cells = (None, None, None), scored_probabilities(blocked, truth, scored)
+    if cells is not None:
+        calibration = reliability(*cells).calibration_error, brier_score(*cells), log_loss(*cells)
+    return MapScores(*ranking, *calibration, _mean(on_obstacles >= 0.5), _mean(on_obstacles), _mean(on_free), highest)
 
 
 def ranking_scores(

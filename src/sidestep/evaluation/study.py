@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from sidestep.errors import ImproperTask, NotConverged
 from sidestep.evaluation.evaluate import Evaluation, evaluate
+from sidestep.evaluation.reliability import Reliability, map_reliability
 from sidestep.robots.planners import Planner
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Cell, Grid
@@ -27,6 +28,11 @@ class MethodResult(Protocol):
     @property
     def ranking(self) -> Float[np.ndarray, "rows columns"] | None:
         """A number for each cell, higher for obstacles; None if the method does not rank cells."""
+        ...
+
+    @property
+    def ranks_by_probability(self) -> bool:
+        """Whether these numbers are P(blocked), and can be scored as such."""
         ...
 
     @property
@@ -77,7 +83,9 @@ class Record:
     Attributes:
         problem: The problem's name.
         method: The method's name.
-        evaluation: The scores; all None if the method failed.
+        evaluation: The scores; all None if the method failed. Those of calibration are None also if the method ranks
+            cells by other numbers than P(blocked).
+        reliability: The reliability of P(blocked) over the scored cells; None where there is no calibration error.
         heldout_log_likelihood: The mean log π(a | s) of held-out moves in nats; None without held-out moves and if a
             value does not converge.
         seconds: The time of learning; None if the method failed.
@@ -89,6 +97,7 @@ class Record:
     problem: str
     method: str
     evaluation: Evaluation = field(default_factory=Evaluation)
+    reliability: Reliability | None = None
     heldout_log_likelihood: float | None = None
     seconds: float | None = None
     converged: bool | None = None
@@ -96,8 +105,9 @@ class Record:
     result: MethodResult | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all but `result` by name, the scores among them."""
-        others = {name: value for name, value in vars(self).items() if name not in ("evaluation", "result")}
+        """Return all but `result` and `reliability` by name, the scores among them."""
+        left_out = "evaluation", "reliability", "result"
+        others = {name: value for name, value in vars(self).items() if name not in left_out}
         return {**others, **self.evaluation.to_dict()}
 
 
@@ -148,8 +158,12 @@ def run_method(
         scores = evaluate(planner, result.ranking, problem.truth, scored, visited, seed, goals=problem.goals)
     except (ImproperTask, NotConverged) as error:
         return Record(problem.name, name, failure=str(error))
+    bins = map_reliability(result.ranking, problem.truth, scored) if result.ranks_by_probability else None
+    if bins is None:
+        # such as costs, which may happen to lie in [0, 1]
+        scores = replace(scores, calibration_error=None, brier_score=None, log_loss=None)
     heldout = None if problem.heldout is None else mean_log_likelihood(result, problem.heldout)
-    return Record(problem.name, name, scores, heldout, seconds, result.converged, result=result)
+    return Record(problem.name, name, scores, bins, heldout, seconds, result.converged, result=result)
 
 
 def mean_log_likelihood(result: MethodResult, demonstrations: Demonstrations) -> float | None:
