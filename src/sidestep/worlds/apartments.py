@@ -7,6 +7,7 @@ from numpy.random import Generator
 from sidestep.errors import check
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 
+_Room = Int[np.ndarray, "_ _"]
 _SMALLEST = 5
 _NARROWEST = 3
 """The least number of rows and columns of a room, if the apartment has as many."""
@@ -49,20 +50,18 @@ def apartment(rows: int, columns: int, seed: int, connectivity: Connectivity = 4
     return Grid(cells, connectivity=connectivity)
 
 
-def _divide(
-    room: Int[np.ndarray, "rows columns"], random: Generator
-) -> tuple[Int[np.ndarray, "_ columns"], Int[np.ndarray, "_ columns"]] | tuple[()]:
+def _divide(room: _Room, random: Generator) -> list[_Room]:
     """Build a wall with a door through a room, seen with the walls around it; return the parts, seen likewise."""
     rows, columns = room.shape
     if max(rows, columns) - 2 <= _LARGEST and random.random() >= _DIVIDED:
-        return ()
+        return []
     across = room if rows > columns or (rows == columns and random.random() < 0.5) else room.T
     # a wall across the longer side, with rooms on both sides and no door at either end
     possible = np.arange(_NARROWEST + 1, len(across) - _NARROWEST - 1)
     possible = possible[(across[possible][:, [0, -1]] == Cell.OCCUPIED).all(axis=1)]
     if not len(possible):
-        return ()
+        return []
     wall = int(random.choice(possible))
     across[wall] = Cell.OCCUPIED
     across[wall, random.integers(1, across.shape[1] - 1)] = Cell.FREE
-    return across[: wall + 1], across[wall:]
+    return [across[: wall + 1], across[wall:]]
