@@ -12,7 +12,9 @@ expects their actions to be (nats a move).
 Robots start from every free cell and plan by what each method has learned. `legal` is the fraction of planned paths
 without an impossible move, `regret` the mean excess of the executed paths in cells, bumps and detours included, and
 `arriving` the fraction of robots that arrive. The regret is a mean over the worlds in which all robots arrive, that of
-held-out actions over those in which values converge for all held-out goals.
+held-out actions over those in which values converge for all held-out goals. `pooled` is the calibration error of the
+cells of all worlds of a draw together (all offices are one draw), and the picture has a reliability diagram for each
+number of walks.
 
 Records: those of `people.py`, with `legal_fraction`, `regret`, `arriving_fraction`, `heldout_log_likelihood`.
 """
@@ -22,9 +24,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from benchmarks import SHARED_DATA, Record, changed, described, flat, option
-from benchmarks.people import CELLS, METHODS, Maze, in_trials, learn_by, read_mazes, show_means
+from benchmarks.people import CELLS, METHODS, Maze, in_trials, learn_by, read_mazes, reliability_figure, show_means
 from sidestep.io.demonstrations import walks_from_trajectories
 from sidestep.maps.config import MapConfig, SimulationConfig
 from sidestep.tabular.grid import Cell
@@ -95,3 +98,9 @@ def show(records: Sequence[Record], options: Options) -> None:
     heldout = {"held-out nats a move": "heldout_log_likelihood .3f"}
     title = f"{options.worlds}, {described(changed(MapConfig(), options.set))}"
     show_means(records, title, CELLS | heldout | PATHS, within=None)
+
+
+def draw(records: Sequence[Record], options: object = None) -> Figure:
+    """Return the reliability diagrams of `behavior`."""
+    del options
+    return reliability_figure(records)

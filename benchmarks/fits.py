@@ -6,7 +6,8 @@
 A fraction of the wall cells, drawn at random, is hidden from the learner, and `--free` times as many free cells: all of
 these are unknown to it, and it knows the rest of the map. Walks are shortest ones (ties at random) at a step cost of 1
 and no discount. Scored are the unknown cells: how well P(blocked) ranks the relevant hidden walls (those that would
-have shortened a walk if they alone were open) above the free cells, beside the ranking by how rarely they were visited.
+have shortened a walk if they alone were open) above the free cells, beside the ranking by how rarely they were visited;
+and how well P(blocked) of all unknown cells is calibrated, of which the picture has a reliability diagram for each map.
 
 Records: those of `people.py`, with `cells`, `goals`, `walks`, `hidden_walls`, `relevant_walls`, `peak_bytes` (of the
 whole process up to then).
@@ -17,15 +18,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from benchmarks import SHARED_DATA, Record, changed, described, flat, option, peak_bytes, print_table
-from benchmarks.people import Maze, learn_by
+from benchmarks import SHARED_DATA, Record, changed, described, flat, groups, option, peak_bytes, print_table
+from benchmarks.people import CALIBRATION, Maze, learn_by, pool
 from sidestep.evaluation.relevance import relevant_obstacles
 from sidestep.io.demonstrations import walks_from_trajectories
 from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map
 from sidestep.maps.config import BehaviorConfig, MapConfig, PriorConfig, SimulationConfig
 from sidestep.maps.fit import demonstrations_of
+from sidestep.plotting.reliability import figure_reliability
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.reward import Reward
 from sidestep.worlds.offices import office
@@ -80,6 +83,14 @@ def show(records: Sequence[Record], options: Options) -> None:
     """Print the table."""
     columns = {"map": "problem", "cells": "cells", "goals": "goals", "walks": "walks", "moves": "moves"}
     columns |= {"relevant": "relevant_walls", "method": "method", "average precision": "average_precision_relevant .3f"}
+    columns |= {name: column for name, column in CALIBRATION.items() if name != "pooled"}
     columns |= {"iterations": "iterations", "converged": "converged", "s": "seconds .0f", "GiB": "peak_bytes GiB"}
     settings = described(changed(CONFIG, options.set))
     print_table(f"{options.hidden:.0%} of the wall cells hidden, {settings}", records, columns)
+
+
+def draw(records: Sequence[Record], options: object = None) -> Figure:
+    """Return the reliability diagrams of `behavior`."""
+    del options
+    pooled = {label["problem"]: pool(own) for label, own in groups(records, "problem")}
+    return figure_reliability({name: bins for name, bins in pooled.items() if bins is not None})

@@ -8,24 +8,31 @@ Tartarus (de Cothi et al. 2022): twelve mazes of 10×10 cells, all unknown to th
 layout over trials 1–10, so trials 5–10 are the purposeful ones (`--trials 1 4`: the others). Of these, N walks are
 drawn by seed without replacement (all of them where there are no more), a map is learned with the defaults of
 `sidestep learn`, and all cells are scored against the true map, beside the ranking of cells by how rarely the same
-walks visit them. Scores are averaged over the draws of a maze, then over mazes.
+walks visit them. Scores are averaged over the draws of a maze, then over mazes. A maze has few cells in each bin, and
+so a calibration error of some hundredths by chance; `pooled` is the error of the cells of all mazes of a draw together,
+averaged over draws. The picture has a reliability diagram for each number of walks.
 
 Records: `problem`, `walks` (asked for), `drawn`, `draw`, `method`, the scores of `sidestep.evaluation` (for all cells,
-and for relevant obstacles: those that a walk had to avoid), `seconds`, `converged`, `failure`, `moves`, `iterations`,
-`objective`, `largest_gradient`, and the fields of the configuration.
+and for relevant obstacles: those that a walk had to avoid), `reliability` (the bins of the calibration error, None
+where there is none), `seconds`, `converged`, `failure`, `moves`, `iterations`, `objective`, `largest_gradient`, and the
+fields of the configuration.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from benchmarks import SHARED_DATA, Record, changed, described, flat, groups, mean_over, note, option, print_table, warn
 from sidestep.baselines import BASELINES
 from sidestep.baselines.interface import ModelResult, model_result
 from sidestep.errors import InputError
+from sidestep.evaluation.reliability import Reliability
 from sidestep.evaluation.study import Problem, run_method
 from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map
@@ -34,11 +41,15 @@ from sidestep.maps.config import MapConfig
 from sidestep.maps.fit import demonstrations_of
 from sidestep.maps.learn import learn_map
 from sidestep.maps.selection import select_behavior
+from sidestep.plotting.reliability import figure_reliability
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Connectivity, Grid
 
 METHODS = ("behavior", *BASELINES)
-CELLS = {"AUC": "auc .3f", "average precision": "average_precision .3f"}
+POOLED = "pooled_calibration_error"
+CALIBRATION = {"calibration error": "calibration_error .3f", "pooled": f"{POOLED} .3f"}
+CALIBRATION |= {"Brier": "brier_score .3f", "log loss": "log_loss .3f"}
+CELLS = {"AUC": "auc .3f", "average precision": "average_precision .3f", **CALIBRATION}
 RELEVANT = {"AUC of relevant": "auc_relevant .3f", "average precision of relevant": "average_precision_relevant .3f"}
 
 
@@ -140,18 +151,42 @@ def learn_by(
             warn(f"{maze.name}, {name}: {record.failure or 'did not converge'}")
         seconds = "failed" if record.seconds is None else f"{record.seconds:.0f} s"
         note(f"{maze.name}, {len(maze.walks)} walks, {name}: {seconds}")
-        yield (
-            {**record.to_dict(), "moves": len(demonstrations), **fitted, **flat(config)},
-            record.result,
-            demonstrations,
-        )
+        bins = None if record.reliability is None else record.reliability.to_dict()
+        numbers = {"reliability": bins, "moves": len(demonstrations), **fitted, **flat(config)}
+        yield {**record.to_dict(), **numbers}, record.result, demonstrations
 
 
 def means(records: Sequence[Record], columns: Mapping[str, str], within: str | None) -> Iterator[Record]:
     """Yield a row for each number of walks and method, with the means of the columns."""
     for label, own in groups(records, "walks", "method"):
         keys = [column.partition(" ")[0] for column in columns.values()]
-        yield {**label, **{key: mean_over(own, key, within) for key in keys}}
+        yield {**label, **{key: pooled_error(own) if key == POOLED else mean_over(own, key, within) for key in keys}}
+
+
+def pooled_error(records: Sequence[Record]) -> float | None:
+    """Return the calibration error of the cells of all problems of a draw, a mean over draws; None without bins.
+
+    A problem with a single draw, such as all of its walks, belongs to every draw.
+    """
+    errors = []
+    for draw in dict.fromkeys(record["draw"] for record in records):
+        drawn = [one for _, own in groups(records, "problem") for one in own if len(own) == 1 or one["draw"] == draw]
+        errors.append({POOLED: pooled.calibration_error if (pooled := pool(drawn)) else None})
+    return mean_over(errors, POOLED)
+
+
+def pool(records: Sequence[Record]) -> Reliability | None:
+    """Return the reliability of the cells of all records together; None if none has any."""
+    bins = [record["reliability"] for record in records if record["reliability"] is not None]
+    parts = (Reliability(**{name: np.asarray(sums) for name, sums in each.items()}) for each in bins)
+    return reduce(add, parts) if bins else None
+
+
+def reliability_figure(records: Sequence[Record]) -> Figure:
+    """Return the reliability diagrams of `behavior`: for each number of walks, of all cells and draws together."""
+    behavior = [record for record in records if record["method"] == "behavior"]
+    pooled = {f"{label['walks']} walks": pool(own) for label, own in groups(behavior, "walks")}
+    return figure_reliability({name: bins for name, bins in pooled.items() if bins is not None})
 
 
 def show_means(records: Sequence[Record], title: str, columns: Mapping[str, str], within: str | None) -> None:
@@ -176,3 +211,9 @@ def show(records: Sequence[Record], options: Options) -> None:
     first, last = options.trials[0], options.trials[-1]
     title = f"{options.animal}, trials {first}–{last}, {described(changed(MapConfig(), options.set))}"
     show_means(records, title, CELLS | RELEVANT, within="problem")
+
+
+def draw(records: Sequence[Record], options: object = None) -> Figure:
+    """Return the reliability diagrams."""
+    del options
+    return reliability_figure(records)

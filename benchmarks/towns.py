@@ -10,7 +10,8 @@ known destinations, at costs of turns and links (`FEATURES`). These costs are fi
 all links open. A link that was driven is open; its prior says so. Scored are the links that no trip of the draw used:
 how well P(closed) ranks the closed ones above the open ones (average precision), beside the fraction of closed links
 among them (the value of any ranking by use, for all were used equally often) and two counts that know what the learner
-does not: how often the other direction was driven, and how often drivers came by. Over all links, P(closed) is beside
+does not: how often the other direction was driven, and how often drivers came by. Calibration error, Brier score and
+log loss of P(closed) are over the same links. Over all links, P(closed) is beside
 the ranking by how rarely links were used. Two more columns need no truth, and settings can be chosen by them: `later`
 is the AUC of ranking the links that none of `--held-out` other trips used above those that one of them did;
 `log_likelihood` is that of these other trips, in nats a turn. `likely` counts unused links with P(closed) above ½.
@@ -44,6 +45,7 @@ from sklearn.metrics import average_precision_score, precision_recall_curve, roc
 from benchmarks import SHARED_DATA, Record, changed, described, flat, groups, mean_over, note, option, print_table, warn
 from benchmarks.people import CELLS, draws, learn_by, read_mazes, show_means
 from sidestep.errors import InputError, NotConverged
+from sidestep.evaluation.reliability import brier_score, log_loss, reliability
 from sidestep.inference.fit import Fit, fit
 from sidestep.inference.optimizers import LBFGS, Rprop
 from sidestep.inference.priors import Normal
@@ -304,6 +306,9 @@ def score(town: Town, trips: Sequence[Trip], others: Sequence[Trip], config: Str
         "closed_fraction": fraction,
         **precision,
         "gain": precision["P(closed)"] - fraction,
+        "calibration_error": reliability(chances[unused], truth[unused]).calibration_error,
+        "brier_score": brier_score(chances[unused], truth[unused]),
+        "log_loss": log_loss(chances[unused], truth[unused]),
         "likely": int((chances[unused] > 0.5).sum()),
         "all_by_closed": average_precision_score(truth, chances),
         "all_by_use": average_precision_score(truth, -uses),
@@ -370,8 +375,8 @@ def show(records: Sequence[Record], options: Options) -> None:
         columns = {"moves": "moves .0f", "into buildings": "into_buildings .0f", **CELLS}
         show_means(records, described(changed(DRIVES, options.set)), columns, within="problem")
         return
-    keys = ("unused", "closed_fraction", "P(closed)", "gain", "came_by", "other_direction")
-    keys += ("all_by_closed", "all_by_use", "later", "log_likelihood")
+    keys = ("unused", "closed_fraction", "P(closed)", "gain", "calibration_error", "brier_score", "log_loss")
+    keys += ("came_by", "other_direction", "all_by_closed", "all_by_use", "later", "log_likelihood")
     rows = []
     for label, own in groups(records, "trips"):
         error = float(np.std([record["gain"] for record in own], ddof=1) / np.sqrt(len(own))) if len(own) > 1 else None

@@ -76,6 +76,8 @@ def test_compare_with_defaults_gives_every_method_every_score(office, compared):
         assert (scores["regret"] is None) == (scores["arriving_fraction"] < 1)
         for key in ("auc", "average_precision"):
             assert scores[key] is None if name == "cloning" else np.isfinite(scores[key])
+        for key in ("calibration_error", "brier_score", "log_loss"):
+            assert (scores[key] is None) == (name in ("visits", "costs", "cloning"))
     assert compared["data"]["walks"] == 32
     assert compared["data"]["heldout_walks"] == 8
     assert (office / "compared" / "compare.png").read_bytes().startswith(b"\x89PNG")

@@ -24,8 +24,8 @@ from sidestep.tabular.reward import Reward
 pytestmark = pytest.mark.slow
 
 SCORES = (
-    "auc", "average_precision", "auc_relevant", "mean_obstacle", "mean_free", "max_probability", "legal_fraction",
-    "excess_length",
+    "auc", "average_precision", "auc_relevant", "calibration_error", "brier_score", "log_loss", "mean_obstacle",
+    "mean_free", "max_probability", "legal_fraction", "excess_length",
 )  # fmt: skip
 LEARNED = ["blocked.npy", "learned.png", "map.pgm", "map.yaml", "summary.json", "visited.npy"]
 
@@ -119,8 +119,27 @@ def test_evaluate_adds_scores_to_the_summary(office, learned, tmp_path, capsys):
     assert set(together["planned_at_most"]) == {"starts", "goals", "executed"}
     assert together["auc"] == together["legal_fraction"] == 1
     assert together["mean_obstacle"] > 0.5 > 0.2 > together["mean_free"]
-    assert "1.000" in capsys.readouterr().out
-    assert written(learned) == LEARNED
+    printed = capsys.readouterr().out
+    assert "1.000" in printed
+    assert f"Brier score           │ {together['brier_score']:.3f}" in printed
+    assert f"reliability diagram and numbers in {learned}" in printed
+    assert written(learned) == sorted([*LEARNED, "reliability.png"])
+    with Image.open(tmp_path / "scores" / "reliability.png") as picture:
+        assert min(picture.size) > 300
+
+
+def test_evaluate_scores_the_calibration_of_unknown_cells(office, learned, tmp_path):
+    """The two cells that the map knew beforehand do not count."""
+    assert call("evaluate", learned, "--true-map", office / "true.yaml", "--out", tmp_path) == 0
+    blocked, unknown = np.load(learned / "blocked.npy"), load_map(learned).grid.known == Cell.UNKNOWN
+    right = np.where(WALL, blocked, 1 - blocked)[unknown]
+    assert right.size == 23
+    scores = summary(tmp_path)
+    assert scores["brier_score"] == pytest.approx(np.mean((1 - right) ** 2))
+    assert scores["log_loss"] == pytest.approx(-np.log(right).mean())
+    own = (10 * blocked[unknown]).astype(int)
+    bias = [abs((blocked[unknown] - WALL[unknown])[own == each].sum()) for each in range(10)]
+    assert scores["calibration_error"] == pytest.approx(sum(bias) / 23)
 
 
 def test_plan_writes_a_legal_path(office, learned, capsys):

@@ -36,8 +36,8 @@ _EXAMPLES: dict[Callable[..., None], str] = {
     experiments.reproduce: "sidestep reproduce --out figures",
     experiments.experiment: "sidestep experiment room --out room",
 }
-_DRAWING = (learn, plan)
-"""The commands that draw a single map."""
+_DRAWING = (learn, plan, evaluate)
+"""The commands that draw a single picture."""
 _INTERRUPTED = 130
 """The exit code that typer gives a keyboard interrupt."""
 

@@ -17,6 +17,9 @@ _HEADINGS = {
     "average_precision": "average\nprecision",
     "auc_relevant": "relevant\nAUC",
     "average_precision_relevant": "relevant\nprecision",
+    "calibration_error": "calibration\nerror",
+    "brier_score": "Brier\nscore",
+    "log_loss": "log loss\n(nats)",
     "mean_obstacle": "mean on\nobstacles",
     "mean_free": "mean on\nfree cells",
     "max_probability": "highest",
@@ -26,8 +29,12 @@ _HEADINGS = {
     "arriving_fraction": "arrive",
     "heldout_log_likelihood": "held-out\nnats a move",
 }
-_CELL_SCORES = "auc", "average_precision", "auc_relevant", "recall", "mean_obstacle", "mean_free", "max_probability"
-_MAP_SCORES = *_CELL_SCORES, "legal_fraction", "excess_length", "regret"
+_RANKING = "auc", "average_precision", "auc_relevant"
+_CALIBRATION = "calibration_error", "brier_score", "log_loss"
+_OTHERS = "recall", "mean_obstacle", "mean_free", "max_probability", "legal_fraction", "excess_length", "regret"
+_MAP_SCORES = *_RANKING, *_CALIBRATION, *_OTHERS
+ROW_SCORES = *_RANKING, *_OTHERS
+"""Those that fit in a row."""
 
 
 def print_lines(*lines: str) -> None:

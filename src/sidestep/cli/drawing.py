@@ -32,35 +32,36 @@ def prepared_drawing() -> Iterator[None]:
             _worker.cache_clear()
 
 
-def draw(name: str, path: Path, *arguments: Any) -> "Future[None]":
+def draw(name: str, path: Path, *arguments: Any, module: str = "maps") -> "Future[None]":
     """Begin to draw a figure and to save it as a PNG.
 
     Args:
-        name: The name of a function in `sidestep.plotting.maps` that returns a figure.
+        name: The name of a function that returns a figure.
         path: The file.
         *arguments: The arguments of that function.
+        module: The name of its module in `sidestep.plotting`.
 
     Returns:
         The drawing: its `result()` waits for the picture, and raises `InputError` where the file system refuses.
     """
     from concurrent.futures import ThreadPoolExecutor
 
-    return ThreadPoolExecutor(max_workers=1).submit(_draw, name, path, *arguments)
+    return ThreadPoolExecutor(max_workers=1).submit(_draw, module, name, path.absolute(), arguments)
 
 
-def _draw(name: str, path: Path, *arguments: Any) -> None:
+def _draw(*figure: Any) -> None:
     if "matplotlib" not in sys.modules:
         worker = _worker()
         _worker.cache_clear()
-        answer, _ = worker.communicate(pickle.dumps((name, path.absolute(), arguments)))
+        answer, _ = worker.communicate(pickle.dumps(figure))
         if worker.returncode == 0:
             error = pickle.loads(answer)
             if error is not None:
                 raise error
             return
-    from sidestep.plotting import maps
+    from sidestep.plotting.worker import save_figure
 
-    maps.save(getattr(maps, name)(*arguments), path)
+    save_figure(*figure)
 
 
 @cache

@@ -28,12 +28,13 @@ def demo(out: Folder = Path("sidestep-demo"), seed: Seed = 0) -> None:
 
 def reproduce(out: Folder = Path("sidestep-reproduce"), seed: Seed = 0) -> None:
     """Reproduce the paper's figures 1-4 as PNG, and the numbers behind them."""
-    from sidestep.cli.display import print_lines, print_scores, working
+    from sidestep.cli.display import ROW_SCORES, print_lines, print_scores, working
     from sidestep.experiments.reproduce import reproduce
 
     with working("starting") as notify:
         summary = reproduce(out, seed, notify)
-    print_scores({f"{name} {way}": scores for name, ways in summary["maps"].items() for way, scores in ways.items()})
+    rows = {f"{name} {way}": scores for name, ways in summary["maps"].items() for way, scores in ways.items()}
+    print_scores(rows, ROW_SCORES)
     print_lines(f"figures and numbers in {out}")
 
 

@@ -67,7 +67,7 @@ class Reliability:
         total = self.cells.sum()
         return float(np.abs(self.expected - self.obstacles).sum() / total) if total else None
 
-    def to_dict(self) -> dict[str, list[float]]:
+    def to_dict(self) -> dict[str, list[float] | list[int]]:
         """Return the three sums by name, as lists."""
         return {name: sums.tolist() for name, sums in vars(self).items()}
 
