@@ -7,44 +7,31 @@
 Maps are drawn by seed (`sidestep.worlds`). Agents walk from random cells to a few goals on best paths, ties at random;
 with `--beta` they are Boltzmann-rational instead. The learner knows no cell. A map is learned from each number of walks
 with the defaults of `sidestep learn`, and all cells are scored against the true map. The table has means over maps; the
-pooled calibration error is that of the cells of all maps together.
+pooled calibration error is that of the cells of all maps together, as in the picture's reliability diagrams.
 
 Weights of priors were explored with maps of the seeds 0 and 100 to 199, so none of these are judged here.
 
-Records: those of `people.py`, with `domain`, `walks`, `draw` (the seed of the map) and `reliability` (see
-`sidestep.evaluation.reliability`).
+Records: those of `people.py`, with `domain`; `draw` is the seed of the map.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
-from operator import add
 
-import numpy as np
+from matplotlib.figure import Figure
 
-from benchmarks import Record, changed, described, flat, groups, mean_over, option, print_table
-from benchmarks.people import CELLS, METHODS, Maze, learn_by
-from sidestep.evaluation.reliability import Reliability, map_reliability
+from benchmarks import Record, changed, described, flat, groups, option, print_table
+from benchmarks.people import CELLS, METHODS, Maze, learn_by, means, pool
 from sidestep.io.demonstrations import walks_from_trajectories
 from sidestep.maps.config import MapConfig, SimulationConfig
-from sidestep.tabular.grid import Cell, Grid
+from sidestep.plotting.reliability import figure_reliability
+from sidestep.tabular.grid import Grid
 from sidestep.worlds.apartments import apartment
 from sidestep.worlds.blocks import blocks
 from sidestep.worlds.offices import office
 from sidestep.worlds.walks import simulate_walks
 
 DOMAINS: Mapping[str, Callable[[int, int, int], Grid]] = {"offices": office, "apartments": apartment, "blocks": blocks}
-COLUMNS = {
-    "domain": "domain",
-    "walks": "walks",
-    "method": "method",
-    **dict(reversed(CELLS.items())),
-    "calibration error": "calibration_error .3f",
-    "pooled": "pooled .3f",
-    "Brier score": "brier_score .3f",
-    "log loss": "log_loss .3f",
-    "s": "seconds .1f",
-}
+SCORES = {**CELLS, "s": "seconds .1f"}
 
 
 @dataclass
@@ -73,28 +60,24 @@ def measure(options: Options) -> Iterator[Record]:
                 walking = SimulationConfig(count, options.goals, options.beta, seed=seed)
                 walks = walks_from_trajectories(*simulate_walks(truth, walking), truth)
                 maze = Maze(f"{domain} {seed}", truth.forget(), truth, walks)
-                for record, result, _ in learn_by(options.methods, maze, config):
-                    scored = result is not None and result.ranks_by_probability
-                    bins = map_reliability(result.ranking, truth, truth.known != Cell.UNKNOWN) if scored else None
-                    own = {"domain": domain, "walks": count, "draw": seed}
-                    yield {**own, **record, "reliability": None if bins is None else bins.to_dict()}
+                for record, *_ in learn_by(options.methods, maze, config):
+                    yield {"domain": domain, "walks": count, "draw": seed, **record}
 
 
 def show(records: Sequence[Record], options: Options) -> None:
     """Print the mean scores."""
+    rows = [{**label, **row} for label, own in groups(records, "domain") for row in means(own, SCORES, within=None)]
     size = f"{options.rows}×{options.columns}, {options.goals} goals"
     agents = "optimal agents" if options.beta is None else f"agents with β = {options.beta:g}"
-    rows = []
-    for label, own in groups(records, "domain", "walks", "method"):
-        keys = [column.partition(" ")[0] for column in COLUMNS.values()]
-        means = {key: mean_over(own, key) for key in keys if key not in label and key != "pooled"}
-        rows.append({**label, **means, "pooled": pooled_calibration_error(own)})
     title = f"{options.maps} maps of {size}, {agents}, {described(changed(MapConfig(), options.set))}"
-    print_table(title, rows, COLUMNS)
+    print_table(title, rows, {"domain": "domain", "walks": "walks", "method": "method", **SCORES})
 
 
-def pooled_calibration_error(records: Sequence[Record]) -> float | None:
-    """Return the calibration error of the cells of all records together; None if none has a reliability."""
-    bins = [record["reliability"] for record in records if record["reliability"] is not None]
-    sums = [Reliability(**{name: np.array(sum_) for name, sum_ in each.items()}) for each in bins]
-    return reduce(add, sums).calibration_error if sums else None
+def draw(records: Sequence[Record], options: object = None) -> Figure:
+    """Return the reliability diagrams of `behavior`, a curve for each domain and number of walks."""
+    del options
+    behavior = [record for record in records if record["method"] == "behavior"]
+    pooled = {
+        f"{each['domain']}, {each['walks']} walks": pool(own) for each, own in groups(behavior, "domain", "walks")
+    }
+    return figure_reliability({name: bins for name, bins in pooled.items() if bins is not None})

@@ -1,4 +1,4 @@
-"""Simulated domains, and the shapes of maps: small runs of both benchmarks, and what they add up."""
+"""Simulated domains, and the shapes of maps: small runs of both benchmarks, and banks of maps."""
 
 import json
 
@@ -7,17 +7,17 @@ import pytest
 from benchmarks.__main__ import main
 
 from benchmarks import domains, shapes
-from sidestep.evaluation.reliability import reliability
 from sidestep.io.maps import write_map
 from sidestep.tabular.grid import Grid
 
 
 @pytest.mark.slow
 def test_main_domains_writes_records_and_prints_a_row_a_domain(tmp_path, capsys):
-    file = tmp_path / "records.json"
+    file, picture = tmp_path / "records.json", tmp_path / "reliability.png"
     size = ["--rows", "10", "--columns", "10", "--maps", "2", "--walks", "8", "--goals", "2"]
     options = ["--domains", "apartments", "blocks", "--methods", "behavior", "visits", "--set", "max_iterations=2"]
-    assert main(["domains", *size, *options, "--json", str(file)]) == 0
+    assert main(["domains", *size, *options, "--json", str(file), "--picture", str(picture)]) == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
     records = json.loads(file.read_text())["records"]
     assert [(r["domain"], r["draw"], r["method"]) for r in records[:4]] == [
         ("apartments", draw, method) for draw in (1, 2) for method in ("behavior", "visits")
@@ -29,16 +29,6 @@ def test_main_domains_writes_records_and_prints_a_row_a_domain(tmp_path, capsys)
     printed = capsys.readouterr().out
     assert "2 maps of 10×10, 2 goals, optimal agents" in printed
     assert printed.count("apartments") == printed.count("blocks") == 2
-
-
-def test_pooled_calibration_error_is_that_of_all_cells_together():
-    random = np.random.default_rng(0)
-    maps = [(random.random(30), random.random(30) < 0.5) for _ in range(3)]
-    records = [{"reliability": reliability(*own).to_dict()} for own in maps]
-    together = reliability(*(np.concatenate(part) for part in zip(*maps, strict=True)))
-    pooled = domains.pooled_calibration_error([*records, {"reliability": None}])
-    assert pooled == pytest.approx(together.calibration_error)
-    assert domains.pooled_calibration_error([{"reliability": None}]) is None
 
 
 def test_coarsened_squares_are_occupied_if_any_cell_is_and_unknown_if_most_are():

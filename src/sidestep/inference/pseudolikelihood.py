@@ -124,8 +124,8 @@ def closing_changes(closed: Bool[np.ndarray, "rows columns"]) -> Int[np.ndarray,
 
     up, down, left, right = STEPS[:4]
     lines = ((at(left) & at(right)) | (at(up) & at(down))).astype(np.int64)
-    pairs = sum(at(side).astype(np.int64) for side in STEPS[:4])
-    isolated = (pairs == 0).astype(np.int64)
+    pairs = np.sum([at(side) for side in STEPS[:4]], axis=0)
+    isolated = np.where(pairs == 0, 1, 0)
     blocks = np.zeros_like(lines)
     for side in STEPS[:4]:
         # what closing a cell does to a closed neighbor

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Int
 from numpy.random import Generator
-from scipy.ndimage import binary_dilation, label
+from scipy import ndimage
 
 from sidestep.errors import check
 from sidestep.tabular.grid import Cell, Connectivity, Grid
@@ -89,5 +89,7 @@ def _fits(occupied: Bool[np.ndarray, "rows columns"], places: Int[np.ndarray, "c
         return False
     own = np.zeros_like(occupied)
     own[tuple(places.T)] = True
-    near = own if touching else binary_dilation(own, np.ones((3, 3), dtype=bool))
-    return not (occupied & near).any() and label(~(occupied | own))[1] == 1
+    near = own if touching else ndimage.binary_dilation(own, np.ones((3, 3), dtype=bool))
+    parts = np.zeros(occupied.shape, dtype=np.int32)
+    ndimage.label(~(occupied | own), output=parts)
+    return not (occupied & near).any() and int(parts.max()) == 1
