@@ -25,6 +25,8 @@ BENCHMARKS = {
     "enumeration": "the sampler and the mean field against the exact posterior of small worlds",
     "people": "walls learned from real walks in the twelve Tartarus mazes",
     "baselines": "all methods of `sidestep compare`: walls, held-out actions, robots with new goals",
+    "domains": "simulated offices, apartments and blocks, all of them learned: how well, and how well calibrated",
+    "shapes": "the shape of maps: weights of a binary Markov random field, fitted to true maps",
     "towns": "one-way streets from taxi trips in Shanghai, buildings from drives in MAGELLAN's towns",
 }
 

@@ -1,14 +1,17 @@
-"""The paper's grids cell by cell, and properties of random offices and rooms."""
+"""The paper's grids cell by cell, and properties of random offices, apartments, blocks and rooms."""
 
 import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from scipy import ndimage
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from sidestep.errors import InputError
 from sidestep.tabular.graph import walkable_graph
 from sidestep.tabular.grid import Cell, Grid
+from sidestep.worlds.apartments import apartment
+from sidestep.worlds.blocks import blocks, polyomino
 from sidestep.worlds.grids import WORLDS, block, wall
 from sidestep.worlds.offices import office, places
 from sidestep.worlds.rooms import rooms_in_a_row
@@ -94,6 +97,119 @@ def test_office_repeats_by_seed():
 def test_office_of_a_few_cells_is_refused(shape):
     with pytest.raises(InputError, match="at least 10 rows and 8 columns"):
         office(*shape, seed=0)
+
+
+@given(rows=st.integers(5, 60), columns=st.integers(5, 60), seed=st.integers(0, 2**32 - 1))
+@example(rows=5, columns=5, seed=0)
+@example(rows=7, columns=100, seed=0)
+def test_apartment_of_any_size_is_walled_in_and_connected_by_doors(rows, columns, seed):
+    grid = apartment(rows, columns, seed=seed)
+    free = grid.known == Cell.FREE
+    assert grid.shape == (rows, columns)
+    assert np.isin(grid.known, [Cell.FREE, Cell.OCCUPIED]).all()
+    assert not free[[0, -1]].any()
+    assert not free[:, [0, -1]].any()
+    assert rooms_of(grid) == 1
+    # walls are one cell thick, so there is no square of four
+    squares = ~(free[1:, 1:] | free[1:, :-1] | free[:-1, 1:] | free[:-1, :-1])
+    assert not squares.any()
+    rooms, count, doors = separate_rooms(grid)
+    assert count == doors + 1
+    for room in range(1, count + 1):
+        inside = np.argwhere(rooms == room)
+        assert (np.ptp(inside, axis=0) + 1).prod() == len(inside), "rooms are rectangles"
+        assert min(np.ptp(inside, axis=0) + 1) >= min(3, rows - 2, columns - 2)
+
+
+def components(cells, corners=False):
+    """Return the number of the connected part that each cell belongs to, from 1; 0 where there is none."""
+    labels = np.zeros(cells.shape, dtype=np.int32)
+    ndimage.label(cells, np.ones((3, 3)) if corners else None, output=labels)
+    return labels
+
+
+def separate_rooms(grid):
+    """Return the number of the room of each cell, of rooms, and of doors: free cells between two walls."""
+    free = grid.known == Cell.FREE
+    wall = np.pad(~free, 1, constant_values=True)
+    vertical = wall[2:, 1:-1] & wall[:-2, 1:-1]
+    horizontal = wall[1:-1, 2:] & wall[1:-1, :-2]
+    doors = free & (vertical ^ horizontal)
+    rooms = components(free & ~doors)
+    return rooms, rooms.max(), doors.sum()
+
+
+def test_apartment_of_20_by_30_has_a_dozen_rooms():
+    for seed in range(25):
+        grid = apartment(20, 30, seed=seed)
+        assert 8 <= separate_rooms(grid)[1] <= 28
+        assert 0.3 < grid.known.mean() < 0.45
+
+
+@given(
+    rows=st.integers(3, 14),
+    columns=st.integers(3, 14),
+    seed=st.integers(0, 2**32 - 1),
+    density=st.sampled_from([0.1, 0.2, 0.9]),
+    sizes=st.sampled_from([(2, 5), (1, 1), (4, 4)]),
+)
+def test_blocks_stand_apart_and_free_cells_are_connected(rows, columns, seed, density, sizes):
+    grid = blocks(rows, columns, seed, density, sizes)
+    assert grid.shape == (rows, columns)
+    assert rooms_of(grid) == 1
+    occupied = grid.known == Cell.OCCUPIED
+    assert occupied.sum() < density * grid.size + sizes[1]
+    # connected by sides alone as by corners: no two touch
+    obstacles = components(occupied)
+    assert obstacles.max() == components(occupied, corners=True).max()
+    cells = np.bincount(obstacles.ravel())[1:]
+    assert ((cells >= sizes[0]) & (cells <= sizes[1])).all()
+
+
+def test_blocks_have_the_density_and_repeat_by_seed():
+    for seed in range(2):
+        assert blocks(20, 30, seed).known.mean() == pytest.approx(0.2, abs=5 / 600)
+    first, dense = blocks(20, 30, 3), blocks(20, 30, 3, density=0.4, touching=True)
+    np.testing.assert_array_equal(first.known, blocks(20, 30, 3).known)
+    assert (first.known != blocks(20, 30, 4).known).any()
+    assert (first.connectivity, blocks(20, 30, 3, connectivity=8).connectivity) == (4, 8)
+    assert dense.known.mean() == pytest.approx(0.4, abs=5 / 600)
+    assert rooms_of(dense) == 1
+    # some touch
+    assert np.bincount(components(dense.known).ravel())[1:].max() > 5
+
+
+def test_apartment_repeats_by_seed():
+    first = apartment(20, 30, seed=3)
+    np.testing.assert_array_equal(first.known, apartment(20, 30, seed=3).known)
+    assert (first.known != apartment(20, 30, seed=4).known).any()
+    assert (first.connectivity, apartment(20, 30, 3, connectivity=8).connectivity) == (4, 8)
+
+
+def test_polyomino_of_four_cells_has_every_shape_of_a_tetromino():
+    """Five up to rotations and reflections: I, L, O, S, T."""
+    random, shapes = np.random.default_rng(0), set()
+    for _ in range(300):
+        cells = polyomino(4, random)
+        assert len(np.unique(cells, axis=0)) == 4
+        turned = [cells @ turn for turn in ROTATIONS]
+        shapes.add(min(tuple(sorted(map(tuple, (each - each.min(axis=0)).tolist()))) for each in turned))
+    assert len(shapes) == 5
+
+
+_TURN, _MIRROR = np.array([[0, 1], [-1, 0]]), np.diag([1, -1])
+ROTATIONS = [np.linalg.matrix_power(_TURN, k) @ mirror for k in range(4) for mirror in (np.eye(2, dtype=int), _MIRROR)]
+
+
+@pytest.mark.parametrize(("call", "match"), [
+    (lambda: apartment(4, 30, seed=0), "at least 5 rows and 5 columns, found 4 and 30"),
+    (lambda: blocks(2, 30, seed=0), "at least 3 rows and 3 columns, found 2 and 30"),
+    (lambda: blocks(9, 9, seed=0, density=1.0), "'density': expected a number above 0 and below 1, found 1.0"),
+    (lambda: blocks(9, 9, seed=0, sizes=(5, 2)), r"'sizes': expected two numbers in order, at least 1, found \(5, 2\)"),
+])  # fmt: skip
+def test_worlds_of_impossible_sizes_are_refused(call, match):
+    with pytest.raises(InputError, match=match):
+        call()
 
 
 def test_places_are_free_different_and_distant():
