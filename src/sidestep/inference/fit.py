@@ -39,6 +39,7 @@ class Fit(eqx.Module, Generic[Model]):
     Attributes:
         model: The transition model at the maximum.
         behavior: The behavior model, with its learned parameters.
+        problem: What was maximized: demonstrations, prior, options; with the model and behavior where the fit started.
         history: The progress before the first and after every iteration.
         sweeps: The number of sweeps of each task's solve under the learned model.
         residual: The residual of each task's solve.
@@ -61,6 +62,7 @@ class Fit(eqx.Module, Generic[Model]):
 
     model: Model
     behavior: BehaviorModel
+    problem: Problem
     history: tuple[Progress, ...] = eqx.field(static=True)
     sweeps: Int[Array, " tasks"]
     residual: Float[Array, " tasks"]
@@ -171,7 +173,8 @@ def fit(
     learned = model.with_parameters(best.parameters.model), behavior.with_parameters(best.parameters.behavior)
     sweeps, residual, task_converged = _of_all_tasks(best.solves, count)
     converged = best.status is Status.CONVERGED and bool(np.asarray(task_converged).all())
-    return Fit(*learned, best.history, sweeps, residual, task_converged, best.status, converged, best.message)
+    status = best.status, converged, best.message
+    return Fit(*learned, problem, best.history, sweeps, residual, task_converged, *status)
 
 
 def _of_all_tasks(batches: list[SolveSummary], tasks: int) -> list[Array]:
