@@ -28,7 +28,7 @@ START = ss.Behavior(ss.BoltzmannAverage(), 3.0, 0.05)
 """Where a fit starts, and the middle of the prior of behavior."""
 PRIOR = ss.Normal(0.0, 4.0)
 """Of the logits."""
-NUMBERS = "ln β", "logit of the lapse", "logit of a step on", "logit of a step back", "logit of two at once"
+NUMBERS = "logit of a step on", "logit of a step back", "logit of two at once", "ln β", "logit of the lapse"
 LEAST, MOST = 0.90, 0.99
 """What is asked of the coverage of 95 % intervals."""
 
@@ -58,20 +58,9 @@ def tasks() -> list[ss.Task]:
     return [ss.task(-np.ones((STATES, len(MOVES) + 1)), 0.95, terminal) for terminal in terminals]
 
 
-def truth() -> np.ndarray:
-    """Return the true numbers in the order of `NUMBERS`, unconstrained."""
-    return np.array([np.log(BETA), np.log(LAPSE / (1 - LAPSE)), *LOGITS])
-
-
-def vector(parameters: ss.Parameters) -> np.ndarray:
-    """Return learned numbers in the order of `NUMBERS`."""
-    own = parameters.behavior
-    return np.concatenate([np.ravel(part) for part in (own.log_beta, own.logit_lapse, parameters.model)])
-
-
-def ends(interval: ss.NaturalScale) -> np.ndarray:
-    """Return the ends of intervals in the order of `NUMBERS`, on their natural scales."""
-    return np.concatenate([np.ravel(part) for part in (interval.beta, interval.lapse, interval.model)])
+def vector(tree: ss.Parameters | ss.NaturalScale) -> np.ndarray:
+    """Return numbers in the order of `NUMBERS`."""
+    return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(tree)])
 
 
 def measure(options: Options) -> Iterator[Record]:
@@ -86,14 +75,14 @@ def measure(options: Options) -> Iterator[Record]:
         estimates.append(vector(result.parameters))
         errors.append(vector(result.standard_errors))
         for into, interval in zip((lower, upper), result.interval(options.level), strict=True):
-            into.append(ends(interval))
-    true = np.array([BETA, LAPSE, *LOGITS])
-    below, above = (true < np.array(lower)).mean(axis=0), (true > np.array(upper)).mean(axis=0)
+            into.append(vector(interval))
+    natural, true = np.array([*LOGITS, BETA, LAPSE]), np.array([*LOGITS, np.log(BETA), np.log(LAPSE / (1 - LAPSE))])
+    below, above = (natural < np.array(lower)).mean(axis=0), (natural > np.array(upper)).mean(axis=0)
     columns = 1 - below - above, below, above, np.mean(estimates, axis=0), np.std(estimates, axis=0)
     names = "covered", "below", "above", "mean", "spread"
     for index, number in enumerate(NUMBERS):
         own = {name: float(column[index]) for name, column in zip(names, columns, strict=True)}
-        yield {"number": number, "truth": float(truth()[index]), **own, "error": float(np.mean(errors, axis=0)[index])}
+        yield {"number": number, "truth": float(true[index]), **own, "error": float(np.mean(errors, axis=0)[index])}
 
 
 def show(records: Sequence[Record], options: Options) -> None:

@@ -81,7 +81,7 @@ from .inference.calibration import (
     score_statistics as score_statistics,
 )
 from .inference.checkpoints import Checkpoint as Checkpoint
-from .inference.fit import Fit as Fit, fit as fit
+from .inference.fit import Estimate as Estimate, Fit as Fit, fit as fit
 from .inference.maximize import Progress as Progress, Status as Status
 from .inference.goals import GoalFit as GoalFit, fit_goals as fit_goals, goal_posterior as goal_posterior
 from .inference.laplace import (

@@ -16,6 +16,7 @@ the natural scale. So intervals are computed there, and their ends mapped.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -26,8 +27,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from sidestep._typing import Tree
-from sidestep.errors import InputError, NotConverged, check, check_count
-from sidestep.inference.fit import Fit
+from sidestep.errors import InputError, NotConverged, SidestepError, check, check_count
+from sidestep.inference.fit import Estimate, Fit
 from sidestep.inference.information import Information
 from sidestep.inference.objective import Parameters
 
@@ -40,6 +41,8 @@ _BOUND = 1e-6
 """The least distance of a learned lapse or discount from 0 and 1."""
 _NAMED = 3
 """The number of parameters that an error message names."""
+_SMALL = 200_000
+"""The most parameters × states × tasks up to which a summary has standard errors: they take about a second."""
 
 
 class NaturalScale(NamedTuple):
@@ -208,7 +211,7 @@ def laplace(fit: Fit[Any], *, dense: int = 500, rank: int = 200) -> Laplace:
         >>> grid = ss.Grid.unknown(rows=1, columns=3)
         >>> shown = ss.gather([ss.Trajectory(np.array([0, 1, 2]), np.array([3, 3]), task=0)], [ss.reach(grid, 2)])
         >>> learned = ss.fit(ss.ObstacleGrid(grid, 0.0), shown, ss.Behavior(ss.HardMax()), terms=("transitions",))
-        >>> [round(float(error), 2) for error in laplace(learned).standard_errors.model]  # √2 where nobody went
+        >>> [round(float(error), 2) for error in laplace(learned).standard_errors.model]  # √2 where no one went
         [1.41, 1.26, 1.26]
 
     References:
@@ -229,6 +232,38 @@ def laplace(fit: Fit[Any], *, dense: int = 500, rank: int = 200) -> Laplace:
     _check_determined(result)
     _check_maximum(fit, result, information.gradient)
     return result
+
+
+def behavior_estimates(fit: Fit[Any]) -> dict[str, Estimate]:
+    """Return β (of a typical person), lapse and discount where they were learned, with standard errors.
+
+    Args:
+        fit: The fit.
+
+    Returns:
+        The estimates by name. They have no error where the problem is not small, by the product of its parameters,
+        states and tasks, and where the posterior has no normal approximation.
+    """
+    parameters = Parameters(fit.model.parameters, fit.behavior.parameters)
+    numbers, count = _typical(parameters), sum(leaf.size for leaf in jax.tree.leaves(parameters))
+    errors: list[float | None] = [None] * len(numbers)
+    if numbers and count * fit.problem.demonstrations.tasks.terminal.size <= _SMALL:
+        with suppress(SidestepError):
+            normal = laplace(fit, dense=count)
+            errors = normal.error_of(lambda point: jnp.stack([*_typical(point).values()])).tolist()
+    return {name: Estimate(float(numbers[name]), error) for name, error in zip(numbers, errors, strict=True)}
+
+
+def _typical(parameters: Parameters) -> dict[str, Array]:
+    """Return the learned numbers of a typical person's behavior."""
+    own, numbers = parameters.behavior, {}
+    if own.log_beta is not None:
+        numbers["beta"] = jnp.exp(own.log_beta.mean())
+    if own.logit_lapse is not None:
+        numbers["lapse"] = jax.nn.sigmoid(own.logit_lapse)
+    if own.logit_discount is not None:
+        numbers["discount"] = jax.nn.sigmoid(own.logit_discount)
+    return numbers
 
 
 def _whole(information: Information) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
@@ -259,12 +294,12 @@ def _low_rank(information: Information, rank: int) -> tuple[np.ndarray, np.ndarr
     operator = LinearOperator((size, size), matvec=beside_prior, dtype=np.float64)  # pyright: ignore[reportCallIssue]
     start = np.random.default_rng(0).normal(size=size)
     try:
-        found, vectors = eigsh(operator, min(rank, size - 1), which="LM", v0=start)
+        largest, vectors = eigsh(operator, min(rank, size - 1), which="LM", v0=start)
     except ArpackNoConvergence as error:
         raise NotConverged(
             f"the information's eigenvalues did not converge: a smaller rank may help ({error})"
         ) from error
-    return scale, vectors, 1 + found, float(np.abs(found).min())
+    return scale, vectors, 1 + largest, float(np.abs(largest).min())
 
 
 def _check_bounds(parameters: Parameters) -> None:
