@@ -21,9 +21,10 @@ from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.behavior_model import behavior_model
 from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.graph import graph
+from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import FIXED, ObstacleGrid, TabularModel, TiedModel
 from sidestep.tabular.solve import SolveOptions
-from sidestep.tabular.tasks import task
+from sidestep.tabular.tasks import reach, task
 
 VARIANCE, SUCCESSES, FAILURES = 4.0, 7, 3
 BEHAVIOR = Behavior(BoltzmannAverage(), 5.0)
@@ -83,18 +84,26 @@ def test_information_is_the_difference_of_gradients():
 
 
 @pytest.mark.slow
-def test_laplace_of_low_rank_is_that_of_the_whole():
+@pytest.mark.parametrize("rank", [3, 20])
+def test_laplace_of_low_rank_has_the_largest_parts_and_bounds_the_others(rank):
     result = fit_of_maze()
-    whole, low = laplace(result), laplace(result, dense=0)
-    assert low.neglected < 1e-3
-    np.testing.assert_allclose(low.covariance, whole.covariance, atol=2e-3)
-    for one, other in zip(*(jax.tree.leaves(each.standard_errors) for each in (whole, low)), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-3)
-    crude = laplace(result, dense=0, rank=3)
-    assert crude.vectors.shape[1] == 3
-    assert crude.neglected > low.neglected
-    wrong = np.diag(crude.covariance) / np.diag(whole.covariance) - 1
-    assert np.abs(wrong).max() <= crude.neglected
+    whole, low = laplace(result).covariance, laplace(result, dense=0, rank=rank)
+    parts = np.linalg.eigvalsh(low.scale[:, None] * np.linalg.inv(whole) * low.scale)
+    largest = np.sort(np.abs(parts - 1))[::-1][:rank]
+    np.testing.assert_allclose(np.sort(np.abs(low.eigenvalues - 1))[::-1], largest, rtol=1e-5)
+    np.testing.assert_allclose(low.neglected, largest[-1], rtol=1e-5)
+    assert np.abs(np.diag(low.covariance) / np.diag(whole) - 1).max() <= low.neglected
+
+
+def test_laplace_of_low_rank_is_that_of_the_whole_where_nothing_is_neglected():
+    grid = Grid.unknown(1, 9)  # of which three cells are entered
+    walk = Trajectory(np.arange(4), np.array([3, 3, 3]), task=0)
+    shown = gather([walk], [reach(grid, 3)])
+    result = fit(ObstacleGrid(grid), shown, BEHAVIOR, prior=Normal(0.0, VARIANCE), terms=("transitions",))
+    whole, low = laplace(result), laplace(result, dense=0, rank=5)
+    assert low.neglected < 1e-9
+    np.testing.assert_allclose(low.covariance, whole.covariance, atol=1e-9)
+    np.testing.assert_allclose(low.standard_errors.model, whole.standard_errors.model, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -170,7 +179,9 @@ def test_laplace_of_the_fixed_policy_gradient_raises():
         laplace(result)
 
 
-@pytest.mark.parametrize(("call", "field"), [(lambda n: n.interval(1.0), "level"), (lambda n: n.sample(None, 0), "n")])
+@pytest.mark.parametrize(
+    ("call", "field"), [(lambda n: n.interval(1.0), "level"), (lambda n: n.sample(jax.random.key(0), 0), "n")]
+)
 def test_laplace_with_wrong_numbers_raises(call, field):
     with pytest.raises(InputError, match=f"'{field}'"):
         call(laplace(fit_of_coin()))

@@ -92,7 +92,7 @@ class Laplace:
         vectors: V, in its columns.
         eigenvalues: M: the information in the direction of each vector, in units of `scale`.
         neglected: A bound of |λ| of what is left out; 0 where the information is complete. A variance is wrong by at
-            most this part of it.
+            most this fraction of it.
     """
 
     parameters: Parameters
@@ -212,7 +212,7 @@ def laplace(fit: Fit[Any], *, dense: int = 500, rank: int = 200) -> Laplace:
         >>> shown = ss.gather([ss.Trajectory(np.array([0, 1, 2]), np.array([3, 3]), task=0)], [ss.reach(grid, 2)])
         >>> learned = ss.fit(ss.ObstacleGrid(grid, 0.0), shown, ss.Behavior(ss.HardMax()), terms=("transitions",))
         >>> [round(float(error), 2) for error in laplace(learned).standard_errors.model]  # √2 where no one went
-        [1.41, 1.26, 1.26]
+        [1.41, 1.3, 1.3]
 
     References:
         Tierney and Kadane, "Accurate approximations for posterior moments and marginal densities" (1986). Bui-Thanh,

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sidestep._typing import Tree
 from sidestep.errors import check_count
@@ -49,7 +49,7 @@ class Draws:
     parameters: Parameters
     split_r_hat: Parameters
     effective_size: Parameters
-    divergent: Float[np.ndarray, "chains draws"]
+    divergent: Bool[np.ndarray, "chains draws"]
     acceptance: Float[np.ndarray, "chains draws"]
 
     def to_arviz(self) -> "InferenceData":
