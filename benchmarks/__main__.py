@@ -21,6 +21,7 @@ BENCHMARKS = {
     "gradients": "a gradient by the adjoint, beside other ways to it",
     "planning": "plans and soft values, beside other planners",
     "fits": "large maps end to end: hide walls, simulate walks, learn, score",
+    "intervals": "how often 95 % intervals of β, a lapse and three logits cover the truth",
     "rollouts": "roll-outs of continuous worlds: speed, and the noise of gradient estimators",
     "enumeration": "the sampler and the mean field against the exact posterior of small worlds",
     "people": "walls learned from real walks in the twelve Tartarus mazes",

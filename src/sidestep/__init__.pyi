@@ -81,10 +81,17 @@ from .inference.calibration import (
     score_statistics as score_statistics,
 )
 from .inference.checkpoints import Checkpoint as Checkpoint
-from .inference.fit import Fit as Fit, fit as fit
+from .inference.fit import Estimate as Estimate, Fit as Fit, fit as fit
 from .inference.maximize import Progress as Progress, Status as Status
 from .inference.goals import GoalFit as GoalFit, fit_goals as fit_goals, goal_posterior as goal_posterior
-from .inference.objective import tasks_mesh as tasks_mesh
+from .inference.laplace import (
+    Laplace as Laplace,
+    NaturalScale as NaturalScale,
+    laplace as laplace,
+    natural_scale as natural_scale,
+)
+from .inference.nuts import Draws as Draws, sample as sample
+from .inference.objective import Parameters as Parameters, tasks_mesh as tasks_mesh
 from .inference.optimizers import LBFGS as LBFGS, Adam as Adam, Optimizer as Optimizer, Rprop as Rprop
 from .inference.priors import (
     FreeCellEvidence as FreeCellEvidence,

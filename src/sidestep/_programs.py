@@ -86,7 +86,9 @@ def _load(path: Path) -> _Program | None:
     from jax.experimental.serialize_executable import deserialize_and_load
 
     try:
-        program, skeleton = pickle.loads(content)
+        program, skeleton, calls_lapack = pickle.loads(content)
+        if calls_lapack:
+            _register_lapack()
         return deserialize_and_load(*program), jax.tree.structure(skeleton)
     except (JaxRuntimeError, ValueError, AttributeError, ImportError, pickle.UnpicklingError):
         return None
@@ -126,7 +128,20 @@ def _keep(path: Path, program: Any, skeleton: Any) -> None:
     from jax.experimental.serialize_executable import serialize
 
     with suppress(AttributeError, JaxRuntimeError, NotImplementedError, TypeError, ValueError, pickle.PicklingError):
-        _cache.keep_entry(path, pickle.dumps((serialize(program), skeleton)))
+        calls_lapack = "lapack_" in program.as_text()
+        _cache.keep_entry(path, pickle.dumps((serialize(program), skeleton, calls_lapack)))
+
+
+@cache
+def _register_lapack() -> None:
+    """Register LAPACK's functions in this process.
+
+    JAX does so when it lowers the first of them. A program that is loaded before would call a null pointer.
+    """
+    import jax
+    from jax.scipy.linalg import lu_factor
+
+    jax.jit(lu_factor).lower(jax.ShapeDtypeStruct((1, 1), "float32"))
 
 
 @cache

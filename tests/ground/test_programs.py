@@ -28,6 +28,10 @@ def calls_back(values):
     print("traces the callback")
     return jax.pure_callback(np.sin, jax.ShapeDtypeStruct(values.shape, values.dtype), values)
 @keep_program
+def inverse(matrix):
+    print("traces an inverse")
+    return jnp.linalg.inv(matrix)  # by LAPACK, whose functions have to be registered
+@keep_program
 def total(result):  # of a class that no key knows
     print("traces a class")
     return result.total
@@ -36,9 +40,10 @@ keep_compiled_code()
 for values in (np.arange(3.0), np.arange(3.0) + 1, np.arange(4.0)):
     result = scaled(values, 2, "a")
     print(float(total(result)), list(result.parts), float(calls_back(jnp.ones(3))[0]) == float(np.sin(np.float32(1))))
+print(float(inverse(np.eye(2) / 2)[0, 0]))
 print(float(jax.grad(lambda x: scaled(x, 3, "b").total)(jnp.ones(2))[0]))
 """
-NUMBERS = ["6.0 ['a'] True", "12.0 ['a'] True", "12.0 ['a'] True", "3.0"]
+NUMBERS = ["6.0 ['a'] True", "12.0 ['a'] True", "12.0 ['a'] True", "2.0", "3.0"]
 
 
 def run(folder):
@@ -63,7 +68,7 @@ def folder(tmp_path_factory):
 def test_keep_program_in_a_second_process_traces_nothing_but_callbacks(folder):
     # a gradient is traced as a whole
     assert set(run(folder)) == {"traces the callback", "traces b", "traces a class"}
-    assert len(list((folder / "cache" / "programs").iterdir())) == 2
+    assert len(list((folder / "cache" / "programs").iterdir())) == 3
 
 
 def test_keep_program_with_damaged_entries_replaces_them(folder):

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from math import floor, log10
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -46,6 +47,21 @@ def print_lines(*lines: str) -> None:
     """
     for line in lines:
         print(line)
+
+
+def with_error(estimate: float, error: float | None) -> str:
+    """Return an estimate with its standard error, to the first digit of the error, or two where that is a 1.
+
+    Args:
+        estimate: The number.
+        error: Its standard error; None where it is unknown.
+    """
+    if not error:
+        return f"{estimate:.3g}"
+    rounded = float(f"{error:.1e}")
+    exponent = floor(log10(rounded))
+    digits = max(0, (1 if rounded < 2 * 10**exponent else 0) - exponent)
+    return f"{estimate:.{digits}f} ± {error:.{digits}f}"
 
 
 def print_notes(*lines: str) -> None:

@@ -9,11 +9,13 @@ if TYPE_CHECKING:
 
     from sidestep.maps.learned_map import LearnedMap
 
+_SYMBOLS = {"beta": "β", "discount": "γ"}
+
 
 @with_learn_options
 def learn(walks: Walks, map_file: MapFile, out: Folder, options: LearnOptions) -> None:
     """Learn a map from a table of walks: map.yaml, map.pgm, blocked.npy, summary.json, learned.png."""
-    from sidestep.cli.display import fit_progress, print_lines, print_notes
+    from sidestep.cli.display import fit_progress, print_lines, print_notes, with_error
     from sidestep.io.walks import read_walks
     from sidestep.maps.fit import max_iterations
     from sidestep.maps.learn import learn_map
@@ -34,6 +36,8 @@ def learn(walks: Walks, map_file: MapFile, out: Folder, options: LearnOptions) -
     print_lines(*(learning.selection.reasons if learning.selection else ()))
     print_notes(*(f"note: {note}" for note in learning.notes))
     print_lines(learning.fit.description)
+    for name, number in learning.fit.learned_behavior.items():
+        print_lines(f"{_SYMBOLS.get(name, name)} {with_error(*number)}")
     if not learned.converged:
         print_notes(f"warning: {learning.fit.status.value}: {learning.fit.status.advice or learning.fit.message}")
     print_lines(f"learned map in {out}")

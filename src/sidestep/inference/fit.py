@@ -7,8 +7,9 @@ is not the gradient of any function, so a line search is impossible: use `Adam` 
 """
 
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -33,12 +34,29 @@ from sidestep.tabular.solve import SolveOptions, check_proper
 Model = TypeVar("Model", bound=TransitionModel)
 
 
+class Estimate(NamedTuple):
+    """A learned number.
+
+    Attributes:
+        estimate: The number at the maximum.
+        standard_error: Its standard error; None where it is unknown.
+
+    Example:
+        >>> Estimate(5.2, 0.4).standard_error
+        0.4
+    """
+
+    estimate: float
+    standard_error: float | None
+
+
 class Fit(eqx.Module, Generic[Model]):
     """A learned transition model.
 
     Attributes:
         model: The transition model at the maximum.
         behavior: The behavior model, with its learned parameters.
+        problem: What was maximized: demonstrations, prior, options; with the model and behavior where the fit started.
         history: The progress before the first and after every iteration.
         sweeps: The number of sweeps of each task's solve under the learned model.
         residual: The residual of each task's solve.
@@ -61,6 +79,7 @@ class Fit(eqx.Module, Generic[Model]):
 
     model: Model
     behavior: BehaviorModel
+    problem: Problem
     history: tuple[Progress, ...] = eqx.field(static=True)
     sweeps: Int[Array, " tasks"]
     residual: Float[Array, " tasks"]
@@ -79,13 +98,29 @@ class Fit(eqx.Module, Generic[Model]):
         """Return the objective and how the optimization ended as text."""
         return f"objective {self.final.objective:.4f} after {self.final.iteration} iterations; {self.message}"
 
+    @cached_property
+    def learned_behavior(self) -> dict[str, Estimate]:
+        """Return `beta` (of a typical person), `lapse` and `discount`, those of them that were learned.
+
+        There is no standard error where the problem is not small (`laplace` takes longer there), and where the
+        posterior has no normal approximation.
+        """
+        if not jax.tree.leaves(self.behavior.parameters):
+            return {}
+        from sidestep.inference.laplace import behavior_estimates
+
+        return behavior_estimates(self)
+
     def summary(self) -> dict[str, Any]:
         """Return the fit's numbers: the objective and its parts in nats, and how the optimizer and the tasks ended.
+
+        Where β, lapse or discount were learned, `learned_behavior` has them with their standard errors.
 
         Returns:
             Plain numbers and texts.
         """
         final, solves = self.final, (self.sweeps, self.residual, self.task_converged)
+        learned = {name: number._asdict() for name, number in self.learned_behavior.items()}
         of_tasks = zip(*(np.asarray(each).tolist() for each in solves), strict=True)
         return {
             "objective": final.objective,
@@ -96,6 +131,7 @@ class Fit(eqx.Module, Generic[Model]):
             "iterations": final.iteration,
             "converged": self.converged,
             "message": self.message,
+            **({"learned_behavior": learned} if learned else {}),
             "tasks": [dict(zip(("sweeps", "residual", "converged"), each, strict=True)) for each in of_tasks],
         }
 
@@ -176,7 +212,8 @@ def fit(
     learned = model.with_parameters(best.parameters.model), behavior.with_parameters(best.parameters.behavior)
     sweeps, residual, task_converged = _of_all_tasks(best.solves, count)
     converged = best.status is Status.CONVERGED and bool(np.asarray(task_converged).all())
-    return Fit(*learned, best.history, sweeps, residual, task_converged, best.status, converged, best.message)
+    status = best.status, converged, best.message
+    return Fit(*learned, problem, best.history, sweeps, residual, task_converged, *status)
 
 
 def _of_all_tasks(batches: list[SolveSummary], tasks: int) -> list[Array]:

@@ -327,6 +327,24 @@ def tasks_mesh(devices: Sequence[Any] | None = None) -> Mesh:
     return Mesh(np.asarray(jax.devices() if devices is None else devices), (AXIS,))
 
 
+def transitions_and_prior(
+    prior: Prior, model: TransitionModel, behavior: BehaviorModel, arrivals: Arrivals | None, parameters: Parameters
+) -> tuple[Array, Array]:
+    """Return the terms of the objective that need no solves, in nats: the transitions' and the prior's.
+
+    Args:
+        prior, model, behavior: Of the problem.
+        arrivals: Of its demonstrations; None where transitions do not count.
+        parameters: θ.
+    """
+    log_density = prior.log_density(parameters.model)
+    transitions = jnp.zeros_like(log_density)
+    log_density += behavior.with_parameters(parameters.behavior).log_density().astype(log_density.dtype)
+    if arrivals is not None:
+        transitions = arrival_log_likelihood(model.with_parameters(parameters.model), arrivals)
+    return transitions, log_density
+
+
 @keep_program
 def _transitions_and_prior(
     prior: Prior, model: TransitionModel, behavior: BehaviorModel, arrivals: Arrivals | None, parameters: Parameters
@@ -334,14 +352,37 @@ def _transitions_and_prior(
     """Return the gradient of the loss without the actions' part, and its terms."""
 
     def loss(parameters: Parameters) -> tuple[Array, tuple[Array, Array]]:
-        log_density = prior.log_density(parameters.model)
-        transitions = jnp.zeros_like(log_density)
-        log_density += behavior.with_parameters(parameters.behavior).log_density().astype(log_density.dtype)
-        if arrivals is not None:
-            transitions = arrival_log_likelihood(model.with_parameters(parameters.model), arrivals)
+        transitions, log_density = transitions_and_prior(prior, model, behavior, arrivals, parameters)
         return -transitions - log_density, (transitions, log_density)
 
     return jax.grad(loss, has_aux=True)(parameters)
+
+
+def actions_log_likelihood(
+    problem: Problem, parameters: Parameters, batch: Batch, starts: WarmStart, region: Array
+) -> tuple[Array, tuple[WarmStart, SolveSummary]]:
+    """Return the actions' log-likelihood of a batch, in nats and tempered, the next starts, and how the solves went.
+
+    Args:
+        problem: The problem.
+        parameters: θ.
+        batch: The tasks.
+        starts: Where their solves start.
+        region: The states that have to be solved, of each task.
+    """
+    model = problem.model.with_parameters(parameters.model)
+    behavior = problem.behavior.with_parameters(parameters.behavior)
+
+    def of_task(one: Batch, start: WarmStart, region: Array) -> tuple[Array, tuple[WarmStart, SolveSummary]]:
+        task, own = behavior.tasks_of(one.tasks), behavior.behavior_of(one.person)
+        options = problem.options
+        value, solution = choice_log_likelihood(model, task, one.choices, own, start, options=options, region=region)
+        unreachable = (one.choices.counts > 0) & ~is_reachable(solution.values[one.choices.states])
+        solves = SolveSummary(solution.sweeps, solution.residual, solution.converged, unreachable)
+        return value, (solution.start, solves)
+
+    values, aux = jax.vmap(of_task)(batch, starts, region)
+    return problem.tempering.astype(values.dtype) * values.sum(), aux
 
 
 @keep_program
@@ -351,21 +392,8 @@ def _batch_result(
     """Evaluate the tasks of a batch that are on one device."""
 
     def loss(parameters: Parameters, adjoint: Array) -> tuple[Array, tuple[WarmStart, SolveSummary]]:
-        model = problem.model.with_parameters(parameters.model)
-        behavior = problem.behavior.with_parameters(parameters.behavior)
-
-        def of_task(one: Batch, start: WarmStart, region: Array) -> tuple[Array, tuple[WarmStart, SolveSummary]]:
-            task, own = behavior.tasks_of(one.tasks), behavior.behavior_of(one.person)
-            options = problem.options
-            value, solution = choice_log_likelihood(
-                model, task, one.choices, own, start, options=options, region=region
-            )
-            unreachable = (one.choices.counts > 0) & ~is_reachable(solution.values[one.choices.states])
-            solves = SolveSummary(solution.sweeps, solution.residual, solution.converged, unreachable)
-            return value, (solution.start, solves)
-
-        values, aux = jax.vmap(of_task)(batch, starts._replace(adjoint=adjoint), region)
-        return -problem.tempering.astype(values.dtype) * values.sum(), aux
+        value, aux = actions_log_likelihood(problem, parameters, batch, starts._replace(adjoint=adjoint), region)
+        return -value, aux
 
     region = starts.region | all_states
     # the gradient by the old adjoint is the new adjoint

@@ -22,8 +22,8 @@ Barriers that walks crossed are open and stay so.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -35,6 +35,7 @@ from sidestep.errors import check, check_count
 from sidestep.inference.chains import BarrierProblem, ChainState, barrier_problem
 from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
 from sidestep.inference.diagnostics import effective_sizes, split_rhat
+from sidestep.inference.fit import Estimate
 from sidestep.inference.maximize import Status
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.tabular.backups import Behavior
@@ -103,6 +104,7 @@ class BarrierPosterior(Generic[Model]):
         effective_sizes: The number of independent samples that each P(closed) is worth.
         history: The progress after every sweep, heated ones included.
         status: `Status.MIXED` if the chains agree, `Status.NOT_MIXED` otherwise.
+        learned_behavior: The parameters of the behavior that were learned before (see `Fit.learned_behavior`).
 
     Example:
         >>> import sidestep as ss
@@ -122,6 +124,7 @@ class BarrierPosterior(Generic[Model]):
     effective_sizes: Float[np.ndarray, " barriers"]
     history: tuple[SweepProgress, ...]
     status: Status
+    learned_behavior: Mapping[str, Estimate] = field(default_factory=dict)
 
     @property
     def converged(self) -> bool:
@@ -179,6 +182,7 @@ class BarrierPosterior(Generic[Model]):
             Plain numbers and texts.
         """
         final = self.final
+        learned = {name: number._asdict() for name, number in self.learned_behavior.items()}
         return {
             "posterior": "sample",
             "objective": final.objective,
@@ -194,6 +198,7 @@ class BarrierPosterior(Generic[Model]):
             "smallest_effective_size": float(self.effective_sizes.min()),
             "converged": self.converged,
             "message": self.message,
+            **({"learned_behavior": learned} if learned else {}),
         }
 
 

@@ -8,6 +8,7 @@ blocked. Parameters of the behavior are learned by a fit; maps are sampled with 
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -176,12 +177,13 @@ def infer_map(
         return fit_map(model, demonstrations, config, sensor=sensor, behavior=behavior, callback=callback, **run)
     message = "maps are sampled without a horizon: expected none, or the posterior mean_field"
     check(config.behavior.horizon is None, message, field="horizon")
+    learned: Fit[ObstacleGrid] | None = None
     if any(leaf is not None for leaf in behavior.parameters):
-        behavior = fit_map(model, demonstrations, config, sensor=sensor, behavior=behavior, callback=callback).behavior
-    return sample_barriers(
+        learned = fit_map(model, demonstrations, config, sensor=sensor, behavior=behavior, callback=callback)
+    posterior = sample_barriers(
         model,
         demonstrations,
-        behavior,
+        learned.behavior if learned else behavior,
         prior=barrier_prior(config.prior, known, method, sensor),
         tempering=config.behavior.tempering,
         terms=ALL_TERMS if config.fit.terms == "both" else (config.fit.terms,),
@@ -191,6 +193,7 @@ def infer_map(
         report=callback,
         **run,
     )
+    return replace(posterior, learned_behavior=learned.learned_behavior) if learned else posterior
 
 
 def fit_map(

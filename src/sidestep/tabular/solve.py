@@ -12,7 +12,6 @@ values. This differs from the textbook method in two points:
 `sidestep.tabular.solvers.base` has the equations that solvers solve.
 """
 
-from functools import partial
 from typing import cast
 
 import equinox as eqx
@@ -23,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sidestep.errors import ImproperTask, check, check_count
 from sidestep.tabular.backups import Backup, Behavior, Gradient, LogSumExp
+from sidestep.tabular.implicit import fixed_point
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solvers import base
 from sidestep.tabular.solvers.gauss_seidel import KERNELS, GaussSeidel
@@ -174,7 +174,7 @@ def solve(
             inputs, fixed = equation.inputs, jax.lax.stop_gradient((equation.inputs, start))
             result = solver.values(equation.at(fixed[0]), fixed[1], region)
             constants = (process.successors, process.terminal, solver, result.order, region, some)
-            solved = _implicit(behavior.backup, options.gradient, constants, inputs, result.values, start.adjoint)
+            solved = fixed_point(behavior.backup, options.gradient, constants, inputs, result.values, start.adjoint)
             values, rows = cast(tuple[Array, Array], solved)
         else:
             values = base.finite_horizon(process, behavior.backup, beta, options.horizon, options.gradient)
@@ -253,40 +253,3 @@ def check_proper(task: Task, behavior: Behavior, actions: int, horizon: int | No
             f"log(actions)/β = {bonus:.4g} with every action, so an endless path is worth more than one to the goal: "
             "expected a step cost above that, a larger β, a discount below 1 or another backup"
         )
-
-
-@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _implicit(
-    backup: Backup, gradient: Gradient, constants: tuple, inputs: base.Cotangents, values: Array, adjoint: Array
-) -> tuple[base.Values, Float[Array, "visited actions outcomes"]]:
-    """Return the solution V of V = F(V, φ), φ = `inputs`, with its gradient by the adjoint equation.
-
-    Also return the probabilities of the visited states. Their gradient is added in place to the one by the values: two
-    arrays of the model's size would take longer to make and to add than most of the rest.
-
-    `adjoint` is where the solve of the adjoint starts. It has no influence, so its gradient is free to carry the new
-    adjoint out of the backward pass.
-    """
-    del backup, gradient, adjoint
-    solver, visited = constants[2], constants[-1]
-    return values, solver.gather_rows(inputs.probabilities, visited)
-
-
-def _implicit_forward(
-    backup: Backup, gradient: Gradient, constants: tuple, inputs: base.Cotangents, values: Array, adjoint: Array
-):
-    outputs = _implicit(backup, gradient, constants, inputs, values, adjoint)
-    return outputs, (constants, inputs, values, adjoint)
-
-
-def _implicit_backward(backup: Backup, gradient: Gradient, saved: tuple, cotangents: tuple[Array, Array]):
-    (successors, terminal, solver, order, region, visited), inputs, values, adjoint = saved
-    probabilities, reward, terminal_reward, discount, beta = inputs
-    process = base.DecisionProcess(successors, probabilities, reward, terminal_reward, terminal, discount)
-    equation, start = base.BellmanEquation(process, backup, beta), base.WarmStart(values, adjoint, order)
-    cotangent, result = solver.vjp(equation, gradient, cotangents[0], start, region)
-    cotangent = cotangent._replace(probabilities=cotangent.probabilities.at[visited].add(cotangents[1]))
-    return None, cotangent, jnp.zeros_like(values), result.values
-
-
-_implicit.defvjp(_implicit_forward, _implicit_backward)

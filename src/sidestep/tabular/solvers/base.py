@@ -140,6 +140,18 @@ class BellmanEquation(NamedTuple):
         process = DecisionProcess(self.process.successors, *inputs[:3], self.process.terminal, inputs.discount)
         return BellmanEquation(process, self.backup, inputs.beta)
 
+    def is_live(self, values: Values) -> Bool[Array, " states"]:
+        """Return whether each state has actions and finite values; the others have no part in a gradient."""
+        return is_reachable(values) & ~self.process.terminal
+
+    def backed_up(self, values: Values, gradient: Gradient = "exact") -> Values:
+        """Return F(V, φ), 0 in states without finite values; differentiable by the gradient asked for."""
+        live = self.is_live(values)
+        q = jnp.where(live[:, None], self.process.action_values(values), 0)
+        exact = gradient == "exact"
+        backed_up = self.backup.value(q, self.beta) if exact else at_fixed_policy(self.backup, self.beta, q)
+        return self.process.with_terminal_rewards(jnp.where(live, backed_up, 0))
+
 
 class SolveResult(NamedTuple):
     """The result of a solver, and how the solve went.

@@ -37,6 +37,8 @@ Or the number of states, if it is larger: news from one end of the world takes a
 """
 _PROGRESS = 0.999
 """The part of the smallest change so far that a change may be to count as smaller."""
+_MOST_FACTORIZED = 1_000
+"""The number of states up to which a linear equation is solved by a factorization: faster than sweeps, but cubic."""
 _OSCILLATIONS, _LARGE = 4, 0.1
 """The number of these sweeps in which a large change must alternate in sign; large as a part of the largest."""
 
@@ -95,28 +97,10 @@ class Jacobi(base.Solver):
     ) -> tuple[base.Cotangents, base.SolveResult]:
         """Return the gradient by all that the values depend on: the adjoint, and one backup pulled back by JAX."""
         del region
-        process, backup, beta = equation
-        values = start.values
-        # states that cannot reach a terminal state have no finite values, and no part in the gradient
-        live = base.is_reachable(values) & ~process.terminal
-
-        def action_values(process: base.DecisionProcess) -> Float[Array, "states actions"]:
-            return jnp.where(live[:, None], process.action_values(values), 0)
-
-        def one_backup(by: base.Cotangents) -> Float[Array, " states"]:
-            varied, _, beta = equation.at(by)
-            q = action_values(varied)
-            backed_up = backup.value(q, beta) if gradient == "exact" else base.at_fixed_policy(backup, beta, q)
-            return varied.with_terminal_rewards(jnp.where(live, backed_up, 0))
-
-        q = action_values(process)
-        policy = backup.fixed_policy_weights(q, beta)
-        weights = backup.weights(q, beta) if gradient == "exact" else policy
-        exits = _exits(process)
-        exit_weights = exits.one_minus_discount + exits.discounted_probs.sum(axis=1)
+        process, values = equation.process, start.values
+        live, exits = equation.is_live(values), _exits(process)
+        weights, diagonal, divisor = _weights(equation, values, gradient, exits)
         jacobian = jnp.where(live, weights.T, 0)[:, None] * exits.discounted_probs
-        diagonal = jnp.where(live, jnp.sum(weights.T * exit_weights, axis=0), 1)
-        divisor = jnp.where(live, _divisor(weights, policy, exit_weights), 1)
         largest = jnp.abs(cotangent).max()
 
         def sweep(adjoint: Values) -> tuple[Values, Values]:
@@ -126,10 +110,53 @@ class Jacobi(base.Solver):
 
         result = self._iterate(sweep, jnp.nan_to_num(start.adjoint, nan=0), start.order)
         adjoint = jnp.where(result.converged, result.values, jnp.nan)
-        by = jax.vjp(one_backup, equation.inputs)[1](adjoint)[0]
+        by = jax.vjp(lambda by: equation.at(by).backed_up(values, gradient), equation.inputs)[1](adjoint)[0]
         # what the adjoint had no part in would stay 0
         by = jax.tree.map(lambda leaf: jnp.where(result.converged, leaf, jnp.nan), by)
         return by, result._replace(values=adjoint)
+
+    def solve_linear(
+        self, equation: BellmanEquation, values: Values, right: Values, *, transposed: bool = False
+    ) -> Values:
+        """Return x of x − Wx = `right`, W = ∂F/∂V at the fixed point `values`; NaN where it does not converge.
+
+        It can be differentiated any number of times.
+
+        Args:
+            equation: The equation of the fixed point.
+            values: The fixed point.
+            right: The right-hand side.
+            transposed: Solve x − Wᵀx = `right` instead.
+        """
+        exits, live = _exits(equation.process), equation.is_live(values)
+        weights, diagonal, divisor = jax.lax.stop_gradient(_weights(equation, values, "exact", exits))
+
+        def forward(x: Values) -> Values:
+            return x - jax.jvp(equation.backed_up, (values,), (x,))[1]
+
+        def backward(x: Values) -> Values:
+            return x - jax.vjp(equation.backed_up, values)[1](x)[0]
+
+        def iterate(matrix: Callable[[Values], Values], right: Values) -> Values:
+            largest = jnp.abs(right).max()
+
+            def sweep(x: Values) -> tuple[Values, Values]:
+                solved = x + (right - matrix(x)) / divisor
+                return solved, jnp.maximum(jnp.abs(solved), largest)
+
+            result = self._iterate(sweep, jnp.zeros_like(right), jnp.zeros(0, jnp.int32))
+            return jnp.where(result.converged, result.values, jnp.nan)
+
+        solvers = iterate, iterate
+        if len(values) <= _MOST_FACTORIZED:
+            states = jnp.arange(len(values))
+            jacobian = jnp.where(live, weights.T, 0)[:, None] * exits.discounted_probs
+            matrix = jnp.diag(diagonal).at[states, exits.successors].add(-jacobian)
+            factors = jax.scipy.linalg.lu_factor(jax.lax.stop_gradient(matrix))
+            solvers = [lambda _, x, by=by: jax.scipy.linalg.lu_solve(factors, x, trans=by) for by in (0, 1)]
+        matrix, order = (backward, -1) if transposed else (forward, 1)
+        solve, transpose_solve = solvers[::order]
+        return jax.lax.custom_linear_solve(matrix, right, solve, transpose_solve=transpose_solve)
 
     def _iterate(
         self, sweep: Callable[[Array], tuple[Array, Array]], start: Values, order: Int[Array, " ordered"]
@@ -209,6 +236,20 @@ def _exits(process: base.DecisionProcess) -> _Exits:
     is_self_loop = successors == jnp.arange(len(process.successors))
     leaving = jnp.where(is_self_loop, 0, probabilities)
     return _Exits(successors, process.discount * leaving, 1 - process.discount)
+
+
+def _weights(
+    equation: BellmanEquation, values: Values, gradient: Gradient, exits: _Exits
+) -> tuple[Float[Array, "states actions"], Values, Values]:
+    """Return the weights ∂V/∂Q, the diagonal Σ w l of the adjoint's matrix, and the divisor of its iteration."""
+    process, backup, beta = equation
+    live = equation.is_live(values)
+    q = jnp.where(live[:, None], process.action_values(values), 0)
+    policy = backup.fixed_policy_weights(q, beta)
+    weights = backup.weights(q, beta) if gradient == "exact" else policy
+    exit_weights = exits.one_minus_discount + exits.discounted_probs.sum(axis=1)
+    diagonal = jnp.where(live, jnp.sum(weights.T * exit_weights, axis=0), 1)
+    return weights, diagonal, jnp.where(live, _divisor(weights, policy, exit_weights), 1)
 
 
 def _solve_states(

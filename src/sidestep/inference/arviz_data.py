@@ -1,0 +1,44 @@
+"""Samples as ArviZ's `InferenceData`: one variable for each learned number, with chains and draws."""
+
+import warnings
+from collections.abc import Mapping
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+
+from sidestep.errors import check
+from sidestep.inference.laplace import NaturalScale
+
+if TYPE_CHECKING:
+    from arviz import InferenceData
+
+
+def require(package: str, what: str) -> None:
+    """Raise `InputError` unless an optional package is installed.
+
+    Args:
+        package: Its name.
+        what: What needs it.
+    """
+    message = f"needs {package}, which is not installed: expected pip install 'sidestep[samplers]' to have run"
+    check(find_spec(package) is not None, message, source=what)
+
+
+def inference_data(draws: NaturalScale, statistics: Mapping[str, np.ndarray] | None = None) -> "InferenceData":
+    """Return draws as `InferenceData`.
+
+    Args:
+        draws: Each leaf with leading axes of chains and draws.
+        statistics: Of the sampler, with the same axes, by ArviZ's names.
+    """
+    require("arviz", "to_arviz")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # that its next version will be another one
+        import arviz
+
+    names: dict[str, np.ndarray] = {}
+    for path, leaf in jax.tree_util.tree_flatten_with_path(draws)[0]:
+        names[jax.tree_util.keystr(path).removeprefix(".")] = np.asarray(leaf)
+    return arviz.from_dict(posterior=names, sample_stats=None if statistics is None else dict(statistics))

@@ -1,0 +1,172 @@
+"""Samples from the posterior of what a fit has learned, by the No-U-Turn sampler, for small problems.
+
+The sampler is blackjax's: Hamiltonian Monte Carlo that chooses the length of its paths (Hoffman and Gelman 2014), after
+a warm-up in windows as Stan's. It differs from common use in one thing: it works in the coordinates of Laplace's
+approximation, in which the posterior is about a standard normal distribution, and chains start at samples of that.
+
+Every gradient is exact and solves all tasks again, so this serves models of a few hundred states and parameters.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from sidestep._typing import Tree
+from sidestep.errors import check_count
+from sidestep.inference.arviz_data import inference_data, require
+from sidestep.inference.batching import Batch
+from sidestep.inference.fit import Fit
+from sidestep.inference.information import Information
+from sidestep.inference.laplace import laplace, natural_scale
+from sidestep.inference.objective import Parameters, Problem, actions_log_likelihood, transitions_and_prior
+from sidestep.tabular.likelihood import Arrivals
+from sidestep.tabular.solvers.base import WarmStart
+
+if TYPE_CHECKING:
+    from arviz import InferenceData
+
+_Data = tuple[list[Batch], list[WarmStart], Arrivals | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Samples of a posterior, by `sample`.
+
+    Attributes:
+        parameters: Unconstrained, each with leading axes of chains and draws; `natural_scale` maps them.
+        split_r_hat: Split-R̂ of each number: above about 1.01, chains have not mixed.
+        effective_size: The number of independent draws that all chains' are worth, of each number.
+        divergent: Whether the path to each draw diverged: where some do, the draws may miss a part of the posterior.
+        acceptance: The mean acceptance rate of each path.
+    """
+
+    parameters: Parameters
+    split_r_hat: Parameters
+    effective_size: Parameters
+    divergent: Bool[np.ndarray, "chains draws"]
+    acceptance: Float[np.ndarray, "chains draws"]
+
+    def to_arviz(self) -> "InferenceData":
+        """Return the samples as ArviZ's `InferenceData`, on their natural scales.
+
+        Raises:
+            InputError: Where ArviZ is not installed.
+        """
+        statistics = {"diverging": self.divergent, "acceptance_rate": self.acceptance}
+        return inference_data(natural_scale(self.parameters), statistics)
+
+
+def sample(fit: Fit[Any], key: PRNGKeyArray, n: int = 1_000, *, chains: int = 4, warmup: int = 500) -> Draws:
+    """Return samples from the posterior of what a fit has learned, by the No-U-Turn sampler.
+
+    It needs `pip install 'sidestep[samplers]'`, and is for small problems. The posterior is that of the parameters of
+    the model and of behavior with their priors, as `fit` maximizes it.
+
+    Args:
+        fit: The fit, with the exact gradient.
+        key: Of the random numbers.
+        n: The number of draws of each chain, at least 4.
+        chains: Their number, at least 1.
+        warmup: The number of steps before the first draw, in which step sizes are adapted, at least 1.
+
+    Returns:
+        The samples, with R̂ and effective sizes.
+
+    Raises:
+        InputError: Where blackjax is not installed, for counts that are too small, and as `laplace` does.
+
+    Example:
+        >>> import sidestep as ss
+        >>> grid = ss.Grid.unknown(rows=1, columns=3)
+        >>> shown = ss.gather([ss.Trajectory(np.array([0, 1, 2]), np.array([3, 3]), task=0)], [ss.reach(grid, 2)])
+        >>> learned = ss.fit(ss.ObstacleGrid(grid, 0.0), shown, ss.Behavior(ss.HardMax()), terms=("transitions",))
+        >>> draws = sample(learned, jax.random.key(0), 10, chains=2, warmup=20)
+        >>> draws.parameters.model.shape
+        (2, 10, 3)
+
+    References:
+        Hoffman and Gelman, "The No-U-Turn sampler" (2014). Cabezas et al., "BlackJAX: composable Bayesian inference in
+        JAX" (2024). Vehtari et al., "Rank-normalization, folding, and localization: an improved R̂" (2021), for
+        splitting chains.
+    """
+    require("blackjax", "sample")
+    for count, least, field in ((n, 4, "n"), (chains, 1, "chains"), (warmup, 1, "warmup")):
+        check_count(count, least, field)
+    normal = laplace(fit)
+    information = Information(fit.problem, normal.parameters)
+    objective = information.objective
+    data = objective.batches, information.starts, objective.arrivals
+    flat, unravel = ravel_pytree(normal.parameters)
+    inner = (normal.vectors * (1 / np.sqrt(normal.eigenvalues) - 1)) @ normal.vectors.T
+    factor = jnp.asarray(normal.scale[:, None] * (np.eye(len(flat)) + inner), flat.dtype)
+    positions, divergent, acceptance = _run(
+        objective.constants, data, normal.parameters, factor, key, n, chains, warmup
+    )
+    parameters = jax.vmap(jax.vmap(unravel))(flat + positions @ factor.T)
+    r_hat, size = _diagnostics(parameters)
+    return Draws(parameters, r_hat, size, np.asarray(divergent), np.asarray(acceptance))
+
+
+@eqx.filter_jit
+def _run(
+    problem: Problem,
+    data: _Data,
+    mode: Parameters,
+    factor: Float[Array, "parameters parameters"],
+    key: PRNGKeyArray,
+    n: int,
+    chains: int,
+    warmup: int,
+) -> tuple[Array, Array, Array]:
+    """Return positions, whether paths diverged, and acceptance rates, with axes of chains and draws."""
+    import blackjax
+
+    flat, unravel = ravel_pytree(mode)
+
+    def log_density(position: Float[Array, " parameters"]) -> Array:
+        return _log_posterior(problem, data, unravel(flat + factor @ position))
+
+    def chain(key: PRNGKeyArray) -> tuple[Array, Array, Array]:
+        begin, adapt, move = jax.random.split(key, 3)
+        position = jax.random.normal(begin, flat.shape, flat.dtype)
+        adaptation = blackjax.window_adaptation(blackjax.nuts, log_density)
+        (state, settings), _ = adaptation.run(adapt, position, num_steps=warmup)
+        step = blackjax.nuts(log_density, **settings).step
+
+        def draw(state: Tree, key: PRNGKeyArray) -> tuple[Tree, tuple[Array, Array, Array]]:
+            state, info = step(key, state)
+            return state, (state.position, info.is_divergent, info.acceptance_rate)
+
+        return jax.lax.scan(draw, state, jax.random.split(move, n))[1]
+
+    return jax.vmap(chain)(jax.random.split(key, chains))
+
+
+def _log_posterior(problem: Problem, data: _Data, parameters: Parameters) -> Array:
+    """Return log L(θ) + log p(θ); NaN, which the sampler rejects, where values do not converge."""
+    batches, starts, arrivals = data
+    total = sum(transitions_and_prior(problem.prior, problem.model, problem.behavior, arrivals, parameters))
+    for batch, start in zip(batches, starts, strict=True):
+        everywhere = jnp.ones(start.values.shape, bool)
+        total = total + actions_log_likelihood(problem, parameters, batch, start, everywhere)[0]
+    return jnp.asarray(total)
+
+
+def _diagnostics(parameters: Parameters) -> tuple[Parameters, Parameters]:
+    """Return split-R̂ and the effective size of each number."""
+    from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
+
+    def halves(leaf: Array) -> Array:
+        half = leaf.shape[1] // 2
+        return jnp.concatenate([leaf[:, :half], leaf[:, half : 2 * half]])
+
+    split = jax.tree.map(halves, parameters)
+    of_all = (jax.tree.map(measure, split) for measure in (potential_scale_reduction, effective_sample_size))
+    r_hat, size = (jax.tree.map(lambda a, leaf: a.reshape(leaf.shape[2:]), each, split) for each in of_all)
+    return r_hat, size
