@@ -14,8 +14,8 @@ averaged over draws. The picture has a reliability diagram for each number of wa
 
 Records: `problem`, `walks` (asked for), `drawn`, `draw`, `method`, the scores of `sidestep.evaluation` (for all cells,
 and for relevant obstacles: those that a walk had to avoid), `reliability` (the bins of the calibration error, None
-where there is none), `seconds`, `converged`, `failure`, `moves`, `iterations`, `objective`, `largest_gradient`, `message`, and the
-fields of the configuration.
+where there is none), `seconds`, `converged`, `failure`, `moves`, `iterations`, `objective`, `largest_gradient`,
+`message`, and the fields of the configuration.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -7,7 +7,9 @@ approximation, in which the posterior is about a standard normal distribution, a
 Every gradient is exact and solves all tasks again, so this serves models of a few hundred states and parameters.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -21,6 +23,7 @@ from sidestep._typing import Tree
 from sidestep.errors import check_count
 from sidestep.inference.arviz_data import inference_data, require
 from sidestep.inference.batching import Batch
+from sidestep.inference.diagnostics import effective_sizes, split_rhat
 from sidestep.inference.fit import Fit
 from sidestep.inference.information import Information
 from sidestep.inference.laplace import laplace, natural_scale
@@ -40,15 +43,15 @@ class Draws:
 
     Attributes:
         parameters: Unconstrained, each with leading axes of chains and draws; `natural_scale` maps them.
-        split_r_hat: Split-R̂ of each number: above about 1.01, chains have not mixed.
-        effective_size: The number of independent draws that all chains' are worth, of each number.
+        rhat: Split-R̂ of each number: above about 1.01, chains have not mixed.
+        effective_sizes: The number of independent draws that all chains' are worth, of each number.
         divergent: Whether the path to each draw diverged: where some do, the draws may miss a part of the posterior.
         acceptance: The mean acceptance rate of each path.
     """
 
     parameters: Parameters
-    split_r_hat: Parameters
-    effective_size: Parameters
+    rhat: Parameters
+    effective_sizes: Parameters
     divergent: Bool[np.ndarray, "chains draws"]
     acceptance: Float[np.ndarray, "chains draws"]
 
@@ -109,8 +112,8 @@ def sample(fit: Fit[Any], key: PRNGKeyArray, n: int = 1_000, *, chains: int = 4,
         objective.constants, data, normal.parameters, factor, key, n, chains, warmup
     )
     parameters = jax.vmap(jax.vmap(unravel))(flat + positions @ factor.T)
-    r_hat, size = _diagnostics(parameters)
-    return Draws(parameters, r_hat, size, np.asarray(divergent), np.asarray(acceptance))
+    rhat, sizes = _of_each(split_rhat, parameters), _of_each(effective_sizes, parameters)
+    return Draws(parameters, rhat, sizes, np.asarray(divergent), np.asarray(acceptance))
 
 
 @eqx.filter_jit
@@ -125,8 +128,7 @@ def _run(
     warmup: int,
 ) -> tuple[Array, Array, Array]:
     """Return positions, whether paths diverged, and acceptance rates, with axes of chains and draws."""
-    import blackjax
-
+    blackjax: Any = import_module("blackjax")  # its types are not those of its functions
     flat, unravel = ravel_pytree(mode)
 
     def log_density(position: Float[Array, " parameters"]) -> Array:
@@ -158,15 +160,11 @@ def _log_posterior(problem: Problem, data: _Data, parameters: Parameters) -> Arr
     return jnp.asarray(total)
 
 
-def _diagnostics(parameters: Parameters) -> tuple[Parameters, Parameters]:
-    """Return split-R̂ and the effective size of each number."""
-    from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
+def _of_each(measure: Callable[[np.ndarray], np.ndarray], parameters: Parameters) -> Parameters:
+    """Return a diagnostic of each number, from draws with axes of chains and draws."""
 
-    def halves(leaf: Array) -> Array:
-        half = leaf.shape[1] // 2
-        return jnp.concatenate([leaf[:, :half], leaf[:, half : 2 * half]])
+    def of_leaf(leaf: Array) -> np.ndarray:
+        draws = np.asarray(leaf, np.float64)
+        return measure(draws.reshape(*draws.shape[:2], -1)).reshape(draws.shape[2:])
 
-    split = jax.tree.map(halves, parameters)
-    of_all = (jax.tree.map(measure, split) for measure in (potential_scale_reduction, effective_sample_size))
-    r_hat, size = (jax.tree.map(lambda a, leaf: a.reshape(leaf.shape[2:]), each, split) for each in of_all)
-    return r_hat, size
+    return jax.tree.map(of_leaf, parameters)
