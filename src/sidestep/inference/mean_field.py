@@ -15,6 +15,7 @@ half closed. `sample_barriers` has neither fault.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sidestep.inference.mrf import BinaryMRF
@@ -43,7 +44,7 @@ class MeanField(Prior):
     weights: Float[Array, " 4"]
     known: Int[Array, "*shape"]
 
-    def __init__(self, prior: BinaryMRF, known: Int[Array, "*shape"]):
+    def __init__(self, prior: BinaryMRF, known: Int[Array | np.ndarray, "*shape"]):
         self.field, self.weights = (
             to_jax(prior.field, jnp.result_type(float)),
             to_jax(prior.weights, jnp.result_type(float)),
