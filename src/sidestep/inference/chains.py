@@ -205,7 +205,7 @@ def barrier_problem(
         terms: The parts of the likelihood that count.
     """
     tasks = agents.tasks_of(demonstrations.tasks)
-    terminal = np.array(tasks.terminal)
+    terminal, discount = np.array(tasks.terminal), np.array(tasks.discount, np.float64)
     persons = [None] * len(terminal) if agents.person is None else np.asarray(agents.person).tolist()
     behaviors = [agents.behavior_of(person) for person in persons]
     passing = np.where(
@@ -228,8 +228,8 @@ def barrier_problem(
     beta = np.array([float(each.beta) for each in behaviors])
     evidence = Evidence(
         reward=np.array(tasks.reward, np.float64),
-        solved=_solvable(barriers, terminal),
-        discount=np.array(tasks.discount, np.float64),
+        solved=_solvable(barriers, terminal, discount),
+        discount=discount,
         beta=beta,
         lapse=np.array([0.0 if each.lapse is None else float(each.lapse) for each in behaviors]),
         tolerance=_TOLERANCE / beta,
@@ -279,13 +279,15 @@ def _grouped(keys: np.ndarray, items: np.ndarray, groups: int) -> tuple[np.ndarr
     return begin.astype(np.int64), pairs[:, 1].astype(np.int64)
 
 
-def _solvable(barriers: Barriers, terminal: np.ndarray) -> np.ndarray:
-    """Return whether each task goes on in each state and can end from there, were all unknown barriers open."""
+def _solvable(barriers: Barriers, terminal: np.ndarray, discount: np.ndarray) -> np.ndarray:
+    """Return whether each task goes on in each state and its value is finite, were all unknown barriers open.
+
+    At discount 1 this is where a task can end from, below 1 everywhere.
+    """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order
 
-    closed = np.append(barriers.known == Cell.OCCUPIED, False)
-    possible = (barriers.attempts > 0) & ~closed[barriers.needed].any(axis=-1)
+    possible = _possible(barriers)
     state = np.nonzero(possible)[0]
     size = len(possible)
     solvable = np.zeros(terminal.shape, bool)
@@ -296,7 +298,13 @@ def _solvable(barriers: Barriers, terminal: np.ndarray) -> np.ndarray:
         graph = csr_array((np.ones(len(rows)), (rows, columns)), shape=(size + 1, size + 1))
         reached = breadth_first_order(graph, size, return_predecessors=False)
         solvable[task, reached[reached < size]] = True
-    return solvable & ~terminal
+    return (solvable | (discount < 1)[:, None]) & ~terminal
+
+
+def _possible(barriers: Barriers) -> Bool[np.ndarray, "states actions attempts"]:
+    """Return whether each attempt can succeed, were all unknown barriers open."""
+    closed = np.append(barriers.known == Cell.OCCUPIED, False)
+    return (barriers.attempts > 0) & ~closed[barriers.needed].any(axis=-1)
 
 
 def _transitions(barriers: Barriers, demonstrations: Demonstrations, terms: Terms) -> tuple[np.ndarray, np.ndarray]:
@@ -311,7 +319,7 @@ def _transitions(barriers: Barriers, demonstrations: Demonstrations, terms: Term
     stays = s == after
     np.add.at(stayed, (s[stays], a[stays]), weight[stays])
     s, a, after, weight = (each[~stays] for each in (s, a, after, weight))
-    leads = (barriers.successors[s, a] == after[:, None]) & (barriers.attempts[s, a] > 0)
+    leads = (barriers.successors[s, a] == after[:, None]) & _possible(barriers)[s, a]
     check(leads.any(axis=-1).all(), "expected transitions that the model allows", field="demonstrations")
     np.add.at(moved, (s, a, leads.argmax(axis=-1)), weight)
     return moved, stayed
