@@ -97,3 +97,10 @@ def exact_model(model: TransitionModel, closed: np.ndarray) -> TransitionModel:
 def all_maps(count: int) -> np.ndarray:
     """All maps of some barriers, one a row."""
     return np.array(list(product((False, True), repeat=count)))
+
+
+def corridor() -> BarrierWorld:
+    """A corridor of four cells along which one walks to the right end, from the second."""
+    grid = Grid.unknown(1, 4)
+    shown = gather([Trajectory(np.array([1, 2, 3]), np.array([RIGHT] * 2), task=0)], [DISCOUNTED.reach(grid, 3)])
+    return BarrierWorld(ObstacleGrid(grid), shown, Behavior(BoltzmannAverage()), BinaryMRF(np.zeros(4), (1, 4)))
