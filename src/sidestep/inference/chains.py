@@ -248,6 +248,22 @@ def barrier_problem(
     return BarrierProblem(barriers, world, evidence, prior, free, (KERNELS[type(backup)], tie), terminal, rewards)
 
 
+def check_prior(barriers: Barriers, prior: BinaryMRF) -> None:
+    """Check that a prior is one of these barriers.
+
+    Args:
+        barriers: The barriers.
+        prior: The prior.
+
+    Raises:
+        InputError: For another number of barriers, and for shape terms on another grid.
+    """
+    size = len(barriers.known)
+    check(len(prior.field) == size, f"expected {size} barriers, found {len(prior.field)}", field="prior")
+    message = f"expected shape {barriers.shape} or None, found {prior.shape}"
+    check(prior.shape is None or prior.shape == barriers.shape, message, field="prior")
+
+
 def _outcomes(barriers: Barriers, world: World, closed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return successors and probabilities with staying as the last outcome."""
     passing = np.append(world.passing[np.arange(len(closed)), closed], 1.0)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sidestep.errors import check
-from sidestep.inference.chains import PASSING, crossed_barriers
+from sidestep.inference.chains import PASSING, check_prior, crossed_barriers
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.demonstrations import Demonstrations
@@ -57,7 +57,7 @@ def enumerate_barriers(
         P(closed) of each barrier, and the evidence.
 
     Raises:
-        InputError: For more than 16 barriers that are unknown and that no walk crossed.
+        InputError: For more than 16 barriers that are unknown and that no walk crossed, and a prior of others.
 
     Example:
         >>> import sidestep as ss
@@ -69,6 +69,7 @@ def enumerate_barriers(
         [0.0, 0.0, 0.5]
     """
     barriers = barriers_of(model)
+    check_prior(barriers, prior)
     crossed = crossed_barriers(barriers, demonstrations, terms)
     free = np.flatnonzero((barriers.known == Cell.UNKNOWN) & ~crossed)
     message = f"expected at most {MAX_BARRIERS} unknown barriers to enumerate, found {len(free)}"
