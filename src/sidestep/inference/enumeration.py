@@ -26,7 +26,7 @@ class ExactPosterior(NamedTuple):
     """The exact posterior of barriers.
 
     Attributes:
-        closed: P(closed) of each barrier.
+        closed: P(closed) of each barrier; exactly 0 or 1 where it is known or was crossed.
         log_evidence: ln Σ L(z)^κ p(z), with the prior up to its constant.
     """
 
@@ -92,5 +92,5 @@ def enumerate_barriers(
     parts = [log_likelihoods(jnp.asarray(maps[at : at + _BATCH])) for at in range(0, len(maps), _BATCH)]
     log_posterior = np.concatenate(parts) @ weights + [prior.log_density(each) for each in maps]
     log_evidence = np.logaddexp.reduce(log_posterior)
-    closed = np.exp(log_posterior - log_evidence) @ maps
-    return ExactPosterior(closed, float(log_evidence))
+    closed = np.minimum(np.exp(log_posterior - log_evidence) @ maps, 1.0)  # sums of rounded numbers
+    return ExactPosterior(np.where(maps.all(axis=0), 1.0, closed), float(log_evidence))
