@@ -117,7 +117,7 @@ def test_learn_with_options_of_the_other_prior_is_wrong_usage(office, capsys, op
     (("--posterior", "mean-field", "--prior", "normal"), "field 'posterior'"),
     (("--sweeps", 11), "field 'sweeps'"),
     (("--posterior", "sample", "--horizon", 5), "field 'horizon'"),
-    (("--log-odds", "nan"), "field"),
+    (("--log-odds", "nan"), "field 'log_odds'"),
 ])  # fmt: skip
 def test_learn_with_a_posterior_that_does_not_fit_is_refused(office, capsys, options, expected):
     before = written(office)

@@ -68,6 +68,8 @@ def test_sweeps_for_fall_with_the_size_between_bounds():
 @pytest.mark.parametrize(("make", "field"), [
     (lambda: PosteriorConfig(sweeps=11), "sweeps"),
     (lambda: PosteriorConfig(chains=1), "chains"),
+    (lambda: PriorConfig(log_odds=float("nan")), "log_odds"),
+    (lambda: PriorConfig(isolated=float("inf")), "isolated"),
     (lambda: MapConfig(posterior=PosteriorConfig("mode")), "posterior"),
     (lambda: MapConfig(prior=NORMAL, posterior=PosteriorConfig("sample")), "posterior"),
     (lambda: MapConfig(prior=NORMAL, posterior=PosteriorConfig("mean_field")), "posterior"),
