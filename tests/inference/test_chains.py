@@ -170,6 +170,19 @@ def test_chain_without_evidence_samples_the_prior():
         assert not state.log_likelihoods.any()
 
 
+@pytest.mark.slow
+def test_chain_moves_and_runs_are_as_probable_as_their_reverses():
+    """Of two cells mostly one is closed; only moves lead from one to the other, flips and runs would bias them."""
+    grid, prior = Grid(np.array([[0, 0, 0], [1, -1, -1]])), BinaryMRF(np.full(6, 6.0), (2, 3), pairs=-12.0)
+    prior.field[4] += 12  # the known obstacle is a neighbor of the first
+    shown = gather([Trajectory(np.array([0, 1]), np.array([RIGHT]), task=0)], [reach(grid, 1)])
+    one = BarrierWorld(ObstacleGrid(grid), shown, Behavior(BoltzmannAverage()), prior)
+    states = sampled_chains(problem_of(one, terms=()), sweeps=5000)
+    samples = np.concatenate([state.samples[20:, 4:] for state in states])
+    assert (samples.sum(axis=1) == 1).mean() > 0.98
+    np.testing.assert_allclose(samples.mean(axis=0), 0.5, atol=0.045)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_barrier_problem_leaves_known_and_crossed_barriers_as_they_are(kind):
     one = world(kind)

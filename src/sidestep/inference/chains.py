@@ -1,7 +1,8 @@
 """A Metropolis chain over the barriers of a model: its state, its evidence, and its sweeps.
 
-`sampler` describes the chain, `chain_kernels` holds its native code. Values are solved from nothing every ten sweeps by
-the solver of `sidestep.tabular.solvers.values`, and followed by local value iteration between.
+`sampler` describes the chain, `chain_kernels` holds its native code. Values are solved from nothing before the first
+sweep, by the solver of `sidestep.tabular.solvers.values`. From then on they are followed by local value iteration, and
+every ten sweeps by value iteration of all states to a finer tolerance.
 """
 
 from dataclasses import dataclass

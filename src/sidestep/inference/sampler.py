@@ -12,8 +12,8 @@ The chain is that of Metropolis et al. (1953), *Equation of state calculations b
 2. It is accepted in two stages (delayed acceptance, Christen & Fox 2005): with probability min(1, p(z′)/p(z)) by the
    prior, and if so with probability min(1, L(z′)/L(z)). The likelihood is computed for what the prior accepts only.
    Detailed balance holds in each stage, so also together.
-3. Values follow a proposal by local value iteration (`chain_kernels`) up to a tolerance, and are solved anew from
-   nothing every ten sweeps. So the chain is exact up to the tolerance.
+3. Values follow a proposal by local value iteration (`chain_kernels`) up to a tolerance. Every ten sweeps all states
+   are solved to a finer one. So the chain is exact up to the tolerance.
 4. In the first third of the sweeps the posterior is heated: log p/T, with T falling from 4 to 1. These are dropped.
 5. Several chains start from few and from many closed barriers. Split-R̂ and effective sample sizes
    (`diagnostics`) compare them.
