@@ -184,7 +184,6 @@ class BarrierPosterior(Generic[Model]):
         final = self.final
         learned = {name: number._asdict() for name, number in self.learned_behavior.items()}
         return {
-            "posterior": "sample",
             "objective": final.objective,
             "log_likelihood_actions": final.actions,
             "log_likelihood_transitions": final.transitions,

@@ -106,7 +106,8 @@ def posterior_method(config: MapConfig, unknown: int, goals: int) -> PosteriorMe
         return config.posterior.method
     if config.prior.kind == "normal":
         return "mode"
-    return "sample" if unknown * goals <= MAX_SAMPLED and config.behavior.horizon is None else "mean_field"
+    samples = config.behavior.horizon is None and config.fit.gradient == "exact" and unknown * goals <= MAX_SAMPLED
+    return "sample" if samples else "mean_field"
 
 
 def sweeps_for(config: MapConfig, unknown: int, goals: int) -> int:
@@ -177,6 +178,8 @@ def infer_map(
         return fit_map(model, demonstrations, config, sensor=sensor, behavior=behavior, callback=callback, **run)
     message = "maps are sampled without a horizon: expected none, or the posterior mean_field"
     check(config.behavior.horizon is None, message, field="horizon")
+    message = "maps are sampled without a gradient: expected exact, or the posterior mean_field"
+    check(config.fit.gradient == "exact", message, field="gradient")
     learned: Fit[ObstacleGrid] | None = None
     if any(leaf is not None for leaf in behavior.parameters):
         learned = fit_map(model, demonstrations, config, sensor=sensor, behavior=behavior, callback=callback)
