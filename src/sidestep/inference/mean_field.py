@@ -15,6 +15,7 @@ half closed. `sample_barriers` has neither fault.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sidestep.inference.mrf import BinaryMRF
@@ -32,7 +33,6 @@ class MeanField(Prior):
         known: The state of each cell as in `Grid.known`, or of each barrier; known ones are part of the shapes.
 
     Example:
-        >>> import numpy as np
         >>> from sidestep.inference.mrf import BinaryMRF
         >>> prior = MeanField(BinaryMRF(np.zeros(3), (1, 3)), np.array([[-1, 0, 1]]))
         >>> round(float(prior.log_density(jnp.zeros(3))), 3)  # the entropy of one cell, ln 2
@@ -43,7 +43,7 @@ class MeanField(Prior):
     weights: Float[Array, " 4"]
     known: Int[Array, "*shape"]
 
-    def __init__(self, prior: BinaryMRF, known: Int[Array, "*shape"]):
+    def __init__(self, prior: BinaryMRF, known: Int[Array, "*shape"] | Int[np.ndarray, "*shape"]):
         self.field, self.weights = (
             to_jax(prior.field, jnp.result_type(float)),
             to_jax(prior.weights, jnp.result_type(float)),
