@@ -1,19 +1,20 @@
 """Samples of barriers from their posterior, by a Metropolis chain with exact values.
 
-    p(z | walks) ∝ L(z)^κ p(z),      z(i) = 1 where barrier i is closed
+    p(z | walks) ∝ L(z) p(z),      z(i) = 1 where barrier i is closed
 
-Each map z has transitions of its own, and L(z) is the likelihood of `sidestep.tabular.likelihood` with these. A closed
+Each map z has transitions of its own, and L(z) is the likelihood of `sidestep.tabular.likelihood` with these, its part
+of the actions to the power κ (`tempering`). A closed
 barrier lets an agent pass with probability .003, an open one with .997, so that no observation is impossible.
 
 The chain is that of Metropolis et al. (1953), *Equation of state calculations by fast computing machines*:
 
-1. A proposal flips a barrier, moves a closed cell to one of the eight cells around it, or flips a run of 2 to 7 equal
-   cells of a row or column. A proposal and its reverse are equally probable.
+1. A proposal flips a barrier, exchanges a cell with one of the eight around it that is not equal, or flips a run of 2
+   to 7 equal cells of a row or column. A proposal and its reverse are equally probable.
 2. It is accepted in two stages (delayed acceptance, Christen & Fox 2005): with probability min(1, p(z′)/p(z)) by the
    prior, and if so with probability min(1, L(z′)/L(z)). The likelihood is computed for what the prior accepts only.
    Detailed balance holds in each stage, so also together.
-3. Values follow a proposal by local value iteration (`chain_kernels`) up to a tolerance, and are solved anew from
-   nothing every ten sweeps. So the chain is exact up to the tolerance.
+3. Values follow a proposal by local value iteration (`chain_kernels`) up to a tolerance. Every ten sweeps all states
+   are solved again, from the values at hand, to a hundredth of it. So the chain is exact up to the tolerance.
 4. In the first third of the sweeps the posterior is heated: log p/T, with T falling from 4 to 1. These are dropped.
 5. Several chains start from few and from many closed barriers. Split-R̂ and effective sample sizes
    (`diagnostics`) compare them.
@@ -225,7 +226,7 @@ def sample_barriers(
         prior: The prior of the barriers.
         tempering: κ in (0, 1], a factor of the actions' log-likelihood.
         terms: The parts of the likelihood that count.
-        sweeps: The number of sweeps of each chain, at least 12; a sweep is a proposal for each unknown barrier.
+        sweeps: The number of sweeps of each chain, at least 12; a sweep has a proposal for each unknown barrier.
         chains: The number of chains, at least 2.
         seed: The seed. The result does not depend on the number of cores.
         report: Called with a `SweepProgress` after every sweep.
