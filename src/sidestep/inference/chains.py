@@ -205,7 +205,7 @@ def barrier_problem(
         terms: The parts of the likelihood that count.
     """
     tasks = agents.tasks_of(demonstrations.tasks)
-    terminal = np.array(tasks.terminal)
+    terminal, discount = np.array(tasks.terminal), np.array(tasks.discount, np.float64)
     persons = [None] * len(terminal) if agents.person is None else np.asarray(agents.person).tolist()
     behaviors = [agents.behavior_of(person) for person in persons]
     passing = np.where(
@@ -228,8 +228,8 @@ def barrier_problem(
     beta = np.array([float(each.beta) for each in behaviors])
     evidence = Evidence(
         reward=np.array(tasks.reward, np.float64),
-        solved=_solvable(barriers, terminal),
-        discount=np.array(tasks.discount, np.float64),
+        solved=_solvable(barriers, terminal, discount),
+        discount=discount,
         beta=beta,
         lapse=np.array([0.0 if each.lapse is None else float(each.lapse) for each in behaviors]),
         tolerance=_TOLERANCE / beta,
@@ -246,6 +246,22 @@ def barrier_problem(
     free = np.flatnonzero((barriers.known == Cell.UNKNOWN) & ~crossed).astype(np.int64)
     rewards = np.array(tasks.terminal_reward, np.float64)
     return BarrierProblem(barriers, world, evidence, prior, free, (KERNELS[type(backup)], tie), terminal, rewards)
+
+
+def check_prior(barriers: Barriers, prior: BinaryMRF) -> None:
+    """Check that a prior is one of these barriers.
+
+    Args:
+        barriers: The barriers.
+        prior: The prior.
+
+    Raises:
+        InputError: For another number of barriers, and for shape terms on another grid.
+    """
+    size = len(barriers.known)
+    check(len(prior.field) == size, f"expected {size} barriers, found {len(prior.field)}", field="prior")
+    message = f"expected shape {barriers.shape} or None, found {prior.shape}"
+    check(prior.shape is None or prior.shape == barriers.shape, message, field="prior")
 
 
 def _outcomes(barriers: Barriers, world: World, closed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -279,13 +295,15 @@ def _grouped(keys: np.ndarray, items: np.ndarray, groups: int) -> tuple[np.ndarr
     return begin.astype(np.int64), pairs[:, 1].astype(np.int64)
 
 
-def _solvable(barriers: Barriers, terminal: np.ndarray) -> np.ndarray:
-    """Return whether each task goes on in each state and can end from there, were all unknown barriers open."""
+def _solvable(barriers: Barriers, terminal: np.ndarray, discount: np.ndarray) -> np.ndarray:
+    """Return whether each task goes on in each state and its value is finite, were all unknown barriers open.
+
+    At discount 1 this is where a task can end from, below 1 everywhere.
+    """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order
 
-    closed = np.append(barriers.known == Cell.OCCUPIED, False)
-    possible = (barriers.attempts > 0) & ~closed[barriers.needed].any(axis=-1)
+    possible = _possible(barriers)
     state = np.nonzero(possible)[0]
     size = len(possible)
     solvable = np.zeros(terminal.shape, bool)
@@ -296,7 +314,13 @@ def _solvable(barriers: Barriers, terminal: np.ndarray) -> np.ndarray:
         graph = csr_array((np.ones(len(rows)), (rows, columns)), shape=(size + 1, size + 1))
         reached = breadth_first_order(graph, size, return_predecessors=False)
         solvable[task, reached[reached < size]] = True
-    return solvable & ~terminal
+    return (solvable | (discount < 1)[:, None]) & ~terminal
+
+
+def _possible(barriers: Barriers) -> Bool[np.ndarray, "states actions attempts"]:
+    """Return whether each attempt can succeed, were all unknown barriers open."""
+    closed = np.append(barriers.known == Cell.OCCUPIED, False)
+    return (barriers.attempts > 0) & ~closed[barriers.needed].any(axis=-1)
 
 
 def _transitions(barriers: Barriers, demonstrations: Demonstrations, terms: Terms) -> tuple[np.ndarray, np.ndarray]:
@@ -311,7 +335,7 @@ def _transitions(barriers: Barriers, demonstrations: Demonstrations, terms: Term
     stays = s == after
     np.add.at(stayed, (s[stays], a[stays]), weight[stays])
     s, a, after, weight = (each[~stays] for each in (s, a, after, weight))
-    leads = (barriers.successors[s, a] == after[:, None]) & (barriers.attempts[s, a] > 0)
+    leads = (barriers.successors[s, a] == after[:, None]) & _possible(barriers)[s, a]
     check(leads.any(axis=-1).all(), "expected transitions that the model allows", field="demonstrations")
     np.add.at(moved, (s, a, leads.argmax(axis=-1)), weight)
     return moved, stayed

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sidestep.errors import check
-from sidestep.inference.chains import PASSING, crossed_barriers
+from sidestep.inference.chains import PASSING, check_prior, crossed_barriers
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.demonstrations import Demonstrations
@@ -26,7 +26,7 @@ class ExactPosterior(NamedTuple):
     """The exact posterior of barriers.
 
     Attributes:
-        closed: P(closed) of each barrier.
+        closed: P(closed) of each barrier; exactly 0 or 1 where it is known or was crossed.
         log_evidence: ln Σ L(z) p(z), with the prior up to its constant, and the actions' part of L to the power κ.
     """
 
@@ -57,7 +57,7 @@ def enumerate_barriers(
         P(closed) of each barrier, and the evidence.
 
     Raises:
-        InputError: For more than 16 barriers that are unknown and that no walk crossed.
+        InputError: For more than 16 barriers that are unknown and that no walk crossed, and a prior of others.
 
     Example:
         >>> import sidestep as ss
@@ -69,6 +69,7 @@ def enumerate_barriers(
         [0.0, 0.0, 0.5]
     """
     barriers = barriers_of(model)
+    check_prior(barriers, prior)
     crossed = crossed_barriers(barriers, demonstrations, terms)
     free = np.flatnonzero((barriers.known == Cell.UNKNOWN) & ~crossed)
     message = f"expected at most {MAX_BARRIERS} unknown barriers to enumerate, found {len(free)}"
@@ -91,5 +92,5 @@ def enumerate_barriers(
     parts = [log_likelihoods(jnp.asarray(maps[at : at + _BATCH])) for at in range(0, len(maps), _BATCH)]
     log_posterior = np.concatenate(parts) @ weights + [prior.log_density(each) for each in maps]
     log_evidence = np.logaddexp.reduce(log_posterior)
-    closed = np.exp(log_posterior - log_evidence) @ maps
-    return ExactPosterior(closed, float(log_evidence))
+    closed = np.minimum(np.exp(log_posterior - log_evidence) @ maps, 1.0)  # sums of rounded numbers
+    return ExactPosterior(np.where(maps.all(axis=0), 1.0, closed), float(log_evidence))

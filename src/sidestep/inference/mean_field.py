@@ -43,7 +43,7 @@ class MeanField(Prior):
     weights: Float[Array, " 4"]
     known: Int[Array, "*shape"]
 
-    def __init__(self, prior: BinaryMRF, known: Int[Array, "*shape"] | Int[np.ndarray, "*shape"]):
+    def __init__(self, prior: BinaryMRF, known: Int[Array | np.ndarray, "*shape"]):
         self.field, self.weights = (
             to_jax(prior.field, jnp.result_type(float)),
             to_jax(prior.weights, jnp.result_type(float)),

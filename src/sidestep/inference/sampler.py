@@ -24,7 +24,7 @@ Barriers that walks crossed are open and stay so.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -33,7 +33,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from sidestep.errors import check, check_count
-from sidestep.inference.chains import BarrierProblem, ChainState, barrier_problem
+from sidestep.inference.chains import BarrierProblem, ChainState, barrier_problem, check_prior
 from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
 from sidestep.inference.diagnostics import effective_sizes, split_rhat
 from sidestep.inference.fit import Estimate
@@ -156,9 +156,10 @@ class BarrierPosterior(Generic[Model]):
         """Return samples at equal distances along each chain.
 
         Args:
-            most: The most samples of all chains together.
+            most: The most samples of all chains together, at least their number.
         """
         chains, draws = self.samples.shape[:2]
+        check_count(most, chains, "most")
         step = math.ceil(chains * draws / most)
         return self.samples[:, step - 1 :: step].reshape(-1, self.samples.shape[-1])
 
@@ -250,12 +251,11 @@ def sample_barriers(
     check(0 < tempering <= 1, f"expected a number in (0, 1], found {tempering}", field="tempering")
     agents = behavior if isinstance(behavior, BehaviorModel) else behavior_model(behavior)
     barriers = barriers_of(model)
-    fits = len(prior.field) == len(barriers.known)
-    check(fits, f"expected {len(barriers.known)} barriers, found {len(prior.field)}", field="prior")
+    check_prior(barriers, prior)
     check_proper(demonstrations.tasks, agents.behavior_of(), model.graph.actions)
     problem = barrier_problem(barriers, demonstrations, agents, prior, tempering=tempering, terms=terms)
     states = start_chains(problem, sweeps, chains, seed)
-    saver = Saver(checkpoint, fingerprint((problem, sweeps, chains, seed)))
+    saver = Saver(checkpoint, fingerprint((astuple(problem), sweeps, chains, seed)))
     done = _load(saver, states) if resume else 0
     free = max(1, len(problem.free))
     for number in range(done, sweeps):
