@@ -5,6 +5,7 @@ line can show the defaults without delay.
 """
 
 from dataclasses import dataclass, field
+from math import isfinite
 from typing import Any, Literal, get_args
 
 from sidestep.errors import check, check_count, check_positive
@@ -76,7 +77,7 @@ class PriorConfig:
         wall_prior: The weight of `WallPrior` in nats, at least 0: the worth of a blocked cell between two others.
 
     Raises:
-        InputError: For an unknown kind.
+        InputError: For an unknown kind, and numbers of the binary prior that are not finite.
 
     Example:
         >>> PriorConfig(kind="normal", mean=0.0).variance
@@ -95,6 +96,9 @@ class PriorConfig:
 
     def __post_init__(self) -> None:
         _check_choice(self.kind, PriorKind, "prior")
+        for name in ("log_odds", *SHAPE_WEIGHTS["sample"]):
+            value = getattr(self, name)
+            check(value is None or isfinite(value), f"expected a finite number, found {value}", field=name)
 
     @property
     def first_logit(self) -> float:
