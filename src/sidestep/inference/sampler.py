@@ -99,6 +99,7 @@ class BarrierPosterior(Generic[Model]):
     Attributes:
         model: The transition model with the posterior's P(closed).
         behavior: The behavior model; it is not sampled.
+        sampled: Whether each barrier was sampled; the others are known, or walks crossed them.
         samples: Whether each barrier is closed, after each sweep that counts, for each chain.
         closed: P(closed) of each barrier: (n + ½)/(N + 1) of n samples in N; exactly 0 or 1 where it is known.
         rhat: Split-R̂ of each barrier.
@@ -119,6 +120,7 @@ class BarrierPosterior(Generic[Model]):
 
     model: Model
     behavior: BehaviorModel
+    sampled: Bool[np.ndarray, " barriers"]
     samples: Bool[np.ndarray, "chains draws barriers"]
     closed: Float[np.ndarray, " barriers"]
     rhat: Float[np.ndarray, " barriers"]
@@ -141,10 +143,18 @@ class BarrierPosterior(Generic[Model]):
     @property
     def message(self) -> str:
         """The status with its measure."""
-        sampled = self.samples.any(axis=(0, 1)) & ~self.samples.all(axis=(0, 1))
-        fraction = float((self.rhat <= MIXED_RHAT).mean())
-        size = f", median effective size {np.median(self.effective_sizes[sampled]):.0f}" if sampled.any() else ""
-        return f"{self.status.value} (split-R̂ at most {MIXED_RHAT} for {fraction:.0%} of the barriers{size})"
+        if not self.sampled.any():
+            return f"{self.status.value} (no barrier was unknown)"
+        size = np.median(self.effective_sizes[self.sampled])
+        return (
+            f"{self.status.value} (split-R̂ at most {MIXED_RHAT} for {self.fraction_mixed:.0%} of the sampled barriers, "
+            f"median effective size {size:.0f})"
+        )
+
+    @property
+    def fraction_mixed(self) -> float:
+        """The fraction of sampled barriers with split-R̂ of at most 1.05; 1 if there are none."""
+        return float((self.rhat[self.sampled] <= MIXED_RHAT).mean()) if self.sampled.any() else 1.0
 
     @property
     def description(self) -> str:
@@ -195,7 +205,7 @@ class BarrierPosterior(Generic[Model]):
             "iterations": final.iteration,
             "accepted": final.accepted,
             "largest_rhat": float(self.rhat.max()) if np.isfinite(self.rhat).all() else None,
-            "fraction_mixed": float((self.rhat <= MIXED_RHAT).mean()),
+            "fraction_mixed": self.fraction_mixed,
             "smallest_effective_size": float(self.effective_sizes.min()),
             "converged": self.converged,
             "message": self.message,
@@ -272,7 +282,9 @@ def sample_barriers(
     mixed = (rhat[problem.free] <= MIXED_RHAT).mean() >= _MIXED_FRACTION if len(problem.free) else True
     status = Status.MIXED if mixed else Status.NOT_MIXED
     learned = with_closed(model, np.clip(closed, _SURE, 1 - _SURE))
-    return BarrierPosterior(learned, agents, samples, closed, rhat, effective_sizes(samples), history, status)
+    sampled = np.isin(np.arange(len(closed)), problem.free)
+    sizes = effective_sizes(samples)
+    return BarrierPosterior(learned, agents, sampled, samples, closed, rhat, sizes, history, status)
 
 
 def heated_sweeps(sweeps: int) -> int:

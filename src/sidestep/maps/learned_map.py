@@ -52,7 +52,7 @@ class PlannedPath:
         open_probability: The probability that the path is open: over maps from the posterior, or where there are none
             the product over its cells, as if they were independent.
         expected_length: The mean length in metres that the robot executes in maps from the posterior, with bumps and
-            detours; None where there are none.
+            detours; None where there are none, or where it arrives in none.
         alternatives: Other paths, the shortest first, where a risk was named.
     """
 
@@ -164,8 +164,9 @@ class LearnedMap:
             blocked.reshape(-1)[self.visited[:, 0]] = 0.0
             risk = independent_open_probability(self.grid, states, blocked), None
         else:
-            expected = expected_length(self.grid, plan, first, self.samples) * self.grid.resolution
-            risk = open_probability(self.grid, states, self.samples), expected
+            expected = expected_length(self.grid, plan, first, self.samples)
+            metres = None if expected is None else expected * self.grid.resolution
+            risk = open_probability(self.grid, states, self.samples), metres
         return PlannedPath(states, positions, self.blocked.reshape(-1)[states], length, *risk)
 
     def evaluate(

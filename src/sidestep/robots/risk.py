@@ -71,7 +71,7 @@ def independent_open_probability(
     return float(np.prod(1 - blocked.reshape(-1)[required_cells(grid, path)]))
 
 
-def expected_length(grid: Grid, plan: GoalPlan, start: int, samples: Maps) -> float:
+def expected_length(grid: Grid, plan: GoalPlan, start: int, samples: Maps) -> float | None:
     """Return the mean length that a robot executes in maps of the posterior, with bumps and detours.
 
     Args:
@@ -81,7 +81,7 @@ def expected_length(grid: Grid, plan: GoalPlan, start: int, samples: Maps) -> fl
         samples: Whether each cell is blocked, in each map; at most 40, at equal distances, are used.
 
     Returns:
-        A length in cell sides, over the maps in which the robot arrives; NaN where it never does.
+        A length in cell sides, over the maps in which the robot arrives; None where it never does.
     """
     lengths = []
     for blocked in samples[:: -(-len(samples) // _EXECUTED)]:
@@ -93,4 +93,4 @@ def expected_length(grid: Grid, plan: GoalPlan, start: int, samples: Maps) -> fl
         )
         lengths.append(plan.executed_lengths(grid_environment(truth), np.array([start]))[0])
     arriving = np.array(lengths)[np.isfinite(lengths)]
-    return float(arriving.mean()) if len(arriving) else float("nan")
+    return float(arriving.mean()) if len(arriving) else None
