@@ -63,31 +63,41 @@ def flat(settings: Any, prefix: str = "") -> dict[str, Any]:
 def changed(settings: Any, overrides: Sequence[str]) -> Any:
     """Return a dataclass with some fields changed, each written as `field=value`; `null` is None.
 
-    The name of a field in another dataclass may be shortened to its last part.
+    The name of a field in another dataclass may be shortened to its last part. All fields are set before a dataclass
+    checks how they go together.
 
     Raises:
         InputError: for a field that does not exist, and for a value of another type.
     """
+    values: dict[str, Any] = {}
     for override in overrides:
         name, _, text = override.partition("=")
         names = [known for known in flat(settings) if f".{known}".endswith(f".{name}")]
         if not names:
             expected = ", ".join(flat(settings))
             raise InputError(f"expected one of {expected} and a value, found {override!r}", source="--set")
-        settings = _replaced(settings, names[0].split("."), yaml.safe_load(text))
-    return settings
+        values[names[0]] = yaml.safe_load(text)
+    return _replaced(settings, values)
 
 
-def _replaced(settings: Any, path: Sequence[str], value: Any) -> Any:
-    name, *rest = path
-    hint = get_type_hints(type(settings))[name]
-    if rest:
-        value = _replaced(getattr(settings, name), rest, value)
-    elif type(value) is int and float in (hint, *get_args(hint)):
-        value = float(value)
-    elif not _fits(value, hint):
+def _replaced(settings: Any, values: Mapping[str, Any], prefix: str = "") -> Any:
+    """Return a dataclass with the values of some fields, by names with dots."""
+    hints, own = get_type_hints(type(settings)), {}
+    for each in fields(settings):
+        name = prefix + each.name
+        if name in values:
+            own[each.name] = _typed(values[name], hints[each.name], each.name)
+        elif any(other.startswith(f"{name}.") for other in values):
+            own[each.name] = _replaced(getattr(settings, each.name), values, f"{name}.")
+    return replace(settings, **own)
+
+
+def _typed(value: Any, hint: Any, name: str) -> Any:
+    if type(value) is int and float in (hint, *get_args(hint)):
+        return float(value)
+    if not _fits(value, hint):
         raise InputError(f"cannot be {value!r}", source="--set", field=name)
-    return replace(settings, **{name: value})
+    return value
 
 
 def described(settings: Any) -> str:

@@ -1,7 +1,7 @@
 """How well maps of simulated domains are learned: offices, apartments, and floors with blocks.
 
     python -m benchmarks domains --json domains.json
-    python -m benchmarks domains --domains offices --walks 100 --set wall_prior=2
+    python -m benchmarks domains --domains offices --walks 100 --set prior.kind=normal wall_prior=2
     python -m benchmarks domains --rows 40 --columns 60 --goals 12 --walks 200 --beta 50
 
 Maps are drawn by seed (`sidestep.worlds`). Agents walk from random cells to a few goals on best paths, ties at random;

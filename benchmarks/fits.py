@@ -11,6 +11,8 @@ and how well P(blocked) of all unknown cells is calibrated, of which the picture
 
 Records: those of `people.py`, with `cells`, `goals`, `walks`, `hidden_walls`, `relevant_walls`, `peak_bytes` (of the
 whole process up to then).
+
+Settings are those of `CONFIG`, with the normal prior and its mode.
 """
 
 from collections.abc import Iterator, Sequence

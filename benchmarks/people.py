@@ -1,6 +1,7 @@
 """How well walls are learned from the walks of real people (or rats), which nobody bumped into.
 
-    python -m benchmarks people --set beta=5 prior.mean=-2
+    python -m benchmarks people --set beta=5 log_odds=-3
+    python -m benchmarks people --set prior.kind=normal prior.mean=-2
     python -m benchmarks people --set select=true --seeds 1
     python -m benchmarks people --animal rats --trials 1 4 --json rats.json
 

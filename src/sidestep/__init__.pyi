@@ -48,6 +48,7 @@ from .tabular.models import (
     true_model as true_model,
     walled_grid as walled_grid,
 )
+from .tabular.models.barriers import Barriers as Barriers, barriers_of as barriers_of
 
 # behavior: how agents choose their actions
 from .tabular.backups import (
@@ -81,6 +82,8 @@ from .inference.calibration import (
     score_statistics as score_statistics,
 )
 from .inference.checkpoints import Checkpoint as Checkpoint
+from .inference.diagnostics import effective_sizes as effective_sizes, split_rhat as split_rhat
+from .inference.enumeration import ExactPosterior as ExactPosterior, enumerate_barriers as enumerate_barriers
 from .inference.fit import Estimate as Estimate, Fit as Fit, fit as fit
 from .inference.maximize import Progress as Progress, Status as Status
 from .inference.goals import GoalFit as GoalFit, fit_goals as fit_goals, goal_posterior as goal_posterior
@@ -90,6 +93,8 @@ from .inference.laplace import (
     laplace as laplace,
     natural_scale as natural_scale,
 )
+from .inference.mean_field import MeanField as MeanField
+from .inference.mrf import BinaryMRF as BinaryMRF
 from .inference.nuts import Draws as Draws, sample as sample
 from .inference.objective import Parameters as Parameters, tasks_mesh as tasks_mesh
 from .inference.optimizers import LBFGS as LBFGS, Adam as Adam, Optimizer as Optimizer, Rprop as Rprop
@@ -101,11 +106,18 @@ from .inference.priors import (
     WallPrior as WallPrior,
     sensor_prior as sensor_prior,
 )
+from .inference.pseudolikelihood import MRFFit as MRFFit, fit_mrf as fit_mrf
+from .inference.sampler import (
+    BarrierPosterior as BarrierPosterior,
+    SweepProgress as SweepProgress,
+    sample_barriers as sample_barriers,
+)
 from .maps.annotations import WalkAnnotations as WalkAnnotations
 from .maps.config import (
     BehaviorConfig as BehaviorConfig,
     FitConfig as FitConfig,
     MapConfig as MapConfig,
+    PosteriorConfig as PosteriorConfig,
     PriorConfig as PriorConfig,
 )
 from .maps.goal_candidates import GoalCandidates as GoalCandidates, read_goal_candidates as read_goal_candidates

@@ -13,6 +13,7 @@ from benchmarks.__main__ import main, run
 import benchmarks
 from benchmarks import planning, rollouts, scaling
 from sidestep.errors import InputError
+from sidestep.maps.config import MapConfig
 
 
 @dataclass
@@ -62,6 +63,13 @@ def test_changed_reads_fields_and_refuses_others():
     for wrong in ("sizes", "beta=x", "nothing=1"):
         with pytest.raises(InputError, match="--set"):
             benchmarks.changed(settings, [wrong])
+
+
+def test_changed_checks_fields_that_go_together_after_all_are_set():
+    config = benchmarks.changed(MapConfig(), ["posterior.method=mode", "prior.kind=normal", "prior.mean=-2"])
+    assert (config.posterior.method, config.prior.kind, config.prior.mean) == ("mode", "normal", -2.0)
+    with pytest.raises(InputError, match="posterior"):
+        benchmarks.changed(MapConfig(), ["posterior.method=mode"])
 
 
 def test_mean_over_averages_within_groups_first():

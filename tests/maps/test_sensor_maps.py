@@ -23,7 +23,7 @@ from sidestep.worlds.rooms import rooms_in_a_row
 
 pytestmark = pytest.mark.slow
 
-NORMAL = ("--prior-mean", 0.5, "--prior-variance", 4, "--wall-prior", 0)
+NORMAL = ("--prior", "normal", "--prior-mean", 0.5, "--prior-variance", 4, "--wall-prior", 0)
 """Cells are independent, so that the observation of one cell moves no other."""
 
 SEEN = np.rint(255 * np.random.default_rng(3).uniform(0.05, 0.95, (5, 5))) / 255

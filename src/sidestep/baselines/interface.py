@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sidestep.evaluation.study import MethodResult
-from sidestep.maps.config import MapConfig
+from sidestep.maps.config import MapConfig, PriorConfig
 from sidestep.maps.fit import behavior_of
 from sidestep.robots.planners import Planner
 from sidestep.robots.robot import risk_averse_robot
@@ -91,7 +91,7 @@ def with_normal_prior(config: MapConfig) -> MapConfig:
     Args:
         config: The configuration of the comparison.
     """
-    prior = replace(config.prior, kind="normal")
+    prior = config.prior if config.prior.kind == "normal" else PriorConfig("normal")
     return replace(config, prior=prior, posterior=replace(config.posterior, method="mode"))
 
 

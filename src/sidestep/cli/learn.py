@@ -14,7 +14,7 @@ _SYMBOLS = {"beta": "β", "discount": "γ"}
 
 @with_learn_options
 def learn(walks: Walks, map_file: MapFile, out: Folder, options: LearnOptions) -> None:
-    """Learn a map from a table of walks: map.yaml, map.pgm, blocked.npy, summary.json, learned.png."""
+    """Learn a map from a table of walks: map.yaml, blocked.npy, samples.npz, summary.json, learned.png."""
     from sidestep.cli.display import fit_progress, print_lines, print_notes, with_error
     from sidestep.io.walks import read_walks
     from sidestep.maps.fit import max_iterations

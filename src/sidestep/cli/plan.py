@@ -14,19 +14,24 @@ def plan(
     goal: Annotated[str, typer.Option(help="In metres.", metavar="X,Y")],
     out: Annotated[Path | None, typer.Option("--out", help="The folder to write to (DIR/plan).", metavar="DIR")] = None,
     bump_cost: BumpCost = BUMP_COST,
+    max_risk: Annotated[
+        float | None, typer.Option(help="The largest probability that the path is not open.", metavar="P")
+    ] = None,
 ) -> None:
     """Plan a path in a learned map: path.csv, path.png, summary.json."""
     import numpy as np
 
-    from sidestep.cli.display import print_lines
+    from sidestep.cli.display import print_lines, print_notes
     from sidestep.cli.drawing import draw
     from sidestep.maps.learned_map import add_to_summary, load_map
 
     out = out or folder / "plan"
     first, last = position_of(start, "--start"), position_of(goal, "--goal")
     learned = load_map(folder)
-    path = learned.plan(first, last, bump_cost=bump_cost)
-    picture = draw("figure_plan", out / "path.png", learned.grid, learned.blocked, path.states)
+    path = learned.plan(first, last, bump_cost=bump_cost, max_risk=max_risk)
+    others = [other.states for other in path.alternatives]
+    title = f"Planned path, open with probability {path.open_probability:.2f}"
+    picture = draw("figure_plan", out / "path.png", learned.grid, learned.blocked, path.states, others, title)
     # imported while the second process draws
     import pyarrow as pa
 
@@ -35,10 +40,26 @@ def plan(
     x, y = path.positions.T
     write_table(out / "path.csv", pa.table({"step": np.arange(len(x)), "x": x, "y": y, "blocked": path.blocked}))
     moves, likeliest = len(path.states) - 1, float(path.blocked.max())
-    settings = {"command": "plan", "start": first, "goal": last, "bump_cost": bump_cost}
-    risk = {"max_probability_blocked": likeliest, "probability_free": float(np.prod(1 - path.blocked))}
+    settings = {"command": "plan", "start": first, "goal": last, "bump_cost": bump_cost, "max_risk": max_risk}
+    alternatives = [
+        {"length_metres": other.length, "open_probability": other.open_probability} for other in path.alternatives
+    ]
+    risk = {
+        "max_probability_blocked": likeliest,
+        "open_probability": path.open_probability,
+        "expected_length_metres": path.expected_length,
+        "alternatives": alternatives,
+    }
     summary = {**settings, "moves": moves, "length_metres": path.length, **risk}
     add_to_summary(folder, out, "plan", summary)
     picture.result()
     print_lines(f"{moves} moves, {path.length:g} m; the likeliest obstacle on the way has P(blocked) = {likeliest:.3f}")
+    joint = "in maps from the posterior" if learned.samples is not None else "if cells were independent"
+    print_lines(f"open with probability {path.open_probability:.3f} {joint}")
+    if path.expected_length is not None:
+        print_lines(f"expected length with bumps and detours: {path.expected_length:.4g} m")
+    for other in path.alternatives:
+        print_lines(f"alternative: {other.length:g} m, open with probability {other.open_probability:.3f}")
+    if max_risk is not None and 1 - path.open_probability > max_risk:
+        print_notes(f"warning: no path has a risk of at most {max_risk:g}; this one has the least")
     print_lines(f"path in {out}")

@@ -1,8 +1,7 @@
 """A Metropolis chain over the barriers of a model: its state, its evidence, and its sweeps.
 
 `sampler` describes the chain, `chain_kernels` holds its native code. Values are solved from nothing before the first
-sweep, by the solver of `sidestep.tabular.solvers.values`. From then on they are followed by local value iteration, and
-every ten sweeps by value iteration of all states to a finer tolerance.
+sweep, by the solver of `sidestep.tabular.solvers.values`, and followed by local value iteration from then on.
 """
 
 from dataclasses import dataclass
@@ -39,12 +38,12 @@ PASSING = (0.997, 0.003)
 _FLIPS, _MOVES = 0.6, 0.8
 """The cumulative probabilities of flips and of moves; the rest are runs."""
 _FRESH_SWEEPS = 10
-"""The number of sweeps after which all values are solved anew."""
+"""The number of sweeps after which all states are solved again, from the values at hand."""
 _NEG_INF = neg_inf(jnp.dtype(float))
 _TOLERANCE = 7e-4
 """The change of β V that is passed on (nats)."""
 _FINER = 0.01
-"""The factor of that tolerance where all values are solved anew."""
+"""The factor of that tolerance where all states are solved again."""
 _EXACT, _MAX_SWEEPS = 1e-9, 5_000
 """The tolerance of values solved from nothing, and the most sweeps."""
 
@@ -163,7 +162,7 @@ class BarrierProblem:
         refresh(self.world, exact, state.chain, state.work, *self.backup, _NEG_INF)
 
     def sweep(self, state: ChainState, number: int, heat: float) -> None:
-        """Make one proposal for each free barrier.
+        """Make as many proposals as there are free barriers.
 
         Args:
             state: The chain, changed in place.

@@ -27,7 +27,7 @@ class ExactPosterior(NamedTuple):
 
     Attributes:
         closed: P(closed) of each barrier; exactly 0 or 1 where it is known or was crossed.
-        log_evidence: ln Σ L(z)^κ p(z), with the prior up to its constant.
+        log_evidence: ln Σ L(z) p(z), with the prior up to its constant, and the actions' part of L to the power κ.
     """
 
     closed: Float[np.ndarray, " barriers"]

@@ -126,7 +126,7 @@ def fit_goals(
     behavior: Behavior,
     learn: Callable[[Model, Demonstrations], Fit[Model]],
     *,
-    rounds: int = 20,
+    rounds: int = 40,
     tolerance: float = 1e-3,
 ) -> GoalFit[Model]:
     """Learn a model and the goals of trajectories by expectation maximization.

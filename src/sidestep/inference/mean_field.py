@@ -33,7 +33,6 @@ class MeanField(Prior):
         known: The state of each cell as in `Grid.known`, or of each barrier; known ones are part of the shapes.
 
     Example:
-        >>> import numpy as np
         >>> from sidestep.inference.mrf import BinaryMRF
         >>> prior = MeanField(BinaryMRF(np.zeros(3), (1, 3)), np.array([[-1, 0, 1]]))
         >>> round(float(prior.log_density(jnp.zeros(3))), 3)  # the entropy of one cell, ln 2

@@ -1,19 +1,20 @@
 """Samples of barriers from their posterior, by a Metropolis chain with exact values.
 
-    p(z | walks) ∝ L(z)^κ p(z),      z(i) = 1 where barrier i is closed
+    p(z | walks) ∝ L(z) p(z),      z(i) = 1 where barrier i is closed
 
-Each map z has transitions of its own, and L(z) is the likelihood of `sidestep.tabular.likelihood` with these. A closed
+Each map z has transitions of its own, and L(z) is the likelihood of `sidestep.tabular.likelihood` with these, its part
+of the actions to the power κ (`tempering`). A closed
 barrier lets an agent pass with probability .003, an open one with .997, so that no observation is impossible.
 
 The chain is that of Metropolis et al. (1953), *Equation of state calculations by fast computing machines*:
 
-1. A proposal flips a barrier, moves a closed cell to one of the eight cells around it, or flips a run of 2 to 7 equal
-   cells of a row or column. A proposal and its reverse are equally probable.
+1. A proposal flips a barrier, exchanges a cell with one of the eight around it that is not equal, or flips a run of 2
+   to 7 equal cells of a row or column. A proposal and its reverse are equally probable.
 2. It is accepted in two stages (delayed acceptance, Christen & Fox 2005): with probability min(1, p(z′)/p(z)) by the
    prior, and if so with probability min(1, L(z′)/L(z)). The likelihood is computed for what the prior accepts only.
    Detailed balance holds in each stage, so also together.
 3. Values follow a proposal by local value iteration (`chain_kernels`) up to a tolerance. Every ten sweeps all states
-   are solved to a finer one. So the chain is exact up to the tolerance.
+   are solved again, from the values at hand, to a hundredth of it. So the chain is exact up to the tolerance.
 4. In the first third of the sweeps the posterior is heated: log p/T, with T falling from 4 to 1. These are dropped.
 5. Several chains start from few and from many closed barriers. Split-R̂ and effective sample sizes
    (`diagnostics`) compare them.
@@ -98,6 +99,7 @@ class BarrierPosterior(Generic[Model]):
     Attributes:
         model: The transition model with the posterior's P(closed).
         behavior: The behavior model; it is not sampled.
+        sampled: Whether each barrier was sampled; the others are known, or walks crossed them.
         samples: Whether each barrier is closed, after each sweep that counts, for each chain.
         closed: P(closed) of each barrier: (n + ½)/(N + 1) of n samples in N; exactly 0 or 1 where it is known.
         rhat: Split-R̂ of each barrier.
@@ -118,6 +120,7 @@ class BarrierPosterior(Generic[Model]):
 
     model: Model
     behavior: BehaviorModel
+    sampled: Bool[np.ndarray, " barriers"]
     samples: Bool[np.ndarray, "chains draws barriers"]
     closed: Float[np.ndarray, " barriers"]
     rhat: Float[np.ndarray, " barriers"]
@@ -140,10 +143,18 @@ class BarrierPosterior(Generic[Model]):
     @property
     def message(self) -> str:
         """The status with its measure."""
-        sampled = self.samples.any(axis=(0, 1)) & ~self.samples.all(axis=(0, 1))
-        fraction = float((self.rhat <= MIXED_RHAT).mean())
-        size = f", median effective size {np.median(self.effective_sizes[sampled]):.0f}" if sampled.any() else ""
-        return f"{self.status.value} (split-R̂ at most {MIXED_RHAT} for {fraction:.0%} of the barriers{size})"
+        if not self.sampled.any():
+            return f"{self.status.value} (no barrier was unknown)"
+        size = np.median(self.effective_sizes[self.sampled])
+        return (
+            f"{self.status.value} (split-R̂ at most {MIXED_RHAT} for {self.fraction_mixed:.0%} of the sampled barriers, "
+            f"median effective size {size:.0f})"
+        )
+
+    @property
+    def fraction_mixed(self) -> float:
+        """The fraction of sampled barriers with split-R̂ of at most 1.05; 1 if there are none."""
+        return float((self.rhat[self.sampled] <= MIXED_RHAT).mean()) if self.sampled.any() else 1.0
 
     @property
     def description(self) -> str:
@@ -185,7 +196,6 @@ class BarrierPosterior(Generic[Model]):
         final = self.final
         learned = {name: number._asdict() for name, number in self.learned_behavior.items()}
         return {
-            "posterior": "sample",
             "objective": final.objective,
             "log_likelihood_actions": final.actions,
             "log_likelihood_transitions": final.transitions,
@@ -195,7 +205,7 @@ class BarrierPosterior(Generic[Model]):
             "iterations": final.iteration,
             "accepted": final.accepted,
             "largest_rhat": float(self.rhat.max()) if np.isfinite(self.rhat).all() else None,
-            "fraction_mixed": float((self.rhat <= MIXED_RHAT).mean()),
+            "fraction_mixed": self.fraction_mixed,
             "smallest_effective_size": float(self.effective_sizes.min()),
             "converged": self.converged,
             "message": self.message,
@@ -227,7 +237,7 @@ def sample_barriers(
         prior: The prior of the barriers.
         tempering: κ in (0, 1], a factor of the actions' log-likelihood.
         terms: The parts of the likelihood that count.
-        sweeps: The number of sweeps of each chain, at least 12; a sweep is a proposal for each unknown barrier.
+        sweeps: The number of sweeps of each chain, at least 12; a sweep has a proposal for each unknown barrier.
         chains: The number of chains, at least 2.
         seed: The seed. The result does not depend on the number of cores.
         report: Called with a `SweepProgress` after every sweep.
@@ -272,7 +282,9 @@ def sample_barriers(
     mixed = (rhat[problem.free] <= MIXED_RHAT).mean() >= _MIXED_FRACTION if len(problem.free) else True
     status = Status.MIXED if mixed else Status.NOT_MIXED
     learned = with_closed(model, np.clip(closed, _SURE, 1 - _SURE))
-    return BarrierPosterior(learned, agents, samples, closed, rhat, effective_sizes(samples), history, status)
+    sampled = np.isin(np.arange(len(closed)), problem.free)
+    sizes = effective_sizes(samples)
+    return BarrierPosterior(learned, agents, sampled, samples, closed, rhat, sizes, history, status)
 
 
 def heated_sweeps(sweeps: int) -> int:

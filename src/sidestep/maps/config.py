@@ -18,6 +18,8 @@ Learnable = Literal["beta", "lapse", "discount"]
 PriorKind = Literal["binary", "normal"]
 PosteriorMethod = Literal["sample", "mean_field", "mode"]
 
+_BINARY_FIELDS = ("log_odds", "lines", "pairs", "blocks", "isolated")
+_NORMAL_FIELDS = ("mean", "variance", "wall_prior")
 LOG_ODDS = -2.5
 """The default of `PriorConfig.log_odds`."""
 SHAPE_WEIGHTS = {
@@ -96,6 +98,10 @@ class PriorConfig:
 
     def __post_init__(self) -> None:
         _check_choice(self.kind, PriorKind, "prior")
+        others = _NORMAL_FIELDS if self.kind == "binary" else _BINARY_FIELDS
+        for name in others:
+            unset = getattr(self, name) == getattr(type(self), name)
+            check(unset, f"belongs to the other prior: expected none for a {self.kind} prior", field=name)
         for name in ("log_odds", *SHAPE_WEIGHTS["sample"]):
             value = getattr(self, name)
             check(value is None or isfinite(value), f"expected a finite number, found {value}", field=name)

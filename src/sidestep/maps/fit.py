@@ -48,7 +48,7 @@ from sidestep.tabular.solve import SolveOptions
 MapPosterior = Fit[ObstacleGrid] | BarrierPosterior[ObstacleGrid]
 """What is learned of a map: a fit, or samples."""
 
-_PROPOSALS, _FEWEST_SWEEPS, _MOST_SWEEPS = 6_000_000, 150, 600
+_PROPOSALS, _FEWEST_SWEEPS, _MOST_SWEEPS = 6_000_000, 150, 300
 """The number of sweeps is this number over unknown cells × goals, within these bounds."""
 _BLOCKED_LOGIT = 8.0
 """The first logit of an unvisited cell of a large map: some 3,000 tries, longer than most detours."""
@@ -106,7 +106,8 @@ def posterior_method(config: MapConfig, unknown: int, goals: int) -> PosteriorMe
         return config.posterior.method
     if config.prior.kind == "normal":
         return "mode"
-    return "sample" if unknown * goals <= MAX_SAMPLED and config.behavior.horizon is None else "mean_field"
+    samples = config.behavior.horizon is None and config.fit.gradient == "exact" and unknown * goals <= MAX_SAMPLED
+    return "sample" if samples else "mean_field"
 
 
 def sweeps_for(config: MapConfig, unknown: int, goals: int) -> int:
@@ -177,6 +178,8 @@ def infer_map(
         return fit_map(model, demonstrations, config, sensor=sensor, behavior=behavior, callback=callback, **run)
     message = "maps are sampled without a horizon: expected none, or the posterior mean_field"
     check(config.behavior.horizon is None, message, field="horizon")
+    message = "maps are sampled without a gradient: expected exact, or the posterior mean_field"
+    check(config.fit.gradient == "exact", message, field="gradient")
     learned: Fit[ObstacleGrid] | None = None
     if any(leaf is not None for leaf in behavior.parameters):
         learned = fit_map(model, demonstrations, config, sensor=sensor, behavior=behavior, callback=callback)

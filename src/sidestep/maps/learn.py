@@ -18,7 +18,7 @@ from sidestep.inference.sampler import BarrierPosterior, SweepProgress
 from sidestep.io.gridding import Moves, grid_walks
 from sidestep.io.walks import Walks
 from sidestep.maps.annotations import NO_ANNOTATIONS, WalkAnnotations, persons_of
-from sidestep.maps.config import MapConfig
+from sidestep.maps.config import MapConfig, PosteriorMethod
 from sidestep.maps.fit import MapPosterior, behavior_model_of, demonstrations_of, infer_map
 from sidestep.maps.goal_candidates import GoalPosterior, fit_with_unknown_goals
 from sidestep.maps.learned_map import LearnedMap
@@ -88,6 +88,13 @@ class Learning:
     seconds: float
     peak_memory_bytes: int | None
 
+    @property
+    def method(self) -> PosteriorMethod:
+        """How the posterior was found."""
+        if isinstance(self.fit, BarrierPosterior):
+            return "sample"
+        return "mean_field" if self.config.prior.kind == "binary" else "mode"
+
     def summary(self) -> dict[str, Any]:
         """Return the content of `summary.json`: plain numbers, texts, lists and dictionaries."""
         behavior = self.fit.behavior.behavior_of()
@@ -102,6 +109,7 @@ class Learning:
                 **(self.selection.summary() if self.selection else {}),
             },
             "data": asdict(self.data),
+            "posterior": self.method,
             "resumed": self.resumed,
             "notes": list(self.notes),
             **self.fit.summary(),
@@ -165,6 +173,8 @@ def learn_map(
     model = ObstacleGrid(grid, first_logits(sensor, grid.known, config.prior))
     candidates, goals, names, person = annotations.goal_candidates, None, [], None
     if candidates is not None:
+        message = "maps are not sampled where goals are unknown: expected mean_field, or none for the default"
+        check(config.posterior.method != "sample", message, field="posterior")
         goals = fit_with_unknown_goals(model, grid, moves, candidates, walks.labels, config, sensor, callback)
         fit, demonstrations = goals.fit.fit, demonstrations_of(goals.moves, grid, config)
     else:

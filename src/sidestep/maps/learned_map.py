@@ -23,6 +23,7 @@ from sidestep._files import read_array, read_json, write_array, write_arrays, wr
 from sidestep.errors import check, input_errors
 from sidestep.io.maps import read_map, write_map
 from sidestep.robots.planners import ModelPlanner
+from sidestep.robots.risk import expected_length, independent_open_probability, open_probability
 from sidestep.robots.robot import BUMP_COST, risk_averse_robot
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 from sidestep.tabular.models import ObstacleGrid
@@ -35,6 +36,9 @@ if TYPE_CHECKING:
 
 Position = tuple[float, float]
 
+_BUMP_FACTORS = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
+"""The factors of the bump cost at which paths are planned where a risk is named."""
+
 
 @dataclass(frozen=True, eq=False)
 class PlannedPath:
@@ -45,12 +49,20 @@ class PlannedPath:
         positions: x, y of their centers in metres.
         blocked: P(blocked) of each.
         length: The length of the path in metres.
+        open_probability: The probability that the path is open: over maps from the posterior, or where there are none
+            the product over its cells, as if they were independent.
+        expected_length: The mean length in metres that the robot executes in maps from the posterior, with bumps and
+            detours; None where there are none, or where it arrives in none.
+        alternatives: Other paths, the shortest first, where a risk was named.
     """
 
     states: Int[np.ndarray, " steps"]
     positions: Float[np.ndarray, "steps 2"]
     blocked: Float[np.ndarray, " steps"]
     length: float
+    open_probability: float
+    expected_length: float | None
+    alternatives: tuple["PlannedPath", ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,27 +116,58 @@ class LearnedMap:
         """
         return risk_averse_robot(self.model, self.visited[:, 0], bump_cost)
 
-    def plan(self, start: Position, goal: Position, *, bump_cost: float = BUMP_COST) -> PlannedPath:
-        """Plan a path as a robot does.
+    def plan(
+        self, start: Position, goal: Position, *, bump_cost: float = BUMP_COST, max_risk: float | None = None
+    ) -> PlannedPath:
+        """Plan a path as a robot does, or the shortest path with a bounded risk.
+
+        With `max_risk`, paths are planned at several bump costs. The shortest of those that are open with a probability
+        of 1 − `max_risk` or more is chosen, or where there is none the one that is most probably open.
 
         Args:
             start: x, y in metres.
             goal: x, y in metres.
             bump_cost: As for `robot`.
+            max_risk: The largest probability that the path is not open, from 0 to 1; None for the robot's own path.
 
         Returns:
-            The states, positions and P(blocked) along the path, and its length in metres.
+            The states, positions and P(blocked) along the path, its length in metres, and its risk.
 
         Raises:
-            InputError: For positions outside the map or in known obstacles, and where there is no path.
+            InputError: For positions outside the map or in known obstacles, where there is no path, and for a risk
+                outside [0, 1].
         """
         first, last = state_at(self.grid, start, "start"), state_at(self.grid, goal, "goal")
-        states = self.robot(bump_cost).plan_to(last).paths_from(np.array([first]))[0]
+        if max_risk is None:
+            return self._planned(first, last, bump_cost, start, goal)
+        check(0 <= max_risk <= 1, f"expected a probability, found {max_risk}", field="max_risk")
+        paths: list[PlannedPath] = []
+        for factor in _BUMP_FACTORS:
+            path = self._planned(first, last, factor * bump_cost, start, goal)
+            if not any(np.array_equal(path.states, other.states) for other in paths):
+                paths.append(path)
+        paths.sort(key=lambda path: path.length)
+        sure = [path for path in paths if 1 - path.open_probability <= max_risk]
+        chosen = sure[0] if sure else max(paths, key=lambda path: path.open_probability)
+        return replace(chosen, alternatives=tuple(path for path in paths if path is not chosen))
+
+    def _planned(self, first: int, last: int, bump_cost: float, start: Position, goal: Position) -> PlannedPath:
+        """Return the robot's path between two states; positions are for the message."""
+        plan = self.robot(bump_cost).plan_to(last)
+        states = plan.paths_from(np.array([first]))[0]
         arrives = states[-1] == last
         check(arrives, f"expected a path from {start} to {goal} in the learned map, found none", field="goal")
         positions = self.grid.centers(states)
         length = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
-        return PlannedPath(states, positions, self.blocked.reshape(-1)[states], length)
+        if self.samples is None:
+            blocked = self.blocked.copy()
+            blocked.reshape(-1)[self.visited[:, 0]] = 0.0
+            risk = independent_open_probability(self.grid, states, blocked), None
+        else:
+            expected = expected_length(self.grid, plan, first, self.samples)
+            metres = None if expected is None else expected * self.grid.resolution
+            risk = open_probability(self.grid, states, self.samples), metres
+        return PlannedPath(states, positions, self.blocked.reshape(-1)[states], length, *risk)
 
     def evaluate(
         self,

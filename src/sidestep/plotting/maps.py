@@ -240,19 +240,29 @@ def figure_fit(
     return figure
 
 
-def figure_plan(grid: Grid, blocked: Values, path: Integer[np.ndarray, " steps"]) -> Figure:
+def figure_plan(
+    grid: Grid,
+    blocked: Values,
+    path: Integer[np.ndarray, " steps"],
+    alternatives: Sequence[Integer[np.ndarray, " _"]] = (),
+    title: str = "Planned path",
+) -> Figure:
     """Return a figure of one path (states) planned in a learned map.
 
     Args:
         grid: The map.
         blocked: The learned P(blocked) of each cell, in [0, 1].
         path: The states along the path.
+        alternatives: Other paths, drawn dashed.
+        title: The title.
     """
     width, height = _size(grid, _PLAN)
     figure, (axes,) = new_figure(1, 1)
     image = draw_blocked(axes, blocked, grid)
+    for other in alternatives:
+        axes.plot(*grid.centers(other).T, color=palette.BLUE, linestyle="--", linewidth=1, label="alternative")
     draw_path(axes, path, grid)
-    axes.set_title("Planned path")
+    axes.set_title(title)
     arrange(figure, [width], height, ColorBar(image, column=0))
     return figure
 

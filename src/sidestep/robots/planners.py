@@ -22,10 +22,11 @@ References:
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from sidestep.tabular.backups import HardMax
 from sidestep.tabular.graph import moves_into
@@ -109,9 +110,12 @@ class ModelPlanner:
             goal: The goal state.
         """
         task = self.task_of(goal)
+        planned = cache(lambda: plan(self.model, task))
         return GoalPlan(
-            lambda starts: plan(self.model, task).follow(starts),
-            lambda environment, starts: replanning_lengths(self.model, environment, task, goal, starts),
+            lambda starts: planned().follow(starts),
+            lambda environment, starts: _executed_lengths(
+                _first_belief(self.model, planned().solution.values, environment, task, goal), environment, starts
+            ),
         )
 
 
@@ -198,13 +202,19 @@ def replanning_lengths(
         NotConverged: If the values of the first plan do not converge.
     """
     values = plan(model, task).solution.values
+    return _executed_lengths(_first_belief(model, values, environment, task, goal), environment, starts)
+
+
+def _first_belief(
+    model: ObstacleGrid, values: Float[Array, " states"], environment: GridEnvironment, task: Task, goal: int
+) -> BeliefState:
+    """Return what a robot believes before its first bump."""
     tolerance = max(HardMax().tie, 64 * float(np.finfo(values.dtype).eps))
     initial_values = np.where(is_reachable(values), values, -np.inf).astype(np.float64)
     on_map = environment.required[..., 0] < len(initial_values)
     success = np.where(on_map, np.asarray(model.probabilities(), dtype=np.float64)[..., 0], 0.0)
     reward = np.array(np.broadcast_to(task.reward, success.shape), dtype=np.float64)
-    belief = BeliefState(success, initial_values, reward, float(task.discount), goal, tolerance)
-    return _executed_lengths(belief, environment, starts)
+    return BeliefState(success, initial_values, reward, float(task.discount), goal, tolerance)
 
 
 def policy_lengths(
