@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int
 from sidestep._files import read_array, read_json, write_array, write_arrays, write_json
 from sidestep.errors import check, input_errors
 from sidestep.io.maps import read_map, write_map
-from sidestep.robots.planners import ModelPlanner
+from sidestep.robots.planners import GoalPlan, ModelPlanner
 from sidestep.robots.risk import expected_length, independent_open_probability, open_probability
 from sidestep.robots.robot import BUMP_COST, risk_averse_robot
 from sidestep.tabular.grid import Cell, Connectivity, Grid
@@ -138,25 +138,24 @@ class LearnedMap:
                 outside [0, 1].
         """
         first, last = state_at(self.grid, start, "start"), state_at(self.grid, goal, "goal")
+        check(max_risk is None or 0 <= max_risk <= 1, f"expected a probability, found {max_risk}", field="max_risk")
+        # a path that several bump costs lead to is assessed once
+        plans: dict[bytes, tuple[GoalPlan, Int[np.ndarray, " steps"]]] = {}
+        for factor in _BUMP_FACTORS if max_risk is not None else (1.0,):
+            plan = self.robot(factor * bump_cost).plan_to(last)
+            states = plan.paths_from(np.array([first]))[0]
+            arrives = states[-1] == last
+            check(arrives, f"expected a path from {start} to {goal} in the learned map, found none", field="goal")
+            plans.setdefault(states.tobytes(), (plan, states))
+        paths = sorted((self._planned(*each) for each in plans.values()), key=lambda path: path.length)
         if max_risk is None:
-            return self._planned(first, last, bump_cost, start, goal)
-        check(0 <= max_risk <= 1, f"expected a probability, found {max_risk}", field="max_risk")
-        paths: list[PlannedPath] = []
-        for factor in _BUMP_FACTORS:
-            path = self._planned(first, last, factor * bump_cost, start, goal)
-            if not any(np.array_equal(path.states, other.states) for other in paths):
-                paths.append(path)
-        paths.sort(key=lambda path: path.length)
+            return paths[0]
         sure = [path for path in paths if 1 - path.open_probability <= max_risk]
         chosen = sure[0] if sure else max(paths, key=lambda path: path.open_probability)
         return replace(chosen, alternatives=tuple(path for path in paths if path is not chosen))
 
-    def _planned(self, first: int, last: int, bump_cost: float, start: Position, goal: Position) -> PlannedPath:
-        """Return the robot's path between two states; positions are for the message."""
-        plan = self.robot(bump_cost).plan_to(last)
-        states = plan.paths_from(np.array([first]))[0]
-        arrives = states[-1] == last
-        check(arrives, f"expected a path from {start} to {goal} in the learned map, found none", field="goal")
+    def _planned(self, plan: GoalPlan, states: Int[np.ndarray, " steps"]) -> PlannedPath:
+        """Return a robot's path with its length and risk."""
         positions = self.grid.centers(states)
         length = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
         if self.samples is None:
@@ -164,7 +163,7 @@ class LearnedMap:
             blocked.reshape(-1)[self.visited[:, 0]] = 0.0
             risk = independent_open_probability(self.grid, states, blocked), None
         else:
-            expected = expected_length(self.grid, plan, first, self.samples)
+            expected = expected_length(self.grid, plan, int(states[0]), self.samples)
             metres = None if expected is None else expected * self.grid.resolution
             risk = open_probability(self.grid, states, self.samples), metres
         return PlannedPath(states, positions, self.blocked.reshape(-1)[states], length, *risk)
