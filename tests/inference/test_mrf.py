@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sidestep.errors import InputError
-from sidestep.inference.chain_kernels import MRFTerms, flip_prior
 from sidestep.inference.mrf import BinaryMRF
+from sidestep.inference.prior_kernels import MRFTerms, flip_prior
 
 WEIGHTS = {"lines": 0.7, "pairs": -0.4, "blocks": -1.3, "isolated": 0.9}
 MAPS = st.tuples(st.integers(1, 5), st.integers(1, 5), st.integers(0, 2**25 - 1))

@@ -12,16 +12,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sidestep.errors import InputError, NotConverged, check
-from sidestep.inference.chain_kernels import (
-    MAX_CHANGED,
-    Chain,
-    Evidence,
-    MRFTerms,
-    Workspace,
-    World,
-    chain_kernels,
-)
+from sidestep.inference.chain_kernels import Chain, Evidence, Workspace, World, chain_kernels
 from sidestep.inference.mrf import BinaryMRF
+from sidestep.inference.prior_chains import KINDS, is_free_of, native_terms
+from sidestep.inference.prior_kernels import MAX_CHANGED
 from sidestep.tabular.backups import HardMax
 from sidestep.tabular.behavior_model import BehaviorModel
 from sidestep.tabular.demonstrations import Demonstrations
@@ -35,8 +29,6 @@ from sidestep.tabular.solvers.values import solve_values
 
 PASSING = (0.997, 0.003)
 """The probability that an open barrier, and a closed one, lets an agent pass."""
-_FLIPS, _MOVES = 0.6, 0.8
-"""The cumulative probabilities of flips and of moves; the rest are runs."""
 _FRESH_SWEEPS = 10
 """The number of sweeps after which all states are solved again, from the values at hand."""
 _NEG_INF = neg_inf(jnp.dtype(float))
@@ -174,12 +166,9 @@ class BarrierProblem:
         if number % _FRESH_SWEEPS == 0:
             self.refresh(state)
         _, sweep = chain_kernels(*self.barriers.successors.shape[1:])
-        prior = MRFTerms(self.prior.field, self.prior.weights, *(self.prior.shape or (0, 0)))
-        is_free = np.zeros(len(state.chain.closed), bool)
-        is_free[self.free] = True
-        kinds, (kind, tie) = np.array([_FLIPS, _MOVES]), self.backup
-        arguments = (self.free, is_free, self.world, self.evidence, prior, kinds, state.chain, state.work)
-        state.accepted[number] = sweep(state.random, len(self.free), heat, *arguments, kind, tie, _NEG_INF)
+        free = self.free, is_free_of(self.free, len(state.chain.closed))
+        arguments = (*free, self.world, self.evidence, native_terms(self.prior), KINDS, state.chain, state.work)
+        state.accepted[number] = sweep(state.random, len(self.free), heat, *arguments, *self.backup, _NEG_INF)
         state.samples[number] = state.chain.closed
         state.log_likelihoods[number] = state.chain.totals
         state.log_priors[number] = self.prior.log_density(state.chain.closed)
