@@ -94,6 +94,7 @@ from .inference.laplace import (
     natural_scale as natural_scale,
 )
 from .inference.mean_field import MeanField as MeanField
+from .inference.hierarchical import HierarchicalMRF as HierarchicalMRF, hierarchical_mrf as hierarchical_mrf
 from .inference.mrf import BinaryMRF as BinaryMRF
 from .inference.nuts import Draws as Draws, sample as sample
 from .inference.objective import Parameters as Parameters, tasks_mesh as tasks_mesh

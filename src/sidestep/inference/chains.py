@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from sidestep.errors import InputError, NotConverged, check
 from sidestep.inference.chain_kernels import Chain, Evidence, Workspace, World, chain_kernels
+from sidestep.inference.hierarchical import HierarchicalMRF, evidence_normalizers, fixed
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.inference.prior_chains import KINDS, is_free_of, native_terms
 from sidestep.inference.prior_kernels import MAX_CHANGED
@@ -51,6 +52,7 @@ class ChainState(NamedTuple):
         log_likelihoods: Those of actions and transitions after each sweep.
         log_priors: log p(z) after each sweep.
         accepted: The number of accepted proposals in each sweep.
+        densities: δ and λ of the prior in each sweep (`HierarchicalMRF`).
     """
 
     chain: Chain
@@ -60,6 +62,7 @@ class ChainState(NamedTuple):
     log_likelihoods: Float[np.ndarray, "sweeps 2"]
     log_priors: Float[np.ndarray, " sweeps"]
     accepted: Int[np.ndarray, " sweeps"]
+    densities: Float[np.ndarray, "sweeps 2"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +74,7 @@ class BarrierProblem:
         world: The same with what depends on which.
         evidence: The tasks and the moves that were observed.
         prior: The prior of the barriers.
+        log_normalizers: log Z of the prior at each δ and λ, up to a constant.
         free: The barriers that are sampled; the others are known, or walks crossed them.
         backup: The number of the backup, and the part of the best value within which actions tie.
         terminal: Where each task ends.
@@ -80,7 +84,8 @@ class BarrierProblem:
     barriers: Barriers
     world: World
     evidence: Evidence
-    prior: BinaryMRF
+    prior: HierarchicalMRF
+    log_normalizers: Float[np.ndarray, "etas strengths"]
     free: Int[np.ndarray, " free"]
     backup: tuple[int, float]
     terminal: Bool[np.ndarray, "tasks states"]
@@ -123,6 +128,7 @@ class BarrierProblem:
             log_likelihoods=np.zeros((sweeps, 2)),
             log_priors=np.zeros(sweeps),
             accepted=np.zeros(sweeps, np.int64),
+            densities=np.zeros((sweeps, 2)),
         )
 
     def solve(self, state: ChainState) -> None:
@@ -166,20 +172,39 @@ class BarrierProblem:
         if number % _FRESH_SWEEPS == 0:
             self.refresh(state)
         _, sweep = chain_kernels(*self.barriers.successors.shape[1:])
+        place = self._draw_density(state, heat)
+        density = float(self.prior.log_odds[place[0]]), float(self.prior.strengths[place[1]])
         free = self.free, is_free_of(self.free, len(state.chain.closed))
-        arguments = (*free, self.world, self.evidence, native_terms(self.prior), KINDS, state.chain, state.work)
+        terms = native_terms(self.prior.at(*density))
+        arguments = (*free, self.world, self.evidence, terms, KINDS, state.chain, state.work)
         state.accepted[number] = sweep(state.random, len(self.free), heat, *arguments, *self.backup, _NEG_INF)
         state.samples[number] = state.chain.closed
         state.log_likelihoods[number] = state.chain.totals
-        state.log_priors[number] = self.prior.log_density(state.chain.closed)
+        state.log_priors[number] = self._log_priors(state)[place]
+        state.densities[number] = density
+
+    def _log_priors(self, state: ChainState) -> Float[np.ndarray, "etas strengths"]:
+        return self.prior.log_densities(state.chain.closed) - self.log_normalizers
+
+    def _draw_density(self, state: ChainState, heat: float) -> tuple[int, int]:
+        """Return the numbers of δ and λ, drawn given the map, or at their mode while the chain is heated.
+
+        A heated chain loses its walls, and λ near 0 would be drawn from what is left.
+        """
+        scores = self.prior.log_prior
+        if heat == 1:
+            scores = self._log_priors(state) + state.random.gumbel(size=scores.shape)
+        row, column = np.unravel_index(scores.argmax(), scores.shape)
+        return int(row), int(column)
 
 
 def barrier_problem(
     barriers: Barriers,
     demonstrations: Demonstrations,
     agents: BehaviorModel,
-    prior: BinaryMRF,
+    prior: BinaryMRF | HierarchicalMRF,
     *,
+    seed: int = 0,
     tempering: float = 1.0,
     terms: Terms = ALL_TERMS,
 ) -> BarrierProblem:
@@ -190,6 +215,7 @@ def barrier_problem(
         demonstrations: The moves and tasks.
         agents: The behavior of the agents.
         prior: The prior of the barriers.
+        seed: The seed of the chains that find the prior's log Z.
         tempering: The weight of the actions' log-likelihood, in (0, 1].
         terms: The parts of the likelihood that count.
     """
@@ -234,10 +260,13 @@ def barrier_problem(
     tie = backup.tie if isinstance(backup, HardMax) else 0.0
     free = np.flatnonzero((barriers.known == Cell.UNKNOWN) & ~crossed).astype(np.int64)
     rewards = np.array(tasks.terminal_reward, np.float64)
-    return BarrierProblem(barriers, world, evidence, prior, free, (KERNELS[type(backup)], tie), terminal, rewards)
+    hierarchical = prior if isinstance(prior, HierarchicalMRF) else fixed(prior)
+    normalizers = evidence_normalizers(hierarchical, barriers.known, free, seed)
+    native = KERNELS[type(backup)], tie
+    return BarrierProblem(barriers, world, evidence, hierarchical, normalizers, free, native, terminal, rewards)
 
 
-def check_prior(barriers: Barriers, prior: BinaryMRF) -> None:
+def check_prior(barriers: Barriers, prior: BinaryMRF | HierarchicalMRF) -> None:
     """Check that a prior is one of these barriers.
 
     Args:
@@ -247,7 +276,7 @@ def check_prior(barriers: Barriers, prior: BinaryMRF) -> None:
     Raises:
         InputError: For another number of barriers, and for shape terms on another grid.
     """
-    size = len(barriers.known)
+    size, prior = len(barriers.known), prior.shapes if isinstance(prior, HierarchicalMRF) else prior
     check(len(prior.field) == size, f"expected {size} barriers, found {len(prior.field)}", field="prior")
     message = f"expected shape {barriers.shape} or None, found {prior.shape}"
     check(prior.shape is None or prior.shape == barriers.shape, message, field="prior")

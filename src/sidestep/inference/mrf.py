@@ -66,20 +66,22 @@ class BinaryMRF:
         """Return the weights of lines, pairs, blocks and isolated cells."""
         return np.array([getattr(self, name) for name in SHAPE_TERMS], dtype=np.float64)
 
-    def log_density(self, closed: Bool[np.ndarray, " barriers"] | Integer[np.ndarray, " barriers"]) -> float:
-        """Return log p(z) in nats, up to a constant.
+    def log_density(
+        self, closed: Bool[np.ndarray, "*maps barriers"] | Integer[np.ndarray, "*maps barriers"]
+    ) -> Float[np.ndarray, "*maps"]:
+        """Return log p(z) of maps in nats, up to a constant.
 
         Args:
             closed: Whether each barrier is closed.
         """
-        total = float(self.field @ closed)
-        if self.shape is not None:
-            total += float(self.weights @ shape_counts(np.asarray(closed, bool).reshape(self.shape)))
-        return total
+        total = np.asarray(closed @ self.field)
+        if self.shape is None:
+            return total
+        return total + shape_counts(np.asarray(closed, bool).reshape(*closed.shape[:-1], *self.shape)) @ self.weights
 
 
-def shape_counts(closed: Bool[np.ndarray, "rows columns"]) -> Int[np.ndarray, " 4"]:
-    """Return the numbers of lines, pairs, blocks and isolated cells of a map.
+def shape_counts(closed: Bool[np.ndarray, "*maps rows columns"]) -> Int[np.ndarray, "*maps 4"]:
+    """Return the numbers of lines, pairs, blocks and isolated cells of maps.
 
     Args:
         closed: Whether each cell is blocked.
@@ -88,11 +90,11 @@ def shape_counts(closed: Bool[np.ndarray, "rows columns"]) -> Int[np.ndarray, " 
         >>> shape_counts(np.array([[1, 1, 1], [0, 0, 0], [1, 0, 0]], dtype=bool)).tolist()
         [1, 2, 0, 1]
     """
-    padded = np.pad(closed, 1)
-    inner, up, down = padded[1:-1, 1:-1], padded[:-2, 1:-1], padded[2:, 1:-1]
-    left, right = padded[1:-1, :-2], padded[1:-1, 2:]
+    padded = np.pad(closed, [(0, 0)] * (closed.ndim - 2) + [(1, 1)] * 2)
+    inner, up, down = padded[..., 1:-1, 1:-1], padded[..., :-2, 1:-1], padded[..., 2:, 1:-1]
+    left, right = padded[..., 1:-1, :-2], padded[..., 1:-1, 2:]
     lines = inner & ((left & right) | (up & down))
     isolated = inner & ~(left | right | up | down)
-    blocks = closed[:-1, :-1] & closed[:-1, 1:] & closed[1:, :-1] & closed[1:, 1:]
-    pairs = (inner & right).sum() + (inner & down).sum()
-    return np.array([lines.sum(), pairs, blocks.sum(), isolated.sum()])
+    blocks = inner & right & down & padded[..., 2:, 2:]
+    pairs = (inner & right).sum((-1, -2)) + (inner & down).sum((-1, -2))
+    return np.stack([lines.sum((-1, -2)), pairs, blocks.sum((-1, -2)), isolated.sum((-1, -2))], axis=-1)

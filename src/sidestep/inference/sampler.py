@@ -19,7 +19,8 @@ The chain is that of Metropolis et al. (1953), *Equation of state calculations b
 5. Several chains start from few and from many closed barriers. Split-R̂ and effective sample sizes
    (`diagnostics`) compare them.
 
-Barriers that walks crossed are open and stay so.
+Barriers that walks crossed are open and stay so. The density and strength of a hierarchical prior are drawn before each
+sweep, given the map (`hierarchical`); while the chain is heated they are at their mode.
 """
 
 import math
@@ -37,6 +38,7 @@ from sidestep.inference.chains import BarrierProblem, ChainState, barrier_proble
 from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
 from sidestep.inference.diagnostics import effective_sizes, split_rhat
 from sidestep.inference.fit import Estimate
+from sidestep.inference.hierarchical import HierarchicalMRF
 from sidestep.inference.maximize import Status
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.tabular.backups import Behavior
@@ -99,6 +101,8 @@ class BarrierPosterior(Generic[Model]):
     Attributes:
         model: The transition model with the posterior's P(closed).
         behavior: The behavior model; it is not sampled.
+        prior: The prior at the posterior mean of its log-odds and strength.
+        densities: δ and λ of the prior in each sweep that counts (`HierarchicalMRF`); 0 and 1 where they are known.
         sampled: Whether each barrier was sampled; the others are known, or walks crossed them.
         samples: Whether each barrier is closed, after each sweep that counts, for each chain.
         closed: P(closed) of each barrier: (n + ½)/(N + 1) of n samples in N; exactly 0 or 1 where it is known.
@@ -120,6 +124,8 @@ class BarrierPosterior(Generic[Model]):
 
     model: Model
     behavior: BehaviorModel
+    prior: BinaryMRF
+    densities: Float[np.ndarray, "chains draws 2"]
     sampled: Bool[np.ndarray, " barriers"]
     samples: Bool[np.ndarray, "chains draws barriers"]
     closed: Float[np.ndarray, " barriers"]
@@ -200,6 +206,7 @@ class BarrierPosterior(Generic[Model]):
             "log_likelihood_actions": final.actions,
             "log_likelihood_transitions": final.transitions,
             "log_prior": final.prior,
+            **self._density_summary(),
             "chains": self.samples.shape[0],
             "draws": self.samples.shape[1],
             "iterations": final.iteration,
@@ -212,13 +219,21 @@ class BarrierPosterior(Generic[Model]):
             **({"learned_behavior": learned} if learned else {}),
         }
 
+    def _density_summary(self) -> dict[str, dict[str, float]]:
+        """Return the means and standard deviations of δ and λ; nothing where they are known."""
+        if not self.densities.std():
+            return {}
+        means, deviations = self.densities.mean(axis=(0, 1)), self.densities.std(axis=(0, 1))
+        pairs = zip(("prior_log_odds", "prior_strength"), means, deviations, strict=True)
+        return {name: {"mean": float(mean), "deviation": float(deviation)} for name, mean, deviation in pairs}
+
 
 def sample_barriers(
     model: Model,
     demonstrations: Demonstrations,
     behavior: Behavior | BehaviorModel,
     *,
-    prior: BinaryMRF,
+    prior: BinaryMRF | HierarchicalMRF,
     tempering: float = 1.0,
     terms: Terms = ALL_TERMS,
     sweeps: int = 300,
@@ -234,7 +249,7 @@ def sample_barriers(
         model: An `ObstacleGrid`, `SlipperyGrid`, `walled_grid` or `road_network`; slips stay as they are.
         demonstrations: Trajectories of agents that know the true dynamics.
         behavior: The behavior of the agents, or a fitted `BehaviorModel`; it stays as it is.
-        prior: The prior of the barriers.
+        prior: The prior of the barriers; the density and strength of a `HierarchicalMRF` are sampled along.
         tempering: κ in (0, 1], a factor of the actions' log-likelihood.
         terms: The parts of the likelihood that count.
         sweeps: The number of sweeps of each chain, at least 12; a sweep has a proposal for each unknown barrier.
@@ -263,7 +278,7 @@ def sample_barriers(
     barriers = barriers_of(model)
     check_prior(barriers, prior)
     check_proper(demonstrations.tasks, agents.behavior_of(), model.graph.actions)
-    problem = barrier_problem(barriers, demonstrations, agents, prior, tempering=tempering, terms=terms)
+    problem = barrier_problem(barriers, demonstrations, agents, prior, seed=seed, tempering=tempering, terms=terms)
     states = start_chains(problem, sweeps, chains, seed)
     saver = Saver(checkpoint, fingerprint((astuple(problem), sweeps, chains, seed)))
     done = _load(saver, states) if resume else 0
@@ -284,7 +299,9 @@ def sample_barriers(
     learned = with_closed(model, np.clip(closed, _SURE, 1 - _SURE))
     sampled = np.isin(np.arange(len(closed)), problem.free)
     sizes = effective_sizes(samples)
-    return BarrierPosterior(learned, agents, sampled, samples, closed, rhat, sizes, history, status)
+    densities = np.stack([state.densities for state in states])[:, heated_sweeps(sweeps) :]
+    mean = problem.prior.at(*densities.mean(axis=(0, 1)).tolist())
+    return BarrierPosterior(learned, agents, mean, densities, sampled, samples, closed, rhat, sizes, history, status)
 
 
 def heated_sweeps(sweeps: int) -> int:
@@ -349,7 +366,7 @@ def _saved(state: ChainState) -> tuple[Any, ...]:
     """Return the arrays on which the future of a chain depends, its generator as four words among them."""
     words = [state.random.bit_generator.state["state"][name] for name in ("state", "inc")]
     generator = np.array([word >> shift & (2**64 - 1) for word in words for shift in (64, 0)], np.uint64)
-    samples = state.samples, state.log_likelihoods, state.log_priors, state.accepted
+    samples = state.samples, state.log_likelihoods, state.log_priors, state.accepted, state.densities
     return tuple(state.chain), state.work.counters, *samples, generator
 
 

@@ -18,6 +18,7 @@ from jaxtyping import Int
 
 from sidestep.errors import check
 from sidestep.inference.fit import Fit, fit
+from sidestep.inference.hierarchical import HierarchicalMRF, hierarchical_mrf
 from sidestep.inference.maximize import Progress
 from sidestep.inference.mean_field import MeanField
 from sidestep.inference.mrf import SHAPE_TERMS, BinaryMRF
@@ -35,7 +36,7 @@ from sidestep.maps.config import (
     PosteriorMethod,
     PriorConfig,
 )
-from sidestep.maps.sensors import SensorMap, cell_field, cell_prior
+from sidestep.maps.sensors import SensorMap, cell_field, cell_prior, seen_cells
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import BACKUPS, Behavior
 from sidestep.tabular.behavior_model import BehaviorModel, behavior_model
@@ -129,7 +130,7 @@ def barrier_prior(
     method: PosteriorMethod,
     sensor: SensorMap | None = None,
 ) -> BinaryMRF:
-    """Return the binary prior of the cells of a map.
+    """Return the binary prior of the cells of a map, of known density.
 
     Args:
         config: The configuration of the prior.
@@ -137,9 +138,35 @@ def barrier_prior(
         method: The method, for the default weights of shapes.
         sensor: What sensors saw, if anything.
     """
+    return BinaryMRF(cell_field(sensor, known, config).ravel(), known.shape, **shape_weights(config, method))
+
+
+def sampled_prior(
+    config: PriorConfig, known: Int[np.ndarray, "rows columns"], sensor: SensorMap | None = None
+) -> BinaryMRF | HierarchicalMRF:
+    """Return the prior with which maps are sampled; its density is unknown unless the configuration says it.
+
+    Args:
+        config: The configuration of the prior.
+        known: The `Cell` value of each cell.
+        sensor: What sensors saw, if anything.
+    """
+    if config.log_odds is not None:
+        return barrier_prior(config, known, "sample", sensor)
+    seen = np.isfinite(seen_cells(sensor, known))
+    field = np.where(seen, cell_field(sensor, known, config), np.nan)
+    return hierarchical_mrf(field.ravel(), known.shape, **shape_weights(config, "sample"))
+
+
+def shape_weights(config: PriorConfig, method: PosteriorMethod) -> dict[str, float]:
+    """Return the weights of the binary prior's shape terms: the configured ones, or the defaults of a method.
+
+    Args:
+        config: The configuration of the prior.
+        method: The method.
+    """
     weights = {name: getattr(config, name) for name in SHAPE_TERMS}
-    weights |= {name: weight for name, weight in SHAPE_WEIGHTS[method].items() if weights[name] is None}
-    return BinaryMRF(cell_field(sensor, known, config).ravel(), known.shape, **weights)
+    return weights | {name: weight for name, weight in SHAPE_WEIGHTS[method].items() if weights[name] is None}
 
 
 def infer_map(
@@ -187,7 +214,7 @@ def infer_map(
         model,
         demonstrations,
         learned.behavior if learned else behavior,
-        prior=barrier_prior(config.prior, known, method, sensor),
+        prior=sampled_prior(config.prior, known, sensor),
         tempering=config.behavior.tempering,
         terms=ALL_TERMS if config.fit.terms == "both" else (config.fit.terms,),
         sweeps=sweeps_for(config, *size),

@@ -1,0 +1,211 @@
+"""A hierarchical prior of barriers: a binary Markov random field with unknown density and strength.
+
+    p(z, δ, λ) = p(δ, λ) · exp(Σ_i (f_i + u_i δ) z_i + λ h(z)) / Z(δ, λ)
+
+h(z) is the log-density of a `BinaryMRF`, up to a constant. u_i is 1 where the log-odds δ are those of a barrier, and 0
+where its log-odds f_i are known, as where sensors saw it. δ and λ take values on a grid, and are drawn from their
+conditional distribution before each sweep (Gibbs sampling).
+
+Z(δ, λ) does not depend on the walks. It is found by thermodynamic integration (Kirkwood 1935; Gelman & Meng 1998,
+*Simulating normalizing constants*): ∂ log Z/∂λ = E[h(z)], the mean over chains of the prior alone, with λ rising and
+falling, and Z(δ, 0) = Π_i (1 + exp(f_i + u_i δ)).
+
+Agents are in open cells because they have to be. A place has halls where they walk and walls between, and one density
+does not describe both: with each crossed cell as evidence of the density, the walls of an office vanish. So barriers
+that walks crossed enter with a weight α = min(1, c / crossed), as if walks had crossed at most c of them:
+
+    log Z = (1 − α) log Z(barriers that were not crossed, given the others) + α log Z(all unknown barriers)
+
+α = 1 is the posterior of this model; α = 0 conditions on what walks crossed (a power posterior between the two; Friel &
+Pettitt 2008).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from sidestep.errors import check
+from sidestep.inference.mrf import SHAPE_TERMS, BinaryMRF
+from sidestep.inference.prior_chains import native_terms, run_prior
+from sidestep.tabular.grid import Cell
+from sidestep.tabular.solvers.native import run_batch
+
+LOG_ODDS = np.arange(-2.5, 1.01, 0.25)
+"""The values of δ."""
+STRENGTHS = np.arange(0.0, 2.01, 0.25)
+"""The values of λ."""
+LOG_ODDS_PRIOR, STRENGTH_PRIOR = (-0.9, 0.6), (1.0, 0.6)
+"""The means and standard deviations of δ and λ, normal and cut off at the ends of the grid."""
+STRENGTH_COST = 1.5
+"""The log-odds that a closed cell loses for each unit of strength, so that walls of any strength are equally dense."""
+CROSSED_WEIGHT = 10.0
+"""c, the most crossed barriers that count as evidence of the density."""
+_SWEEPS, _PROPOSALS = 40, 20_000
+"""The fewest sweeps at each δ and λ on the way up and down, and the fewest proposals."""
+
+
+@dataclass(frozen=True, eq=False)
+class HierarchicalMRF:
+    """A binary Markov random field with unknown log-odds δ and strength λ of its shapes.
+
+    Attributes:
+        shapes: h, the field that the strength multiplies.
+        field: f, the log-odds of each barrier that do not vary.
+        varied: u, whether δ adds to the log-odds of each barrier.
+        log_odds: The values of δ.
+        strengths: The values of λ, ascending; from 0 where there is more than one value.
+        log_prior: log p(δ, λ), up to a constant.
+        crossed_weight: c, at least 0.
+
+    Raises:
+        InputError: For numbers that do not fit these ranges.
+
+    Example:
+        >>> prior = hierarchical_mrf(np.full(12, np.nan), (3, 4))
+        >>> prior.at(-1.0, 0.0).field.tolist() == [-1.0] * 12
+        True
+    """
+
+    shapes: BinaryMRF
+    field: Float[np.ndarray, " barriers"]
+    varied: Bool[np.ndarray, " barriers"]
+    log_odds: Float[np.ndarray, " etas"]
+    strengths: Float[np.ndarray, " strengths"]
+    log_prior: Float[np.ndarray, "etas strengths"]
+    crossed_weight: float = CROSSED_WEIGHT
+
+    def __post_init__(self) -> None:
+        check(np.isfinite(self.field).all(), "expected finite numbers", field="field")
+        check(np.isfinite(self.log_odds).all(), "expected finite numbers", field="log_odds")
+        rises = np.isfinite(self.strengths).all() and (np.diff(self.strengths) > 0).all()
+        starts = len(self.strengths) == 1 or self.strengths[0] == 0
+        check(rises and starts, "expected ascending numbers from 0, or a single one", field="strengths")
+        check(np.isfinite(self.log_prior).all(), "expected finite numbers", field="log_prior")
+        message = f"expected a number of at least 0, found {self.crossed_weight}"
+        check(self.crossed_weight >= 0, message, field="crossed_weight")
+
+    def at(self, log_odds: float, strength: float) -> BinaryMRF:
+        """Return the prior at one δ and λ.
+
+        Args:
+            log_odds: δ.
+            strength: λ.
+        """
+        weights = dict(zip(SHAPE_TERMS, strength * self.shapes.weights, strict=True))
+        field = self.field + log_odds * self.varied + strength * self.shapes.field
+        return BinaryMRF(field, self.shapes.shape, **weights)
+
+    def log_densities(self, closed: Bool[np.ndarray, " barriers"]) -> Float[np.ndarray, "etas strengths"]:
+        """Return log p(z, δ, λ) + log Z(δ, λ) at each δ and λ, up to a constant.
+
+        Args:
+            closed: z.
+        """
+        closed = np.asarray(closed, bool)
+        of_log_odds = self.field @ closed + self.log_odds * (self.varied & closed).sum()
+        return self.log_prior + of_log_odds[:, None] + self.strengths * self.shapes.log_density(closed)
+
+
+def hierarchical_mrf(
+    field: Float[np.ndarray, " barriers"],
+    shape: tuple[int, int] | None = None,
+    *,
+    lines: float = 2.5,
+    pairs: float = 0.0,
+    blocks: float = -3.0,
+    isolated: float = -1.0,
+) -> HierarchicalMRF:
+    """Return the default prior of barriers that are open or closed: that of walls of unknown density and strength.
+
+    Args:
+        field: The log-odds of each barrier where they are known, as where sensors saw it; NaN elsewhere.
+        shape: The rows and columns where barriers are the cells of a grid.
+        lines, pairs, blocks, isolated: The weights of shapes at strength 1, in nats; without effect without a grid.
+
+    Raises:
+        InputError: As `BinaryMRF` does.
+
+    Example:
+        >>> len(hierarchical_mrf(np.full(7, np.nan)).strengths)  # barriers that are no cells have no shapes
+        1
+    """
+    varied = np.isnan(field)
+    strengths = np.zeros(1) if shape is None else STRENGTHS
+    weights = (0.0,) * 4 if shape is None else (lines, pairs, blocks, isolated)
+    cost = 0.0 if shape is None else STRENGTH_COST
+    shapes = BinaryMRF(np.where(varied, -cost, 0.0), shape, *weights)
+    of_log_odds, of_strengths = (
+        -(((values - mean) / deviation) ** 2) / 2
+        for values, (mean, deviation) in ((LOG_ODDS, LOG_ODDS_PRIOR), (strengths, STRENGTH_PRIOR))
+    )
+    log_prior = of_log_odds[:, None] + of_strengths
+    return HierarchicalMRF(shapes, np.where(varied, 0.0, field), varied, LOG_ODDS, strengths, log_prior)
+
+
+def fixed(prior: BinaryMRF) -> HierarchicalMRF:
+    """Return a prior with known density and strength as a hierarchical one.
+
+    Args:
+        prior: The prior.
+    """
+    zeros = np.zeros(len(prior.field))
+    return HierarchicalMRF(prior, zeros, zeros > 0, np.zeros(1), np.ones(1), np.zeros((1, 1)))
+
+
+def log_normalizers(
+    prior: HierarchicalMRF, free: Int[np.ndarray, " free"], closed: Bool[np.ndarray, " barriers"], seed: int
+) -> Float[np.ndarray, "etas strengths"]:
+    """Return log Z(δ, λ) over some barriers, given the others, up to a constant.
+
+    Args:
+        prior: The prior.
+        free: The barriers over which Z sums.
+        closed: Whether each of the others is closed.
+        seed: The seed of the chains; the result does not depend on the number of cores.
+    """
+    result = np.zeros(prior.log_prior.shape)
+    others = closed.copy()
+    others[free] = False
+    sweeps = max(_SWEEPS, _PROPOSALS // max(1, len(free)))
+    sequences = np.random.SeedSequence(seed).spawn(len(prior.log_odds))
+
+    def integrate(index: tuple[int, ...]) -> None:
+        (at,) = index
+        field = prior.at(prior.log_odds[at], 0.0).field
+        result[at] = np.logaddexp(0, field[free]).sum() + field @ others
+        random = np.random.Generator(np.random.PCG64(sequences[at]))
+        z = others.astype(np.uint8)
+        z[free] = random.random(len(free)) < 1 / (1 + np.exp(-field[free]))
+        means = np.zeros((2, len(prior.strengths)))
+        for way, order in enumerate((1, -1)):
+            for place in np.arange(len(prior.strengths))[::order]:
+                terms = native_terms(prior.at(prior.log_odds[at], float(prior.strengths[place])))
+                samples = run_prior(terms, free, z, sweeps, random)[sweeps // 3 :]
+                means[way, place] = prior.shapes.log_density(samples).mean()
+        slopes = means.mean(axis=0)
+        result[at, 1:] += np.cumsum((slopes[1:] + slopes[:-1]) / 2 * np.diff(prior.strengths))
+
+    if prior.log_prior.size > 1:
+        run_batch(integrate, [(at,) for at in range(len(prior.log_odds))])
+    return result
+
+
+def evidence_normalizers(
+    prior: HierarchicalMRF, known: Int[np.ndarray, " barriers"], free: Int[np.ndarray, " free"], seed: int
+) -> Float[np.ndarray, "etas strengths"]:
+    """Return log Z(δ, λ) in which barriers that walks crossed have their weight, up to a constant.
+
+    Args:
+        prior: The prior.
+        known: The `Cell` value of each barrier.
+        free: The unknown barriers that walks did not cross.
+        seed: The seed of the chains.
+    """
+    unknown, closed = np.flatnonzero(known == Cell.UNKNOWN), known == Cell.OCCUPIED
+    crossed = len(unknown) - len(free)
+    result = log_normalizers(prior, free, closed, seed)
+    if crossed == 0 or prior.crossed_weight == 0:
+        return result
+    weight = min(1.0, prior.crossed_weight / crossed)
+    return (1 - weight) * result + weight * log_normalizers(prior, unknown, closed, seed)
