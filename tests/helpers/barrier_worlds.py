@@ -53,7 +53,8 @@ def model_of(kind: str) -> TransitionModel:
     if kind == "borders":
         return walled_grid(Grid.unknown(2, 4))
     if kind == "turns":
-        return road_network(TURNS, np.arange(1.0, 6.0), by_turn=True)
+        # as many actions as on grids, for which there is native code already
+        return road_network(np.append(TURNS, [[1, 0], [1, 4]], axis=0), np.arange(1.0, 6.0), by_turn=True)
     if kind == "slips":
         return SlipperyGrid(room(), slip=np.array([-1.5]), terrain=np.where(np.arange(16).reshape(4, 4) % 3, 0, -1))
     return ObstacleGrid(room(8 if kind == "8 moves" else 4))

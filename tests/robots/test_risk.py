@@ -1,10 +1,13 @@
 """The risk of paths over maps that were sampled together."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sidestep.errors import InputError
 from sidestep.maps.learned_map import LearnedMap
+from sidestep.robots.planners import grid_environment
 from sidestep.robots.risk import expected_length, independent_open_probability, open_probability, required_cells
 from sidestep.robots.robot import risk_averse_robot
 from sidestep.tabular.grid import Grid
@@ -37,11 +40,25 @@ def test_required_cells_of_a_diagonal_include_those_beside_it():
 
 def test_expected_length_counts_bumps_and_detours():
     """In half of the maps the robot bumps at the top, and goes through the middle instead."""
-    robot = risk_averse_robot(ObstacleGrid(GRID, -2.0), [], bump_cost=0.0)
-    assert expected_length(GRID, robot.plan_to(2), 0, GAPS) == (2 + (1 + 4)) / 2
-    assert expected_length(GRID, robot.plan_to(2), 0, GAPS & False) == 2
-    closed = GAPS | True
-    assert expected_length(GRID, risk_averse_robot(ObstacleGrid(GRID, -2.0), []).plan_to(2), 0, closed) is None
+    plan = risk_averse_robot(ObstacleGrid(GRID, -2.0), [], bump_cost=0.0).plan_to(2)
+    path = plan.paths_from(np.array([0]))[0]
+    assert path.tolist() == TOP.tolist()
+    assert expected_length(GRID, plan, path, GAPS) == (2 + (1 + 4)) / 2
+    assert expected_length(GRID, plan, path, GAPS & False) == 2
+    assert expected_length(GRID, plan, path, GAPS | True) is None
+
+
+@pytest.mark.parametrize("connectivity", [4, 8])
+def test_expected_length_is_the_mean_of_executed_lengths(connectivity):
+    """Where the path is open too, though there no move is followed."""
+    grid = Grid.unknown(6, 6, connectivity=connectivity)
+    maps = np.random.default_rng(0).random((30, 6, 6)) < 0.15
+    plan = risk_averse_robot(ObstacleGrid(grid, np.linspace(-3, -1, 36)), [], bump_cost=1.0).plan_to(35)
+    path = plan.paths_from(np.array([0]))[0]
+    truths = [grid_environment(replace(grid, known=each.astype(int))) for each in maps]
+    lengths = np.array([plan.executed_lengths(truth, np.array([0]))[0] for truth in truths])
+    assert 0.1 < open_probability(grid, path, maps) < 0.9
+    assert expected_length(grid, plan, path, maps) == lengths[np.isfinite(lengths)].mean()
 
 
 def learned_map() -> LearnedMap:

@@ -17,10 +17,11 @@ from typing import NamedTuple
 import numpy as np
 
 from sidestep.inference.prior_kernels import flip_prior, propose
-from sidestep.tabular.solvers.native import NativeBackup, NativeFunction, compiled, inlined
+from sidestep.tabular.solvers.native import NativeBackup, NativeFunction, compiled, part
 from sidestep.tabular.solvers.value_kernels import Scratch, own_root
 
 _FAST = {"contract", "reassoc", "nsz", "arcp"}
+_own_root = own_root.as_part()
 
 
 class World(NamedTuple):
@@ -124,7 +125,7 @@ PROPOSAL, LOGGED, LOGGED_ROWS, SOURCES, BACKUPS = range(5)
 # The likelihood
 
 
-@inlined(fastmath=_FAST)
+@part(fastmath=_FAST)
 def _transition_log_likelihood(s, actions, width, probs, evidence):  # pragma: no cover
     """Return the log-likelihood of the observed transitions out of a state."""
     total = 0.0
@@ -139,7 +140,7 @@ def _transition_log_likelihood(s, actions, width, probs, evidence):  # pragma: n
     return total
 
 
-@inlined(fastmath=_FAST)
+@part(fastmath=_FAST)
 def _choice_log_likelihood(actions, lapse, beta, counts, advantages):  # pragma: no cover
     """Return the log-likelihood of the observed choices in a state from the advantages of its actions."""
     best = advantages[0]
@@ -162,7 +163,7 @@ def _choice_log_likelihood(actions, lapse, beta, counts, advantages):  # pragma:
 def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunction]:
     """Return the native code that computes everything in a chain from its barriers, and that which makes proposals."""
 
-    @inlined(fastmath=_FAST)
+    @part(fastmath=_FAST)
     def fill(task, s, world, evidence, chain, neg_inf, scratch):  # pragma: no cover
         """Fill in c(a) and l(a) of a state (see `base`); return its repeat-action value."""
         discount = evidence.discount[task]
@@ -183,7 +184,7 @@ def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunct
                 repeat_value = max(repeat_value, exit_value / weight)
         return repeat_value
 
-    @compiled(fastmath=_FAST)
+    @part(fastmath=_FAST)
     def settle(task, count, world, evidence, chain, work, kind, tie, neg_inf, scratch):  # pragma: no cover
         """Solve the states in the active list, and those that depend on what changes, until nothing does."""
         beta, tolerance = evidence.beta[task], evidence.tolerance[task]
@@ -191,7 +192,7 @@ def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunct
         reachable_above = -np.sqrt(-neg_inf)
         states, head = chain.values.shape[1], 0
         while count > 0:
-            s = work.queue[head]
+            s = np.int64(work.queue[head])
             head = head + 1 if head + 1 < states else 0
             count -= 1
             work.queued[s] = False
@@ -200,7 +201,7 @@ def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunct
             repeat_value = fill(task, s, world, evidence, chain, neg_inf, scratch)
             value = neg_inf
             if repeat_value > reachable_above:
-                value = own_root(actions, backup, old, repeat_value, reachable_above, neg_inf, scratch)
+                value = _own_root(actions, backup, old, repeat_value, reachable_above, neg_inf, scratch)
             if work.logged[task, s] != work.counters[PROPOSAL]:
                 at = work.counters[LOGGED]
                 work.log_task[at], work.log_state[at], work.log_value[at] = task, s, old
@@ -216,7 +217,7 @@ def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunct
                         work.queue[tail if tail < states else tail - states] = j
                         count += 1
 
-    @compiled(fastmath=_FAST)
+    @part(fastmath=_FAST)
     def choices_in(task, s, world, evidence, chain, neg_inf, scratch):  # pragma: no cover
         """Return the log-likelihood of the choices in a state for a task."""
         fill(task, s, world, evidence, chain, neg_inf, scratch)
@@ -225,7 +226,7 @@ def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunct
         counts = evidence.choices[evidence.choice_row[task, s]]
         return _choice_log_likelihood(actions, evidence.lapse[task], evidence.beta[task], counts, scratch.advantages)
 
-    @compiled(fastmath=_FAST)
+    @part(fastmath=_FAST)
     def refresh_probs(s, world, chain):  # pragma: no cover
         """Compute the probabilities of the attempts out of a state from the barriers."""
         for a in range(actions):
@@ -263,7 +264,7 @@ def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunct
                     chain.row_log_likelihood[row] = choices_in(task, s, world, evidence, chain, neg_inf, scratch)
                     chain.totals[0] += chain.row_log_likelihood[row]
 
-    @compiled(fastmath=_FAST)
+    @part(fastmath=_FAST)
     def change_transitions(count, world, evidence, chain, work):  # pragma: no cover
         """Compute what depends on changed barriers directly; return the change of the transitions' log-likelihood."""
         work.counters[SOURCES] = 0
@@ -283,7 +284,7 @@ def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunct
                         change += _transition_log_likelihood(s, actions, width, chain.probs, evidence)
         return change
 
-    @compiled(fastmath=_FAST)
+    @part(fastmath=_FAST)
     def change_choices(task, world, evidence, chain, work, kind, tie, neg_inf, scratch):  # pragma: no cover
         """Solve a task after a change of transitions; return the change of the choices' log-likelihood."""
         first, count = work.counters[LOGGED], 0
@@ -306,7 +307,7 @@ def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunct
                 change += chain.row_log_likelihood[row] - old
         return change
 
-    @compiled()
+    @part()
     def undo(count, world, chain, work):  # pragma: no cover
         """Restore what a proposal has changed."""
         for n in range(count):

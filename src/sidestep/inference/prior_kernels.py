@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sidestep.tabular.solvers.native import compiled, inlined
+from sidestep.tabular.solvers.native import compiled, part
 
 _FAST = {"contract", "reassoc", "nsz", "arcp"}
 MAX_CHANGED = 8
@@ -30,7 +30,7 @@ class MRFTerms(NamedTuple):
     columns: int
 
 
-@inlined()
+@part()
 def _at(closed, row, column, rows, columns):  # pragma: no cover
     """Return whether a cell is closed; cells outside the map are open."""
     if row < 0 or row >= rows or column < 0 or column >= columns:
@@ -38,7 +38,7 @@ def _at(closed, row, column, rows, columns):  # pragma: no cover
     return closed[row * columns + column]
 
 
-@compiled(fastmath=_FAST)
+@part(fastmath=_FAST)
 def _shape_terms(closed, row, column, rows, columns, weights):  # pragma: no cover
     """Return the terms of log p(z) that depend on a cell beside its neighbors: lines, pairs, blocks, isolated."""
     total = 0.0
@@ -80,7 +80,7 @@ def flip_prior(closed, i, prior):  # pragma: no cover
     return change
 
 
-@compiled()
+@part()
 def propose(rng, free, is_free, closed, prior, kinds, changed):  # pragma: no cover
     """Fill in the barriers of a proposal; return their number, 0 where the proposal is no change.
 

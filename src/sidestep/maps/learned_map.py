@@ -163,7 +163,7 @@ class LearnedMap:
             blocked.reshape(-1)[self.visited[:, 0]] = 0.0
             risk = independent_open_probability(self.grid, states, blocked), None
         else:
-            expected = expected_length(self.grid, plan, int(states[0]), self.samples)
+            expected = expected_length(self.grid, plan, states, self.samples)
             metres = None if expected is None else expected * self.grid.resolution
             risk = open_probability(self.grid, states, self.samples), metres
         return PlannedPath(states, positions, self.blocked.reshape(-1)[states], length, *risk)

@@ -33,7 +33,7 @@ from sidestep.tabular.graph import moves_into
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.planning import followed, plan
-from sidestep.tabular.solvers.base import is_reachable
+from sidestep.tabular.solvers.base import reachable_above
 from sidestep.tabular.tasks import Task
 
 Starts = Int[np.ndarray, " starts"]
@@ -111,11 +111,10 @@ class ModelPlanner:
         """
         task = self.task_of(goal)
         planned = cache(lambda: plan(self.model, task))
+        belief = cache(lambda: _first_belief(self.model, planned().solution.values, task, goal))
         return GoalPlan(
             lambda starts: planned().follow(starts),
-            lambda environment, starts: _executed_lengths(
-                _first_belief(self.model, planned().solution.values, environment, task, goal), environment, starts
-            ),
+            lambda environment, starts: _executed_lengths(belief(), environment, starts),
         )
 
 
@@ -202,16 +201,15 @@ def replanning_lengths(
         NotConverged: If the values of the first plan do not converge.
     """
     values = plan(model, task).solution.values
-    return _executed_lengths(_first_belief(model, values, environment, task, goal), environment, starts)
+    return _executed_lengths(_first_belief(model, values, task, goal), environment, starts)
 
 
-def _first_belief(
-    model: ObstacleGrid, values: Float[Array, " states"], environment: GridEnvironment, task: Task, goal: int
-) -> BeliefState:
+def _first_belief(model: ObstacleGrid, values: Float[Array, " states"], task: Task, goal: int) -> BeliefState:
     """Return what a robot believes before its first bump."""
-    tolerance = max(HardMax().tie, 64 * float(np.finfo(values.dtype).eps))
-    initial_values = np.where(is_reachable(values), values, -np.inf).astype(np.float64)
-    on_map = environment.required[..., 0] < len(initial_values)
+    known = np.asarray(values)
+    tolerance = max(HardMax().tie, 64 * float(np.finfo(known.dtype).eps))
+    initial_values = np.where(known > reachable_above(known.dtype), known, -np.inf).astype(np.float64)
+    on_map = moves_into(model.blank)[..., 0] < len(initial_values)
     success = np.where(on_map, np.asarray(model.probabilities(), dtype=np.float64)[..., 0], 0.0)
     reward = np.array(np.broadcast_to(task.reward, success.shape), dtype=np.float64)
     return BeliefState(success, initial_values, reward, float(task.discount), goal, tolerance)

@@ -4,7 +4,7 @@ from heapq import heappop, heappush
 
 import numpy as np
 
-from sidestep.tabular.solvers.native import compiled
+from sidestep.tabular.solvers.native import compiled, part
 
 
 @compiled()
@@ -37,7 +37,7 @@ def executed_length(environment, belief, start):  # pragma: no cover
     return length
 
 
-@compiled()
+@part()
 def _next_action(belief, required, state):  # pragma: no cover
     """Return the first of the best actions, as in an optimal plan (`HardMax`) or a policy; −1 if none succeeds."""
     success = belief.success[state]
@@ -53,7 +53,7 @@ def _next_action(belief, required, state):  # pragma: no cover
     return np.argmax(q >= best - belief.tolerance * abs(best)) if best > -np.inf else -1
 
 
-@compiled()
+@part()
 def _backup(belief, required, state, stale):  # pragma: no cover
     """Return the best value of a state by one action, repeated until it succeeds, that leads to no stale state."""
     best = -np.inf
@@ -65,7 +65,7 @@ def _backup(belief, required, state, stale):  # pragma: no cover
     return best
 
 
-@compiled()
+@part()
 def block_and_repair(belief, required, cell, stale):  # pragma: no cover
     """Block a cell and repair the values, if any; `stale` is False everywhere, before and after.
 

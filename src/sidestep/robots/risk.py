@@ -7,6 +7,8 @@ in a map if each of its moves is legal there, and
     P(open) = (n + ½)/(N + 1),      n of N maps in which it is open.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -34,11 +36,20 @@ def required_cells(grid: Grid, path: Int[np.ndarray, " steps"]) -> Int[np.ndarra
         >>> required_cells(Grid.unknown(2, 2, connectivity=8), np.array([0, 3])).tolist()
         [1, 2, 3]
     """
-    needed = moves_into(grid)[path[:-1]]
-    leads = needed[..., 0] == path[1:, None]
-    check(leads.any(axis=1).all(), "expected single moves", field="path")
-    cells = needed[np.arange(len(leads)), leads.argmax(axis=1)]
+    cells = moves_into(grid)[path[:-1], _actions(grid, path)]
     return np.unique(cells[cells < grid.size])
+
+
+def _actions(grid: Grid, path: Int[np.ndarray, " steps"]) -> Int[np.ndarray, " moves"]:
+    """Return the actions along a path."""
+    leads = moves_into(grid)[path[:-1], :, 0] == path[1:, None]
+    check(leads.any(axis=1).all(), "expected single moves", field="path")
+    return leads.argmax(axis=1)
+
+
+def _is_open(grid: Grid, path: Int[np.ndarray, " steps"], samples: Maps) -> Bool[np.ndarray, " samples"]:
+    """Return whether a path is open in each map."""
+    return np.asarray(~samples.reshape(len(samples), -1)[:, required_cells(grid, path)].any(axis=1))
 
 
 def open_probability(grid: Grid, path: Int[np.ndarray, " steps"], samples: Maps) -> float:
@@ -54,8 +65,7 @@ def open_probability(grid: Grid, path: Int[np.ndarray, " steps"], samples: Maps)
         >>> open_probability(grid, np.array([0, 1, 2]), one_of_two)
         0.5
     """
-    blocked = samples.reshape(len(samples), -1)[:, required_cells(grid, path)].any(axis=1)
-    return float(((~blocked).sum() + 0.5) / (len(samples) + 1))
+    return float((_is_open(grid, path, samples).sum() + 0.5) / (len(samples) + 1))
 
 
 def independent_open_probability(
@@ -71,26 +81,27 @@ def independent_open_probability(
     return float(np.prod(1 - blocked.reshape(-1)[required_cells(grid, path)]))
 
 
-def expected_length(grid: Grid, plan: GoalPlan, start: int, samples: Maps) -> float | None:
+def expected_length(grid: Grid, plan: GoalPlan, path: Int[np.ndarray, " steps"], samples: Maps) -> float | None:
     """Return the mean length that a robot executes in maps of the posterior, with bumps and detours.
+
+    Where its path is open it goes along it; only in the other maps its moves are followed one by one.
 
     Args:
         grid: The cells and the moves.
         plan: The robot's plan to the goal.
-        start: The start state.
+        path: The states along the plan's path from the start to the goal.
         samples: Whether each cell is blocked, in each map; at most 40, at equal distances, are used.
 
     Returns:
         A length in cell sides, over the maps in which the robot arrives; None where it never does.
     """
-    lengths = []
-    for blocked in samples[:: -(-len(samples) // _EXECUTED)]:
-        truth = Grid(
-            np.where(blocked, Cell.OCCUPIED, Cell.FREE).astype(np.int64),
-            grid.resolution,
-            grid.origin,
-            grid.connectivity,
-        )
-        lengths.append(plan.executed_lengths(grid_environment(truth), np.array([start]))[0])
-    arriving = np.array(lengths)[np.isfinite(lengths)]
+    used = samples[:: -(-len(samples) // _EXECUTED)]
+    is_open = _is_open(grid, path, used)
+    # added up in the order of the moves, as the robot does
+    lengths = np.full(len(used), sum(grid.lengths[_actions(grid, path)].tolist()))
+    for index in np.flatnonzero(~is_open):
+        known = np.where(used[index], Cell.OCCUPIED, Cell.FREE).astype(np.int64)
+        truth = grid_environment(replace(grid, known=known))
+        lengths[index] = plan.executed_lengths(truth, path[:1])[0]
+    arriving = lengths[np.isfinite(lengths)]
     return float(arriving.mean()) if len(arriving) else None

@@ -13,11 +13,11 @@ these models, so that binary variables can be sampled for all of them by the sam
 from functools import singledispatch
 from typing import NamedTuple, TypeVar
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 
 from sidestep.errors import InputError, check
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import moves_into
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models.base import TransitionModel
@@ -127,6 +127,6 @@ def with_closed(model: Model, closed: Float[np.ndarray, " barriers"]) -> Model:
         The same model with the logits of these probabilities; its other parameters stay.
     """
     logits = np.log(closed) - np.log1p(-closed)
-    parameters = model.parameters
-    assert isinstance(parameters, jax.Array)
-    return model.with_parameters(parameters.at[: len(logits)].set(logits.astype(parameters.dtype)))
+    parameters = np.array(model.parameters)
+    parameters[: len(logits)] = logits
+    return model.with_parameters(to_jax(parameters))

@@ -244,9 +244,14 @@ def neg_inf(dtype: jnp.dtype) -> float:
     return -1e200 if dtype == jnp.float64 else -1e25
 
 
+def reachable_above(dtype: jnp.dtype) -> float:
+    """Return the number above which values at discount 1 are of states from which a terminal state can be reached."""
+    return -((-neg_inf(dtype)) ** 0.5)
+
+
 def is_reachable(values: Float[Array, "*states"]) -> Bool[Array, "*states"]:
     """Return whether a terminal state can be reached, by values at discount 1: whether they are far above `neg_inf`."""
-    return values > -((-neg_inf(values.dtype)) ** 0.5)
+    return values > reachable_above(values.dtype)
 
 
 def at_fixed_policy(backup: Backup, beta: Beta, q: Float[Array, "states actions"]) -> Float[Array, " states"]:

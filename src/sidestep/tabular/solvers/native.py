@@ -262,16 +262,40 @@ class NativeFunction:
                 from numba import njit
 
                 function = _with_dispatchers(self._function)
-                self._dispatcher = njit(nogil=True, error_model="numpy", **self._options)(function)
+                # nothing calls functions by their address, as C code does
+                options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True} | self._options
+                self._dispatcher = njit(**options)(function)
                 folder = _code_folder() if self._options.get("inline") is None else None
                 if folder is not None:
                     self._dispatcher._cache = _CodeCache(function, folder)
             return self._dispatcher
 
+    def as_part(self) -> "NativePart":
+        """Return an inlined function as one that is compiled by itself and then becomes part of those that call it."""
+        options = {name: option for name, option in self._options.items() if name != "inline"}
+        return part(**options, forceinline=True)(self._function)
+
+
+class NativePart(NativeFunction):
+    """A function that only native code calls; without what Python calls it by, it compiles sooner."""
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Refuse the call, for which there is no code."""
+        raise TypeError(f"{self._function.__qualname__} can be called by native code only")
+
 
 def compiled(**options: Any) -> Callable[[Callable], NativeFunction]:
     """Return a decorator: numba's `njit` with `options`, without Python's lock, kept from process to process."""
     return lambda function: NativeFunction(function, options)
+
+
+def part(**options: Any) -> Callable[[Callable], NativePart]:
+    """Return a decorator: as `compiled`, for a function that only native code calls.
+
+    numba inlines what is `inlined` before it knows types, and so infers and lowers it again in each place; a part it
+    does once. Which is faster when it runs depends on the references to arrays that numba counts: measure.
+    """
+    return lambda function: NativePart(function, {"no_cpython_wrapper": True} | options)
 
 
 def inlined(**options: Any) -> Callable[[Callable], NativeFunction]:
