@@ -40,8 +40,9 @@ def learn(walks: Walks, map_file: MapFile, out: Folder, options: LearnOptions) -
         print_lines(f"{_SYMBOLS.get(name, name)} {with_error(*number)}")
     if not learned.converged:
         print_notes(f"warning: {learning.fit.status.value}: {learning.fit.status.advice or learning.fit.message}")
-    silent, threshold = learned.without_evidence.sum(), learned.unknown_below
-    print_lines(f"{silent} of {data.unknown_cells} unknown cells: walks say less than {threshold:g} nats (hatched)")
+    silent, sources = learned.without_evidence.sum(), "walks and sensors" if learning.sensor else "walks"
+    less = f"{sources} say less than {learned.unknown_below:g} nats (hatched)"
+    print_lines(f"{silent} of {data.unknown_cells} unknown cells: {less}")
     print_lines(f"learned map in {out}")
 
 

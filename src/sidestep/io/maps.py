@@ -202,7 +202,7 @@ def write_map(
     blocked: Float[np.ndarray, "rows columns"],
     grid: Grid,
     *,
-    unknown: Bool[np.ndarray, "rows columns"] | None = None,
+    unknown: Bool[np.ndarray, "_ _"] | None = None,
 ) -> None:
     """Write P(blocked) as a ROS map in `raw` mode: `NAME.yaml` and `NAME.pgm`.
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sidestep._programs import keep_program
 from sidestep.inference.cell_information import information, prior_closed
 from sidestep.inference.fit import Fit, fit
 from sidestep.inference.information import Information
@@ -78,7 +79,7 @@ def map_information(posterior: MapPosterior, config: MapConfig) -> Float[np.ndar
 def _slopes(posterior: Fit[ObstacleGrid], prior: Prior) -> Float[Array, " cells"]:
     """Return what the evidence adds to the gradient of the prior, as derivatives by the probabilities."""
     logits = posterior.model.parameters
-    alone, chances = jax.grad(prior.log_density)(logits), jax.nn.sigmoid(logits)
+    alone, chances = _gradient(prior, logits), jax.nn.sigmoid(logits)
     whole = np.zeros(len(logits))
     if not posterior.final.gradient <= _NO_GRADIENT:
         parameters = Parameters(logits, posterior.behavior.parameters)
@@ -86,6 +87,11 @@ def _slopes(posterior: Fit[ObstacleGrid], prior: Prior) -> Float[Array, " cells"
     # where solves failed, a fit counts as ended at its maximum
     whole = jnp.asarray(np.where(np.isfinite(whole), whole, 0.0), logits.dtype)
     return (whole - alone) / jnp.maximum(chances * (1 - chances), _LEAST_SLOPE)
+
+
+@keep_program
+def _gradient(prior: Prior, parameters: Float[Array, " cells"]) -> Float[Array, " cells"]:
+    return jax.grad(prior.log_density)(parameters)
 
 
 def _maximum(posterior: Fit[ObstacleGrid], prior: Prior, start: ObstacleGrid) -> ObstacleGrid:
