@@ -71,6 +71,12 @@ def check_positive(value: float, field: str) -> None:
         raise InputError(f"expected a finite number above 0, found {value}", field=field)
 
 
+def check_not_negative(value: float, field: str) -> None:
+    """Raise `InputError` unless a setting is a finite number, at least 0."""
+    if not (isfinite(value) and value >= 0):
+        raise InputError(f"expected a finite number, at least 0, found {value}", field=field)
+
+
 class ImproperTask(SidestepError):
     """A task with infinite or ambiguous values, such as one in which continuing is better than arriving."""
 

@@ -27,7 +27,10 @@ SCORES = (
     "auc", "average_precision", "auc_relevant", "calibration_error", "brier_score", "log_loss", "mean_obstacle",
     "mean_free", "max_probability", "legal_fraction", "excess_length",
 )  # fmt: skip
-LEARNED = ["blocked.npy", "learned.png", "map.pgm", "map.yaml", "samples.npz", "summary.json", "visited.npy"]
+LEARNED = [
+    "blocked.npy", "information.npy", "learned.png", "map.pgm", "map.yaml",
+    "samples.npz", "summary.json", "visited.npy",
+]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -69,9 +72,9 @@ def test_learn_writes_a_map_and_a_picture(learned):
     assert ((blocked > 0) & (blocked < 1)).sum() == 23
     assert blocked[1:4, 2].min() > blocked[~WALL].max()
     image = np.asarray(Image.open(learned / "map.pgm"))
-    np.testing.assert_array_equal(image, np.rint(255 * (1 - blocked)))
+    np.testing.assert_array_equal(image, np.where(load_map(learned).without_evidence, 205, np.rint(100 * blocked)))
     entries = yaml.safe_load((learned / "map.yaml").read_text())
-    assert (entries["mode"], entries["resolution"], entries["origin"]) == ("scale", 0.5, [-1.0, 2.0, 0.0])
+    assert (entries["mode"], entries["resolution"], entries["origin"]) == ("raw", 0.5, [-1.0, 2.0, 0.0])
     with Image.open(learned / "learned.png") as picture:
         assert min(picture.size) > 100
 

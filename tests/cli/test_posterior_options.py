@@ -5,10 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from helpers.office import WALL, call, simulated, summary, write_office, written
+from sidestep.io.maps import read_map
 from sidestep.io.walks import write_walks
 from sidestep.maps.learned_map import load_map
+from sidestep.tabular.grid import Cell
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +54,30 @@ def test_learn_prints_the_samples(office, tmp_path, capsys):
     assert "8 samples of each of 2 chains" in printed.out
     warned = "more sweeps let the chains agree" in printed.err
     assert warned != summary(tmp_path / "out")["converged"]
+
+
+def test_learn_prints_and_writes_the_cells_of_which_walks_say_little(office, tmp_path, capsys):
+    few = "--max-walks", 2, "--sweeps", 12
+    assert learn(office, tmp_path / "out", *few, "--unknown-below", 0.3) == 0
+    loaded, printed = load_map(tmp_path / "out"), capsys.readouterr().out
+    count = int(loaded.without_evidence.sum())
+    assert 0 < count < 23
+    assert f"{count} of 23 unknown cells: walks say less than 0.3 nats (hatched)" in printed
+    assert summary(tmp_path / "out")["cells_without_evidence"] == count
+    assert summary(tmp_path / "out")["settings"]["unknown_below"] == 0.3
+    assert (read_map(tmp_path / "out" / "map.yaml").known[loaded.without_evidence] == Cell.UNKNOWN).all()
+    assert learn(office, tmp_path / "all", *few, "--unknown-below", 0) == 0
+    everything = load_map(tmp_path / "all")
+    assert not everything.without_evidence.any()
+    np.testing.assert_array_equal(everything.blocked, loaded.blocked)
+    assert np.asarray(Image.open(tmp_path / "all" / "map.pgm")).max() <= 100
+
+
+@pytest.mark.parametrize("threshold", ["-1", "nan", "inf"])
+def test_learn_refuses_another_threshold_of_unknown_cells(office, tmp_path, capsys, threshold):
+    assert learn(office, tmp_path / "out", "--unknown-below", threshold) == 1
+    assert "'unknown_below': expected a finite number, at least 0" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow

@@ -183,6 +183,18 @@ def test_read_map_of_a_huge_image_raises_before_decoding(tmp_path, size):
         read_map(path)
 
 
+def as_occupancy_grid(path):
+    """The OccupancyGrid that Nav2's `map_server` publishes of a map, row 0 at the top: percent, and -1 for unknown."""
+    settings = yaml.safe_load(path.read_text())
+    pixels = np.asarray(Image.open(path.parent / settings["image"])).astype(int)
+    occupancy = pixels / 255 if settings["negate"] else 1 - pixels / 255
+    if settings["mode"] == "raw":
+        return np.where(pixels <= 100, pixels, -1)
+    low, high = settings["free_thresh"], settings["occupied_thresh"]
+    between = np.rint((occupancy - low) / (high - low) * 100) if settings["mode"] == "scale" else -1
+    return np.where(occupancy > high, 100, np.where(occupancy < low, 0, between))
+
+
 numbers = st.floats(-1e6, 1e6, allow_nan=False)
 
 
@@ -199,18 +211,32 @@ def test_write_map_is_read_back(tmp_path_factory, rows, resolution, origin):
     write_map(folder / "learned.yaml", blocked, grid)
     read = read_map(folder / "learned.yaml")
     assert (read.resolution, read.origin) == (resolution, origin)
-    pixels = np.asarray(Image.open(folder / "learned.pgm"))
-    assert np.abs(1 - pixels / 255 - blocked).max() <= 0.5 / 255 + 1e-12
+    percent = as_occupancy_grid(folder / "learned.yaml")
+    assert np.abs(percent - 100 * blocked).max() <= 0.5 + 1e-9
     sure = np.abs(blocked[..., None] - [0.65, 0.196]).min(axis=-1) > 0.01
     expected = np.where(blocked > 0.65, OCCUPIED, np.where(blocked < 0.196, FREE, UNKNOWN))
     np.testing.assert_array_equal(read.known[sure], expected[sure])
 
 
+@given(
+    st.lists(st.tuples(st.floats(0, 1), st.booleans()), min_size=1, max_size=8),
+)
+def test_write_map_unknown_cells_are_minus_one_and_others_lose_half_a_percent(tmp_path_factory, cells):
+    folder = tmp_path_factory.mktemp("maps")
+    blocked, unknown = np.array([[p for p, _ in cells]]), np.array([[hidden for _, hidden in cells]])
+    write_map(folder / "learned.yaml", blocked, Grid.unknown(*blocked.shape), unknown=unknown)
+    percent = as_occupancy_grid(folder / "learned.yaml")
+    np.testing.assert_array_equal(percent == -1, unknown)
+    assert (np.abs(percent - 100 * blocked)[~unknown] <= 0.5 + 1e-9).all()
+    assert (np.asarray(Image.open(folder / "learned.pgm"))[unknown] == 205).all()
+    assert (read_map(folder / "learned.yaml").known[unknown] == UNKNOWN).all()
+
+
 def test_write_map_writes_the_keys_of_nav2(tmp_path):
     write_map(tmp_path / "new" / "learned.yaml", np.array([[0.0, 1.0]]), Grid.unknown(1, 2))
     settings = yaml.safe_load((tmp_path / "new" / "learned.yaml").read_text())
-    assert settings == SETTINGS | {"image": "learned.pgm", "mode": "scale", "resolution": 1.0, "origin": [0.0] * 3}
-    assert np.asarray(Image.open(tmp_path / "new" / "learned.pgm")).tolist() == [[255, 0]]
+    assert settings == SETTINGS | {"image": "learned.pgm", "mode": "raw", "resolution": 1.0, "origin": [0.0] * 3}
+    assert np.asarray(Image.open(tmp_path / "new" / "learned.pgm")).tolist() == [[0, 100]]
 
 
 @pytest.mark.parametrize("value", [-0.01, 1.01, float("nan")])
@@ -223,6 +249,8 @@ def test_write_map_of_other_values_raises(tmp_path, value):
 def test_write_map_of_another_shape_or_name_raises(tmp_path):
     with pytest.raises(InputError, match=r"expected an array of shape \(1, 1\), found \(1, 2\)"):
         write_map(tmp_path / "map.yaml", np.zeros((1, 2)), Grid.unknown(1, 1))
+    with pytest.raises(InputError, match=r"'unknown': expected an array of shape \(1, 1\), found \(1, 2\)"):
+        write_map(tmp_path / "map.yaml", np.zeros((1, 1)), Grid.unknown(1, 1), unknown=np.zeros((1, 2), bool))
     with pytest.raises(InputError, match=r"ends in \.yaml"):
         write_map(tmp_path / "map.pgm", np.zeros((1, 1)), Grid.unknown(1, 1))
 
@@ -264,7 +292,7 @@ def test_read_sensor_map_raw_mode_is_percent(tmp_path):
 def test_read_sensor_map_reads_a_learned_map(tmp_path):
     blocked = np.random.default_rng(0).random((2, 3))
     write_map(tmp_path / "learned.yaml", blocked, GRID)
-    np.testing.assert_allclose(read_sensor_map(tmp_path / "learned.yaml", GRID), blocked, atol=0.5 / 255)
+    np.testing.assert_allclose(read_sensor_map(tmp_path / "learned.yaml", GRID), blocked, atol=0.005)
 
 
 @pytest.mark.parametrize(

@@ -26,8 +26,8 @@ pytestmark = pytest.mark.slow
 NORMAL = ("--prior", "normal", "--prior-mean", 0.5, "--prior-variance", 4, "--wall-prior", 0)
 """Cells are independent, so that the observation of one cell moves no other."""
 
-SEEN = np.rint(255 * np.random.default_rng(3).uniform(0.05, 0.95, (5, 5))) / 255
-"""P(occupied) in whole gray levels."""
+SEEN = np.rint(100 * np.random.default_rng(3).uniform(0.05, 0.95, (5, 5))) / 100
+"""P(occupied) in whole percent."""
 
 
 @pytest.fixture(scope="module")

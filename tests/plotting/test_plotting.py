@@ -199,6 +199,32 @@ def test_figure_fit_shows_walks_goals_map_and_objective():
     assert bar.get_ylabel() == "P(blocked)"
 
 
+def test_draw_without_evidence_hatches_these_cells(axes):
+    silent = np.array([[False, True, True], [True, False, False]])
+    plotting.draw_blocked(axes, BLOCKED, GRID)
+    plotting.draw_without_evidence(axes, silent, GRID)
+    (patch,) = axes.patches
+    assert patch.get_hatch()
+    centers = GRID.centers(np.arange(6))
+    inside = patch.get_path().contains_points(centers)
+    np.testing.assert_array_equal(inside.reshape(2, 3), silent)
+
+
+def test_draw_without_evidence_of_no_cells_draws_nothing(axes):
+    plotting.draw_without_evidence(axes, np.zeros((2, 3), bool), GRID)
+    assert not axes.patches
+
+
+@pytest.mark.parametrize("figure", [
+    lambda silent: plotting.figure_fit(GRID, [], BLOCKED, np.zeros(2), without_evidence=silent),
+    lambda silent: plotting.figure_learned([plotting.Panel("", GRID, BLOCKED, without_evidence=silent)]),
+])  # fmt: skip
+def test_figures_hatch_cells_without_evidence_and_say_so_in_the_key(figure):
+    labels = [text.get_text() for text in figure(BLOCKED > 0.4).legends[0].get_texts()]
+    assert labels == ["walks say next to nothing"]
+    assert not figure(BLOCKED > 2).legends
+
+
 def test_figure_plan_shows_map_and_path():
     figure = plotting.figure_plan(GRID, BLOCKED, np.array([0, 3, 4]))
     axes, bar = figure.axes

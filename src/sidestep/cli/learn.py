@@ -14,7 +14,7 @@ _SYMBOLS = {"beta": "β", "discount": "γ"}
 
 @with_learn_options
 def learn(walks: Walks, map_file: MapFile, out: Folder, options: LearnOptions) -> None:
-    """Learn a map from a table of walks: map.yaml, blocked.npy, samples.npz, summary.json, learned.png."""
+    """Learn a map from walks: map.yaml, blocked.npy, information.npy, samples.npz, summary.json, learned.png."""
     from sidestep.cli.display import fit_progress, print_lines, print_notes, with_error
     from sidestep.io.walks import read_walks
     from sidestep.maps.fit import max_iterations
@@ -40,6 +40,9 @@ def learn(walks: Walks, map_file: MapFile, out: Folder, options: LearnOptions) -
         print_lines(f"{_SYMBOLS.get(name, name)} {with_error(*number)}")
     if not learned.converged:
         print_notes(f"warning: {learning.fit.status.value}: {learning.fit.status.advice or learning.fit.message}")
+    silent, sources = learned.without_evidence.sum(), "walks and sensors" if learning.sensor else "walks"
+    less = f"{sources} say less than {learned.unknown_below:g} nats (hatched)"
+    print_lines(f"{silent} of {data.unknown_cells} unknown cells: {less}")
     print_lines(f"learned map in {out}")
 
 
@@ -56,6 +59,8 @@ def save_learned(learned: "LearnedMap", folder: "Path", **entries: object) -> No
     seen = None if learning.sensor is None else seen_cells(learning.sensor, learned.grid.known)
     paths = learning.demonstrations.paths()
     goals = np.flatnonzero(np.asarray(learning.demonstrations.tasks.terminal).any(axis=0))
-    picture = draw("figure_fit", folder / "learned.png", learned.grid, paths, learned.blocked, objective, seen, goals)
+    silent = learned.without_evidence
+    values = learned.grid, paths, learned.blocked, objective, seen, goals, silent
+    picture = draw("figure_fit", folder / "learned.png", *values)
     learned.save(folder, **entries)
     picture.result()

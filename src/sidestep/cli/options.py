@@ -95,6 +95,9 @@ class LearnOptions:
     max_iterations: Annotated[int | None, Option(help="The most iterations.")] = FitConfig.max_iterations
     memory: Annotated[float, Option(help="About how many GiB the fit may take.", metavar="GIB")] = FitConfig.memory
     max_walks: Annotated[int | None, Option(help="Learn from this many walks only, drawn by the seed.")] = None
+    unknown_below: Annotated[
+        float, Option(help="Cells of which walks say less stay unknown in maps for ROS; 0: none.", metavar="NATS")
+    ] = MapConfig.unknown_below
     seed: Seed = MapConfig.seed
     resume: Annotated[bool, Option("--resume", help="Continue an interrupted run.")] = False
 
@@ -104,7 +107,8 @@ class LearnOptions:
         behavior = self._part(BehaviorConfig, learn=learned, select=self.select_behavior)
         prior, posterior = self._prior(), PosteriorConfig(self._method(), self.sweeps)
         fit = self._part(FitConfig, gradient=self.gradient.replace("-", "_"))
-        return MapConfig(self._part(Reward), behavior, prior, posterior, fit, max_walks=self.max_walks, seed=self.seed)
+        others = {name: getattr(self, name) for name in ("max_walks", "unknown_below", "seed")}
+        return MapConfig(self._part(Reward), behavior, prior, posterior, fit, **others)
 
     def _prior(self) -> PriorConfig:
         """Return the prior; options of the other kind are refused."""

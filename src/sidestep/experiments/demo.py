@@ -51,7 +51,8 @@ def demo(folder: Path, seed: int = 0, notify: Notify = quiet, config: DemoConfig
     trajectories, goals = simulate_walks(truth, agents)
     walks = walks_from_trajectories(trajectories, goals, truth)
     ss.write_map(folder / "truth.yaml", truth.known.astype(np.float64), truth)
-    ss.write_map(folder / "office.yaml", np.full(truth.shape, 0.5), truth.forget())
+    blank, nothing = truth.forget(), np.ones(truth.shape, bool)
+    ss.write_map(folder / "office.yaml", np.full(truth.shape, 0.5), blank, unknown=nothing)
     ss.write_walks(folder / "walks.csv", walks)
 
     notify("learning the map from their walks")
@@ -67,7 +68,7 @@ def demo(folder: Path, seed: int = 0, notify: Notify = quiet, config: DemoConfig
     title = "what they say of its walls, and new plans"
     panels = [
         Panel(f"{len(walks)} walks in an office", truth, paths=learning.demonstrations.paths(), goals=goals),
-        Panel(title, learned.grid, learned.blocked, truth, paths, new[:1], new[1:]),
+        Panel(title, learned.grid, learned.blocked, truth, paths, new[:1], new[1:], learned.without_evidence),
     ]
     save(figure_learned(panels), folder / "demo.png")
     entries = {"command": "demo", "agents": asdict(agents), "scores": scores.to_dict()}

@@ -10,21 +10,22 @@ from sidestep.tabular.grid import Cell
 
 KINDS = np.array([0.6, 0.8])
 """The cumulative probabilities of flips and of moves; the rest are runs."""
-_WARMUP_SWEEPS, _SWEEPS_APART, _LEVELS = 200, 50, 20
+_WARMUP_SWEEPS, _LEVELS = 200, 20
 
 
 def sample_prior(
-    prior: BinaryMRF, known: Int[np.ndarray, " barriers"], count: int, *, seed: int = 0
+    prior: BinaryMRF, known: Int[np.ndarray, " barriers"], count: int, *, apart: int = 50, seed: int = 0
 ) -> Bool[np.ndarray, "count barriers"]:
     """Sample barriers from their prior.
 
-    A chain starts from independent barriers, follows the weights of shapes as they grow to their strength, and is read
-    every 50 sweeps from then on.
+    A chain starts from independent barriers, and follows the weights of shapes as they grow to their strength. From
+    then on it is read at equal distances.
 
     Args:
         prior: The prior.
         known: The `Cell` value of each barrier; known ones stay.
         count: The number of samples, at least 1.
+        apart: The sweeps between samples, at least 1; the fewer, the more alike samples are.
         seed: The seed.
 
     Returns:
@@ -36,6 +37,7 @@ def sample_prior(
         [[False, True], [False, True], [False, True]]
     """
     check_count(count, 1, "count")
+    check_count(apart, 1, "apart")
     random = np.random.Generator(np.random.PCG64(seed))
     free = np.flatnonzero(known == Cell.UNKNOWN)
     closed = (known == Cell.OCCUPIED).astype(np.uint8)
@@ -43,7 +45,7 @@ def sample_prior(
         run_prior(native_terms(prior, level), free, closed, _WARMUP_SWEEPS // _LEVELS, random)
     terms = native_terms(prior)
     run_prior(terms, free, closed, _WARMUP_SWEEPS, random)
-    return np.stack([run_prior(terms, free, closed, _SWEEPS_APART, random)[-1] for _ in range(count)])
+    return np.stack([run_prior(terms, free, closed, apart, random)[-1] for _ in range(count)])
 
 
 def run_prior(

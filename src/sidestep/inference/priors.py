@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sidestep._typing import FloatTree
-from sidestep.errors import check
+from sidestep.errors import check, check_not_negative
 
 Numbers = float | Float[Array | np.ndarray, "..."]
 MIN_PROBABILITY = 1 / 1020
@@ -34,8 +34,7 @@ def _as_floats(numbers: Numbers) -> Float[Array, "..."]:
 
 
 def _checked_strength(strength: float) -> Float[Array, ""]:
-    valid = np.isfinite(strength) and strength >= 0
-    check(valid, f"expected a finite number, at least 0, found {strength}", field="strength")
+    check_not_negative(strength, "strength")
     return _as_floats(strength)
 
 

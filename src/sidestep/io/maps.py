@@ -25,12 +25,12 @@ MOST_PIXELS = 100_000_000
 """Images with more pixels are refused before they are decoded."""
 
 OCCUPIED_ABOVE, FREE_BELOW = 0.65, 0.196
-"""The thresholds written into learned maps.
+"""The thresholds written into learned maps, those of nearly every ROS map.
 
-They are those of nearly every ROS map. In `scale` mode Nav2 spreads the occupancy between them over 0…100 and sets
-everything above 0.65 to 100, the only value that its default costmap treats as a wall (`lethal_cost_threshold: 100`).
-With a threshold of 1, no learned wall would stop a robot, however sure.
+Nav2 ignores them in `raw` mode, where a value is the occupancy in percent. `read_map` uses them.
 """
+UNKNOWN_PIXEL = 205
+"""The gray of unknown cells in the maps that mappers write; in `raw` mode all above 100 is unknown."""
 
 _ORIGIN_TOLERANCE = 1e-3
 """Two corners are the same within this distance in cell sides (and within rounding)."""
@@ -197,19 +197,28 @@ def read_sensor_variance(path: str | Path, grid: Grid) -> Float[np.ndarray, "row
     return variance
 
 
-def write_map(path: str | Path, blocked: Float[np.ndarray, "rows columns"], grid: Grid) -> None:
-    """Write P(blocked) as a ROS map in `scale` mode: `NAME.yaml` and `NAME.pgm`.
+def write_map(
+    path: str | Path,
+    blocked: Float[np.ndarray, "rows columns"],
+    grid: Grid,
+    *,
+    unknown: Bool[np.ndarray, "_ _"] | None = None,
+) -> None:
+    """Write P(blocked) as a ROS map in `raw` mode: `NAME.yaml` and `NAME.pgm`.
 
-    A pixel is 255·(1 − p) rounded; resolution and origin are those of the grid, to the last digit. Both files appear
-    atomically, the image first.
+    A pixel is P(blocked) in percent, rounded, or 205 where a cell is unknown: so `map_server` publishes the percentages
+    of an OccupancyGrid, and −1. Mode `scale` would lose more: it has 0 below `free_thresh` and 100 above
+    `occupied_thresh`. Resolution and origin are those of the grid, to the last digit. Both files appear atomically, the
+    image first.
 
     Args:
         path: A name that ends in .yaml or .yml.
         blocked: P(blocked) of each cell, from 0 to 1.
         grid: The geometry of the map.
+        unknown: The cells that are written as unknown; by default none.
 
     Raises:
-        InputError: For another ending, an array of another shape than the grid, and values outside 0…1.
+        InputError: For another ending, arrays of another shape than the grid, and values outside 0…1.
 
     Example:
         >>> write_map("learned.yaml", blocked, grid)  # doctest: +SKIP
@@ -219,14 +228,15 @@ def write_map(path: str | Path, blocked: Float[np.ndarray, "rows columns"], grid
 
     path = Path(path)
     check(path.suffix.lower() in (".yaml", ".yml"), "expected a file name that ends in .yaml or .yml", source=path)
-    message = f"expected an array of shape {grid.shape}, found {blocked.shape}"
-    check(blocked.shape == grid.shape, message, field="blocked")
+    unknown = np.zeros(grid.shape, bool) if unknown is None else unknown
+    for name, cells in (("blocked", blocked), ("unknown", unknown)):
+        check(cells.shape == grid.shape, f"expected an array of shape {grid.shape}, found {cells.shape}", field=name)
     check(((blocked >= 0) & (blocked <= 1)).all(), "expected probabilities from 0 to 1 in every cell", field="blocked")
     image = path.with_suffix(".pgm")
     place = {"resolution": float(grid.resolution), "origin": [float(number) for number in grid.origin]}
     meaning = {"negate": 0, "occupied_thresh": OCCUPIED_ABOVE, "free_thresh": FREE_BELOW}
-    settings = {"image": image.name, "mode": "scale", **place, **meaning}
-    pixels = Image.fromarray(np.rint(255 * (1 - blocked)).astype(np.uint8))
+    settings = {"image": image.name, "mode": "raw", **place, **meaning}
+    pixels = Image.fromarray(np.where(unknown, UNKNOWN_PIXEL, np.rint(100 * blocked)).astype(np.uint8))
     text = yaml.safe_dump(settings, sort_keys=False, allow_unicode=True)
     write_whole(image, lambda file: pixels.save(file, format="PPM"))
     write_whole(path, lambda file: file.write(text.encode()))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from math import isfinite
 from typing import Any, Literal, get_args
 
-from sidestep.errors import check, check_count, check_positive
+from sidestep.errors import check, check_count, check_not_negative, check_positive
 from sidestep.tabular.reward import Reward
 
 BackupName = Literal["boltzmann", "max", "logsumexp", "mellowmax"]
@@ -189,6 +189,7 @@ class MapConfig:
         posterior: How their posterior is found.
         fit: How a posterior is maximized.
         max_walks: Learn from this many walks, drawn by `seed`; None for all.
+        unknown_below: Cells of which walks say less (nats, at least 0) stay unknown in maps for ROS; 0 for none.
         seed: The seed of everything random.
 
     Example:
@@ -197,7 +198,7 @@ class MapConfig:
         'binary'
 
     Raises:
-        InputError: For a method that does not go with the prior.
+        InputError: For a method that does not go with the prior, and for a threshold below 0 or not finite.
     """
 
     reward: Reward = field(default_factory=Reward)
@@ -206,9 +207,11 @@ class MapConfig:
     posterior: PosteriorConfig = field(default_factory=PosteriorConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     max_walks: int | None = None
+    unknown_below: float = 0.05
     seed: int = 0
 
     def __post_init__(self) -> None:
+        check_not_negative(self.unknown_below, "unknown_below")
         method, kind = self.posterior.method, self.prior.kind
         expected = "mode" if kind == "normal" else "sample or mean_field"
         fits = method is None or (method == "mode") == (kind == "normal")

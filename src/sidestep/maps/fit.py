@@ -111,6 +111,18 @@ def posterior_method(config: MapConfig, unknown: int, goals: int) -> PosteriorMe
     return "sample" if samples else "mean_field"
 
 
+def method_of(posterior: MapPosterior, config: MapConfig) -> PosteriorMethod:
+    """Return the method that found a posterior.
+
+    Args:
+        posterior: The posterior.
+        config: The configuration by which it was found.
+    """
+    if isinstance(posterior, BarrierPosterior):
+        return "sample"
+    return "mean_field" if config.prior.kind == "binary" else "mode"
+
+
 def sweeps_for(config: MapConfig, unknown: int, goals: int) -> int:
     """Return the number of sweeps: the configured one, or one by the size.
 
@@ -259,7 +271,7 @@ def fit_map(
     """
     behavior = behavior or behavior_model_of(config)
     weights, unknown = np.asarray(demonstrations.weights), np.asarray(model.known).ravel() == Cell.UNKNOWN
-    prior = _prior_of_fit(config.prior, model, sensor)
+    prior = prior_of_fit(config.prior, model, sensor)
     if config.fit.terms != "actions":
         # of each unknown cell, the walks that begin there, by their weights
         first = demonstrations.first_moves()
@@ -293,7 +305,14 @@ def fit_map(
     )
 
 
-def _prior_of_fit(config: PriorConfig, model: ObstacleGrid, sensor: SensorMap | None) -> Prior:
+def prior_of_fit(config: PriorConfig, model: ObstacleGrid, sensor: SensorMap | None = None) -> Prior:
+    """Return the prior of the cells' logits with which a map is fitted.
+
+    Args:
+        config: The configuration of the prior.
+        model: The grid.
+        sensor: What sensors saw, if anything.
+    """
     if config.kind == "binary":
         return MeanField(barrier_prior(config, np.asarray(model.known), "mean_field", sensor), model.known)
     prior = cell_prior(sensor, config)

@@ -19,8 +19,9 @@ from sidestep.io.gridding import Moves, grid_walks
 from sidestep.io.walks import Walks
 from sidestep.maps.annotations import NO_ANNOTATIONS, WalkAnnotations, persons_of
 from sidestep.maps.config import MapConfig, PosteriorMethod
-from sidestep.maps.fit import MapPosterior, behavior_model_of, demonstrations_of, infer_map
+from sidestep.maps.fit import MapPosterior, behavior_model_of, demonstrations_of, infer_map, method_of
 from sidestep.maps.goal_candidates import GoalPosterior, fit_with_unknown_goals
+from sidestep.maps.information import map_information
 from sidestep.maps.learned_map import LearnedMap
 from sidestep.maps.selection import Selection, select_behavior
 from sidestep.maps.sensors import SensorMap, first_logits, seen_cells
@@ -91,9 +92,7 @@ class Learning:
     @property
     def method(self) -> PosteriorMethod:
         """How the posterior was found."""
-        if isinstance(self.fit, BarrierPosterior):
-            return "sample"
-        return "mean_field" if self.config.prior.kind == "binary" else "mode"
+        return method_of(self.fit, self.config)
 
     def summary(self) -> dict[str, Any]:
         """Return the content of `summary.json`: plain numbers, texts, lists and dictionaries."""
@@ -187,6 +186,7 @@ def learn_map(
         behavior = behavior_model_of(config, person)
         run: dict[str, Any] = {"callback": callback, "checkpoint": checkpoint, "resume": resume}
         fit = infer_map(model, demonstrations, config, sensor=sensor, behavior=behavior, **run)
+    nats = map_information(fit, config)
     learning = Learning(
         config=config,
         fit=fit,
@@ -204,7 +204,16 @@ def learn_map(
     blocked, samples = np.asarray(fit.model.blocked, dtype=np.float64), None
     if isinstance(fit, BarrierPosterior):
         samples = fit.thinned(_KEPT_SAMPLES).reshape(-1, *grid.shape)
-    return LearnedMap(grid, blocked, demonstrations.visited_state_goals(), config.reward, learning, samples)
+    return LearnedMap(
+        grid,
+        blocked,
+        demonstrations.visited_state_goals(),
+        config.reward,
+        learning,
+        samples,
+        information=nats,
+        unknown_below=config.unknown_below,
+    )
 
 
 def sample_walks(walks: Walks, config: MapConfig) -> Walks:

@@ -2,8 +2,9 @@
 
 | file           | content                                                                          |
 |----------------|----------------------------------------------------------------------------------|
-| `map.yaml`, `map.pgm` | the map for ROS (`map_server`, mode scale)                                |
+| `map.yaml`, `map.pgm` | the map for ROS (`map_server`, mode raw)                                  |
 | `blocked.npy`  | P(blocked) of each cell, row 0 at the top; exactly 0 or 1 where the map knew     |
+| `information.npy` | what walks say of each cell, in nats; 0 where the map knew                    |
 | `samples.npz`  | `blocked`: maps from the posterior, where it was sampled                         |
 | `visited.npy`  | the (state, goal) pairs that the walks passed                                    |
 | `posterior.csv`| P(goal) of each walk, where the walks did not name their goals                   |
@@ -20,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sidestep._files import read_array, read_json, write_array, write_arrays, write_json
-from sidestep.errors import check, input_errors
+from sidestep.errors import InputError, check, check_not_negative, input_errors
 from sidestep.io.maps import read_map, write_map
 from sidestep.robots.planners import GoalPlan, ModelPlanner
 from sidestep.robots.risk import expected_length, independent_open_probability, open_probability
@@ -76,6 +77,9 @@ class LearnedMap:
         reward: The reward that the agents pursued.
         learning: How the map was learned; None for a map that was loaded from a folder.
         samples: Maps from the posterior: whether each cell is blocked; None where it was not sampled.
+        information: What walks say of each cell in nats (`sidestep.inference.cell_information`), 0 where the map knew;
+            None where it was not computed.
+        unknown_below: Cells of which walks say less than this (nats) stay unknown in maps for ROS.
 
     Example:
         >>> grid = Grid(np.array([[0, -1, 0]]))
@@ -90,11 +94,22 @@ class LearnedMap:
     reward: Reward
     learning: "sidestep.maps.learn.Learning | None" = None
     samples: Bool[np.ndarray, "samples rows columns"] | None = None
+    information: Float[np.ndarray, "rows columns"] | None = None
+    unknown_below: float = 0.0
 
     @property
     def unknown(self) -> Bool[np.ndarray, "rows columns"]:
         """The cells that had to be learned."""
         return self.grid.known == Cell.UNKNOWN
+
+    @property
+    def without_evidence(self) -> Bool[np.ndarray, "rows columns"]:
+        """The cells that walks say too little of: less than `unknown_below`, and no walk was in them."""
+        if self.information is None:
+            return np.zeros(self.grid.shape, dtype=bool)
+        visited = np.zeros(self.grid.size, dtype=bool)
+        visited[self.visited[:, 0]] = True
+        return self.unknown & (self.information < self.unknown_below) & ~visited.reshape(self.grid.shape)
 
     @property
     def converged(self) -> bool | None:
@@ -197,9 +212,11 @@ class LearnedMap:
         Returns:
             Plain numbers, texts, lists and dictionaries.
         """
-        reward = {"reward": {"discount": self.reward.discount, "step_cost": self.reward.step_cost}}
-        summary = {"settings": reward} if self.learning is None else self.learning.summary()
-        return {"connectivity": self.grid.connectivity, **summary}
+        reward = {"discount": self.reward.discount, "step_cost": self.reward.step_cost}
+        settings = {"reward": reward, "unknown_below": self.unknown_below}
+        summary = {"settings": settings} if self.learning is None else self.learning.summary()
+        count = None if self.information is None else int(self.without_evidence.sum())
+        return {"connectivity": self.grid.connectivity, "cells_without_evidence": count, **summary}
 
     def save(self, folder: str | Path, **entries: Any) -> None:
         """Write the map to a folder, each file whole, `summary.json` last.
@@ -215,13 +232,16 @@ class LearnedMap:
         """
         folder, smallest = Path(folder), np.finfo(np.float64).epsneg
         blocked = np.where(self.unknown, np.clip(self.blocked, smallest, 1 - smallest), self.blocked)
-        write_map(folder / "map.yaml", blocked, self.grid)
+        write_map(folder / "map.yaml", blocked, self.grid, unknown=self.without_evidence)
         write_array(folder / "blocked.npy", blocked)
         write_array(folder / "visited.npy", self.visited)
         if self.samples is not None:
             write_arrays(folder / "samples.npz", blocked=self.samples)
-        else:
-            (folder / "samples.npz").unlink(missing_ok=True)  # of an earlier map in this folder
+        if self.information is not None:
+            write_array(folder / "information.npy", self.information)
+        for name, array in (("samples.npz", self.samples), ("information.npy", self.information)):
+            if array is None:
+                (folder / name).unlink(missing_ok=True)  # of an earlier map in this folder
         if self.learning is not None and self.learning.goals is not None:
             from sidestep.maps.goal_candidates import write_goal_posterior
 
@@ -251,7 +271,7 @@ def load_map(folder: str | Path) -> LearnedMap:
         [[0.0, 0.1, 0.0]]
     """
     folder = Path(folder)
-    connectivity, reward = _settings(folder / "summary.json")
+    connectivity, reward, unknown_below = _settings(folder / "summary.json")
     geometry = read_map(folder / "map.yaml", connectivity=connectivity)
     blocked = read_array(folder / "blocked.npy", kinds="f")
     fits = blocked.shape == geometry.shape and ((blocked >= 0) & (blocked <= 1)).all()
@@ -263,8 +283,24 @@ def load_map(folder: str | Path) -> LearnedMap:
     check(fits, message, source=folder / "visited.npy")
     known = np.where(blocked == 0, Cell.FREE, np.where(blocked == 1, Cell.OCCUPIED, Cell.UNKNOWN))
     grid = replace(geometry, known=known.astype(np.int64))
-    samples = _read_samples(folder / "samples.npz", geometry.shape)
-    return LearnedMap(grid, blocked.astype(np.float64), visited.astype(np.int64), reward, samples=samples)
+    return LearnedMap(
+        grid,
+        blocked.astype(np.float64),
+        visited.astype(np.int64),
+        reward,
+        samples=_read_samples(folder / "samples.npz", geometry.shape),
+        information=_read_information(folder / "information.npy", geometry.shape),
+        unknown_below=unknown_below,
+    )
+
+
+def _read_information(path: Path, shape: tuple[int, int]) -> Float[np.ndarray, "rows columns"] | None:
+    if not path.exists():  # of an earlier version, or made without
+        return None
+    nats = read_array(path, kinds="f").astype(np.float64)
+    message = f"expected numbers of at least 0 in the map's shape {shape}, found shape {nats.shape}"
+    check(nats.shape == shape and (nats >= 0).all(), message, source=path)
+    return nats
 
 
 def _read_samples(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "samples rows columns"] | None:
@@ -291,16 +327,19 @@ def add_to_summary(folder: Path, out: Path, key: str | None, summary: dict[str, 
     write_json(path, summary)
 
 
-def _settings(path: Path) -> tuple[Connectivity, Reward]:
-    """Read the connectivity and the reward that a map was learned with."""
+def _settings(path: Path) -> tuple[Connectivity, Reward, float]:
+    """Read the connectivity and the reward that a map was learned with, and below what cells are unknown."""
     summary = read_json(path)
     message = "expected connectivity and settings.reward with discount and step_cost, as `sidestep learn` writes"
     with input_errors(message, KeyError, TypeError, ValueError, source=path):
         connectivity, reward = summary["connectivity"], summary["settings"]["reward"]
         discount = float(reward["discount"])
         step_cost = None if reward["step_cost"] is None else float(reward["step_cost"])
+        unknown_below = float(summary["settings"].get("unknown_below", 0.0))  # absent in earlier versions
     check(connectivity in (4, 8), f"expected 4 or 8, found {connectivity!r}", source=path, field="connectivity")
     check(0 < discount <= 1, f"expected a number in (0, 1], found {discount}", source=path, field="discount")
     positive = step_cost is None or 0 < step_cost < np.inf
     check(positive, f"expected a number above 0, found {step_cost}", source=path, field="step_cost")
-    return connectivity, Reward(discount, step_cost)
+    with input_errors("expected the threshold of unknown cells", InputError, source=path):
+        check_not_negative(unknown_below, "unknown_below")
+    return connectivity, Reward(discount, step_cost), unknown_below

@@ -16,6 +16,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path as Outline
 from matplotlib.patheffects import Normal, Stroke
 from matplotlib.transforms import Affine2D
 
@@ -33,6 +35,7 @@ _OBJECTIVE_SPAN = 1.0
 """The least height of the objective's axis, in nats: smaller changes look as small as they are."""
 
 Values = Float[np.ndarray, "rows columns"]
+Cells = Bool[np.ndarray, "rows columns"]
 Places = Integer[np.ndarray, " _"] | Float[np.ndarray, "_ 2"]
 """States, or positions in metres."""
 Marks = Sequence[int] | Places
@@ -50,6 +53,7 @@ class Panel:
         paths: The places along each path. A place is a state, or a position in metres.
         starts: Places that get a red square.
         goals: Places that get a green diamond.
+        without_evidence: Cells that are hatched, since walks say next to nothing of them; None for none.
     """
 
     title: str
@@ -59,6 +63,7 @@ class Panel:
     paths: Sequence[Places] = ()
     starts: Marks = ()
     goals: Marks = ()
+    without_evidence: Cells | None = None
 
 
 def draw_cells(
@@ -123,6 +128,21 @@ def draw_outlines(axes: Axes, truth: Grid) -> None:
     outline = LineCollection(segments, colors=palette.OUTLINE, linewidths=width, zorder=2, label="true obstacle")
     outline.set(capstyle="projecting", path_effects=_halo(width))
     axes.add_collection(outline, autolim=False)
+
+
+def draw_without_evidence(axes: Axes, cells: Cells, grid: Grid) -> None:
+    """Hatch cells that walks say next to nothing of, over a veil that lets their P(blocked) through.
+
+    Args:
+        axes: The axes to draw on.
+        cells: Whether each cell is hatched, row 0 at the top.
+        grid: The map.
+    """
+    if not cells.any():
+        return
+    path = Outline.make_compound_path(*(Outline(corners, closed=True) for corners in _runs(cells, grid)))
+    style = {"facecolor": (1.0, 1.0, 1.0, 0.6), "edgecolor": "0.35", "linewidth": 0.0, "hatch": "/////"}
+    axes.add_patch(PathPatch(path, label="walks say next to nothing", zorder=1.5, **style))
 
 
 def draw_walks(axes: Axes, paths: Sequence[Places], grid: Grid, label: str = "walk") -> None:
@@ -205,6 +225,7 @@ def figure_fit(
     objective: Float[np.ndarray, " _"],
     seen: Values | None = None,
     goals: Marks = (),
+    without_evidence: Cells | None = None,
 ) -> Figure:
     """Return a figure of a fit: the walks and their goals, the learned map, and the objective in every iteration.
 
@@ -215,6 +236,7 @@ def figure_fit(
         objective: The log posterior (nats) before the first iteration and after each.
         seen: P(blocked) of each cell in the map of a sensor, NaN where it has none.
         goals: The goals of the walks.
+        without_evidence: Cells of the learned map that are hatched; None for none.
     """
     width, height = _size(grid, _FIT)
     height = max(height, 2.2)
@@ -226,6 +248,8 @@ def figure_fit(
     before.set_title(f"Known before, and {len(paths)} walks")
     image = draw_blocked(after, blocked, grid)
     after.set_title("Learned")
+    if without_evidence is not None:
+        draw_without_evidence(after, without_evidence, grid)
     for axes in (before, after):
         draw_places(axes, (), goals, grid)
     progress.plot(np.arange(len(objective)), objective, color=palette.BLUE, marker="." if len(objective) < 30 else "")
@@ -286,6 +310,8 @@ def _draw_panel(axes: Axes, panel: Panel) -> AxesImage | None:
     """Draw a panel; return its image if a color bar applies to it."""
     if panel.blocked is not None:
         image = draw_blocked(axes, panel.blocked, panel.grid, panel.truth)
+        if panel.without_evidence is not None:
+            draw_without_evidence(axes, panel.without_evidence, panel.grid)
     else:
         image = draw_map(axes, panel.grid)
     draw_walks(axes, panel.paths, panel.grid, label="path")
@@ -311,6 +337,16 @@ def _borders(inside: Bool[np.ndarray, "rows columns"], grid: Grid) -> list[Float
     level = np.array([[column, rows - row], [column + 1, rows - row]])
     sides = np.concatenate([upright, level], axis=-1).transpose(2, 0, 1)
     return list(grid.to_metres(sides.reshape(-1, 2).astype(np.float64)).reshape(-1, 2, 2))
+
+
+def _runs(cells: Cells, grid: Grid) -> Float[np.ndarray, "runs 5 2"]:
+    """Return the corners of each run of cells in a row, the first one twice, in metres."""
+    change = np.diff(np.pad(cells, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    row, left = np.nonzero(change == 1)
+    _, right = np.nonzero(change == -1)  # in the same order: row by row
+    above, below = cells.shape[0] - row, cells.shape[0] - row - 1
+    corners = np.stack([[left, below], [right, below], [right, above], [left, above], [left, below]])
+    return grid.to_metres(corners.transpose(2, 0, 1).reshape(-1, 2).astype(np.float64)).reshape(-1, 5, 2)
 
 
 def _shifts(count: int) -> Float[np.ndarray, "walks 2"]:
