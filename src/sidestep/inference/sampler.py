@@ -101,7 +101,6 @@ class BarrierPosterior(Generic[Model]):
     Attributes:
         model: The transition model with the posterior's P(closed).
         behavior: The behavior model; it is not sampled.
-        prior: The prior at the posterior mean of its log-odds and strength.
         densities: δ and λ of the prior in each sweep that counts (`HierarchicalMRF`); 0 and 1 where they are known.
         sampled: Whether each barrier was sampled; the others are known, or walks crossed them.
         samples: Whether each barrier is closed, after each sweep that counts, for each chain.
@@ -124,7 +123,6 @@ class BarrierPosterior(Generic[Model]):
 
     model: Model
     behavior: BehaviorModel
-    prior: BinaryMRF
     densities: Float[np.ndarray, "chains draws 2"]
     sampled: Bool[np.ndarray, " barriers"]
     samples: Bool[np.ndarray, "chains draws barriers"]
@@ -300,8 +298,7 @@ def sample_barriers(
     sampled = np.isin(np.arange(len(closed)), problem.free)
     sizes = effective_sizes(samples)
     densities = np.stack([state.densities for state in states])[:, heated_sweeps(sweeps) :]
-    mean = problem.prior.at(*densities.mean(axis=(0, 1)).tolist())
-    return BarrierPosterior(learned, agents, mean, densities, sampled, samples, closed, rhat, sizes, history, status)
+    return BarrierPosterior(learned, agents, densities, sampled, samples, closed, rhat, sizes, history, status)
 
 
 def heated_sweeps(sweeps: int) -> int:

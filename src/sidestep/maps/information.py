@@ -1,6 +1,8 @@
 """What walks and sensors say of each cell of a map, in nats (`sidestep.inference.cell_information`).
 
-Samples of the posterior are compared with samples of the prior. A fit has an approximation, with more than one optimum,
+Samples of the posterior are compared with samples of the prior at the density that was learned, so that what walks say
+of the density does not count for every cell. Cells that no walk crossed are compared given those that walks crossed:
+which these are follows from starts and goals, and only choices say what is beside them. A fit has an approximation, with more than one optimum,
 and on large maps it ends early. So it is compared with itself without evidence:
 
 1. The gradient of the objective without that of the prior is what the evidence adds, at the end of the fit and by the
@@ -19,12 +21,14 @@ from jaxtyping import Array, Float
 from sidestep._programs import keep_program
 from sidestep.inference.cell_information import information, prior_closed
 from sidestep.inference.fit import Fit, fit
+from sidestep.inference.hierarchical import HierarchicalMRF
 from sidestep.inference.information import Information
 from sidestep.inference.objective import Parameters
 from sidestep.inference.priors import Prior
 from sidestep.inference.sampler import BarrierPosterior
 from sidestep.maps.config import MapConfig
-from sidestep.maps.fit import MapPosterior, barrier_prior, prior_of_fit
+from sidestep.maps.fit import MapPosterior, prior_of_fit, sampled_prior
+from sidestep.tabular.grid import Cell
 from sidestep.tabular.models import ObstacleGrid
 
 _SURE_LOGIT = 6.0
@@ -64,9 +68,7 @@ def map_information(posterior: MapPosterior, config: MapConfig) -> Float[np.ndar
         config: The configuration by which it was found.
     """
     if isinstance(posterior, BarrierPosterior):
-        known = np.asarray(posterior.model.known)
-        prior = barrier_prior(config.prior, known, "sample")
-        before = prior_closed(prior, known.ravel(), seed=config.seed).reshape(known.shape)
+        before = _prior_of_samples(posterior, config)
         return information(np.asarray(posterior.model.blocked, np.float64), before)
     prior = prior_of_fit(config.prior, posterior.model)
     slopes = _slopes(posterior, prior)
@@ -74,6 +76,22 @@ def map_information(posterior: MapPosterior, config: MapConfig) -> Float[np.ndar
     start = after.with_parameters(jnp.clip(after.parameters, -_SURE_LOGIT, _SURE_LOGIT))
     before = _maximum(posterior, LinearEvidence(prior, jnp.zeros_like(slopes)), start)
     return information(*(np.asarray(model.blocked, np.float64) for model in (after, before)))
+
+
+def _prior_of_samples(
+    posterior: BarrierPosterior[ObstacleGrid], config: MapConfig
+) -> Float[np.ndarray, "rows columns"]:
+    """Return P(blocked) of each cell before walks and sensors, at the posterior mean of the density and strength."""
+    known = np.asarray(posterior.model.known)
+    prior = sampled_prior(config.prior, known)
+    if isinstance(prior, HierarchicalMRF):
+        prior = prior.at(*posterior.densities.mean(axis=(0, 1)).tolist())
+    given = np.where(
+        posterior.sampled, known.ravel(), np.where(known.ravel() == Cell.OCCUPIED, Cell.OCCUPIED, Cell.FREE)
+    )
+    conditions = np.where(posterior.sampled, known.ravel(), visited), known.ravel()
+    before = (prior_closed(prior, cells, seed=config.seed) for cells in conditions)
+    return np.where(posterior.sampled, *before).reshape(known.shape)
 
 
 def _slopes(posterior: Fit[ObstacleGrid], prior: Prior) -> Float[Array, " cells"]:
