@@ -8,9 +8,8 @@ true parameters among L independent draws from the posterior is uniform on 0…L
 
 Uniform ranks lie inside the band of `uniform_band` for all k at once with a probability of 95 % or a little more. It
 is that of Säilynoja et al. (2022): pointwise binomial intervals, all with the same tails, as narrow as the probability
-allows. Their section 2.2 has it at the N ranks or at equal distances; here it is at each of the L values of k. The
-probability is computed exactly, from one k to the next: given the number of ranks up to k, that of ranks equal to k + 1 is
-binomial.
+allows. The probability is computed exactly, from one k to the next: given the number of ranks up to k, that of ranks
+equal to k + 1 is binomial. It differs from theirs in that intervals are at every k, not at as many places as there are ranks.
 
 References:
     S. Talts, M. Betancourt, D. Simpson, A. Vehtari and A. Gelman (2018). Validating Bayesian inference algorithms with
@@ -101,7 +100,7 @@ def rank_difference(ranks: Int[np.ndarray, " ranks"], draws: int) -> Float[np.nd
 
 
 def band_excess(ranks: Int[np.ndarray, " ranks"], band: UniformBand) -> float:
-    """Return how far ranks lie outside a band at most, as a fraction of ranks; 0 on its edge, negative inside.
+    """Return how far the empirical distribution of ranks leaves a band at most; 0 where it stays inside.
 
     Args:
         ranks: As many numbers as the band is for, from 0 to L.
@@ -112,7 +111,7 @@ def band_excess(ranks: Int[np.ndarray, " ranks"], band: UniformBand) -> float:
     """
     check(len(ranks) == band.ranks, f"expected {band.ranks} ranks, found {len(ranks)}", field="ranks")
     numbers = _numbers_up_to(ranks, band.draws)
-    return float(np.maximum(numbers - band.high, band.low - numbers).max() / len(ranks))
+    return float(np.maximum(numbers - band.high, band.low - numbers).max().clip(min=0) / len(ranks))
 
 
 def outside_fraction(ranks: Int[np.ndarray, " ranks"], draws: int, probability: float = 0.9) -> float:

@@ -6,7 +6,7 @@ draws from the posterior is uniform (`sidestep.evaluation.ranks`). Three quantit
 
 - the length of the shortest path from A to B, cells in the middle of the upper and of the lower edge; infinite if
   there is none
-- the log-likelihood of the walks, by `sidestep.log_likelihood`, which shares no code with the sampler's
+- the log-likelihood of the walks, by `sidestep.log_likelihood` and not by the sampler's own numbers
 - whether the door, a cell in the middle of the map, is open
 
 The walks follow the sampler's model exactly:
@@ -171,7 +171,7 @@ def rank_scores(ranks: Int[np.ndarray, " maps"], band: UniformBand) -> dict[str,
 
     Returns:
         `largest_difference`, of their empirical distribution from the uniform one; `band_excess`, by which it leaves
-        the band at most, negative inside; `outside_90`, the fraction of maps outside the central 90 % of the draws.
+        the band at most, 0 inside; `outside_90`, the fraction of maps outside the central 90 % of the draws.
     """
     return {
         "largest_difference": float(np.abs(rank_difference(ranks, band.draws)).max()),

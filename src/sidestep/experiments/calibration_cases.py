@@ -45,7 +45,7 @@ class CalibrationConfig:
         walks: The number of walks on a map, at least 2.
         moves: The number of moves after which an agent stops, at least 1.
         sweeps: The sweeps of each of two chains, at least 12.
-        draws: The number of draws from each posterior, an even number, at least 4.
+        draws: The number of draws from each posterior, an even number, at least 8.
         prior: The prior of maps.
         behavior: The behavior of the agents.
         reward: The reward that they pursue.
@@ -65,7 +65,7 @@ class CalibrationConfig:
     reward: ss.Reward = field(default_factory=ss.Reward)
 
     def __post_init__(self) -> None:
-        least = {"maps": 1, "rows": 3, "walks": 2, "moves": 1, "sweeps": 12, "draws": 4}
+        least = {"maps": 1, "rows": 3, "walks": 2, "moves": 1, "sweeps": 12, "draws": 8}
         for name, number in least.items():
             check_count(getattr(self, name), number, name)
         check(self.draws % 2 == 0, f"expected an even number, found {self.draws}", field="draws")
