@@ -6,10 +6,11 @@ true parameters among L independent draws from the posterior is uniform on 0…L
 
     F(k) = the fraction of N ranks that are at most k,        F(k) − (k + 1)/(L + 1),    k = 0 … L − 1.
 
-Uniform ranks lie inside the band of `uniform_band` for all k at once with a probability of 95 % or a little more. It
-is that of Säilynoja et al. (2022): pointwise binomial intervals, all with the same tails, as narrow as the probability
+Uniform ranks lie inside the band of `uniform_band` for all k at once with a probability of 95 % or a little more. It is
+that of Säilynoja et al. (2022): pointwise binomial intervals, all with the same tails, as narrow as the probability
 allows. The probability is computed exactly, from one k to the next: given the number of ranks up to k, that of ranks
-equal to k + 1 is binomial. It differs from theirs in that intervals are at every k, not at as many places as there are ranks.
+equal to k + 1 is binomial. It differs from theirs in that intervals are at every k, not at as many places as there are
+ranks.
 
 References:
     S. Talts, M. Betancourt, D. Simpson, A. Vehtari and A. Gelman (2018). Validating Bayesian inference algorithms with
