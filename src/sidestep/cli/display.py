@@ -30,6 +30,9 @@ _HEADINGS = {
     "regret": "regret\n(cells)",
     "arriving_fraction": "arrive",
     "heldout_log_likelihood": "held-out\nnats a move",
+    "largest_difference": "largest\ndifference",
+    "band_excess": "beyond\nthe band",
+    "outside_90": "outside\ncentral 90 %",
 }
 _RANKING = "auc", "average_precision", "auc_relevant"
 _CALIBRATION = "calibration_error", "brier_score", "log_loss"

@@ -2,8 +2,10 @@
 
 Samples of the posterior are compared with samples of the prior at the density that was learned, so that what walks say
 of the density does not count for every cell. Cells that no walk crossed are compared given those that walks crossed:
-which these are follows from starts and goals, and only choices say what is beside them. A fit has an approximation, with more than one optimum,
-and on large maps it ends early. So it is compared with itself without evidence:
+which these are follows from starts and goals, and only choices say what is beside them.
+
+A fit has an approximation, with more than one optimum, and on large maps it ends early. So it is compared with itself
+without evidence:
 
 1. The gradient of the objective without that of the prior is what the evidence adds, at the end of the fit and by the
    probabilities: e(i) = ∂(log L + the evidence of sensors and first cells)/∂σ(θ(i)).
@@ -86,9 +88,7 @@ def _prior_of_samples(
     prior = sampled_prior(config.prior, known)
     if isinstance(prior, HierarchicalMRF):
         prior = prior.at(*posterior.densities.mean(axis=(0, 1)).tolist())
-    given = np.where(
-        posterior.sampled, known.ravel(), np.where(known.ravel() == Cell.OCCUPIED, Cell.OCCUPIED, Cell.FREE)
-    )
+    visited = np.where(known == Cell.OCCUPIED, Cell.OCCUPIED, Cell.FREE).ravel()
     conditions = np.where(posterior.sampled, known.ravel(), visited), known.ravel()
     before = (prior_closed(prior, cells, seed=config.seed) for cells in conditions)
     return np.where(posterior.sampled, *before).reshape(known.shape)
