@@ -31,15 +31,15 @@ from sidestep.inference.prior_chains import native_terms, run_prior
 from sidestep.tabular.grid import Cell
 from sidestep.tabular.solvers.native import run_batch
 
-LOG_ODDS = np.arange(-2.5, 1.01, 0.25)
+LOG_ODDS = np.arange(-1.0, 1.26, 0.25)
 """The values of δ."""
-STRENGTHS = np.arange(0.0, 2.01, 0.25)
+STRENGTHS = np.arange(0.0, 1.76, 0.25)
 """The values of λ."""
-LOG_ODDS_PRIOR, STRENGTH_PRIOR = (-0.9, 0.6), (1.0, 0.6)
+LOG_ODDS_PRIOR, STRENGTH_PRIOR = (0.1, 0.3), (0.75, 0.6)
 """The means and standard deviations of δ and λ, normal and cut off at the ends of the grid."""
-STRENGTH_COST = 1.5
+STRENGTH_COST = 2.25
 """The log-odds that a closed cell loses for each unit of strength, so that walls of any strength are equally dense."""
-CROSSED_WEIGHT = 10.0
+CROSSED_WEIGHT = 12.0
 """c, the most crossed barriers that count as evidence of the density."""
 _SWEEPS, _PROPOSALS = 40, 20_000
 """The fewest sweeps at each δ and λ on the way up and down, and the fewest proposals."""
