@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from sidestep.errors import InputError, NotConverged, check
 from sidestep.inference.chain_kernels import Chain, Evidence, Workspace, World, chain_kernels
-from sidestep.inference.hierarchical import HierarchicalMRF, evidence_normalizers, fixed
+from sidestep.inference.hierarchical import HierarchicalMRF, as_hierarchical, evidence_normalizers
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.inference.prior_chains import KINDS, is_free_of, native_terms
 from sidestep.inference.prior_kernels import MAX_CHANGED
@@ -260,7 +260,7 @@ def barrier_problem(
     tie = backup.tie if isinstance(backup, HardMax) else 0.0
     free = np.flatnonzero((barriers.known == Cell.UNKNOWN) & ~crossed).astype(np.int64)
     rewards = np.array(tasks.terminal_reward, np.float64)
-    hierarchical = prior if isinstance(prior, HierarchicalMRF) else fixed(prior)
+    hierarchical = as_hierarchical(prior)
     normalizers = evidence_normalizers(hierarchical, barriers.known, free, seed)
     native = KERNELS[type(backup)], tie
     return BarrierProblem(barriers, world, evidence, hierarchical, normalizers, free, native, terminal, rewards)
@@ -276,7 +276,7 @@ def check_prior(barriers: Barriers, prior: BinaryMRF | HierarchicalMRF) -> None:
     Raises:
         InputError: For another number of barriers, and for shape terms on another grid.
     """
-    size, prior = len(barriers.known), prior.shapes if isinstance(prior, HierarchicalMRF) else prior
+    size, prior = len(barriers.known), as_hierarchical(prior).shapes
     check(len(prior.field) == size, f"expected {size} barriers, found {len(prior.field)}", field="prior")
     message = f"expected shape {barriers.shape} or None, found {prior.shape}"
     check(prior.shape is None or prior.shape == barriers.shape, message, field="prior")

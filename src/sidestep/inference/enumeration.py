@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from sidestep.errors import check
 from sidestep.inference.chains import PASSING, check_prior, crossed_barriers
+from sidestep.inference.hierarchical import HierarchicalMRF, as_hierarchical, evidence_normalizers
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.demonstrations import Demonstrations
@@ -38,10 +39,11 @@ def enumerate_barriers(
     model: TransitionModel,
     demonstrations: Demonstrations,
     behavior: Behavior,
-    prior: BinaryMRF,
+    prior: BinaryMRF | HierarchicalMRF,
     *,
     tempering: float = 1.0,
     terms: Terms = ALL_TERMS,
+    seed: int = 0,
 ) -> ExactPosterior:
     """Return the exact posterior of at most 16 unknown barriers, from the likelihood of each of the 2ⁿ maps.
 
@@ -49,9 +51,10 @@ def enumerate_barriers(
         model: The transition model; see `barriers_of`.
         demonstrations: The moves and tasks.
         behavior: The behavior of the agents.
-        prior: The prior of the barriers.
+        prior: The prior of the barriers; the density and strength of a `HierarchicalMRF` are summed over.
         tempering: κ, the weight of the actions' log-likelihood.
         terms: The parts of the likelihood that count.
+        seed: The seed of the chains that find log Z of a `HierarchicalMRF`, as for `sample_barriers`.
 
     Returns:
         P(closed) of each barrier, and the evidence.
@@ -90,7 +93,11 @@ def enumerate_barriers(
         return jax.vmap(one)(batch)
 
     parts = [log_likelihoods(jnp.asarray(maps[at : at + _BATCH])) for at in range(0, len(maps), _BATCH)]
-    log_posterior = np.concatenate(parts) @ weights + [prior.log_density(each) for each in maps]
+    hierarchical = as_hierarchical(prior)
+    log_normalizers = evidence_normalizers(hierarchical, barriers.known, free, seed)
+    densities = hierarchical.log_densities(maps) - log_normalizers
+    log_priors = np.logaddexp.reduce(densities.reshape(len(maps), -1), axis=1)
+    log_posterior = np.concatenate(parts) @ weights + log_priors
     log_evidence = np.logaddexp.reduce(log_posterior)
     closed = np.minimum(np.exp(log_posterior - log_evidence) @ maps, 1.0)  # sums of rounded numbers
     return ExactPosterior(np.where(maps.all(axis=0), 1.0, closed), float(log_evidence))

@@ -23,7 +23,7 @@ Pettitt 2008).
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Integer
 
 from sidestep.errors import check
 from sidestep.inference.mrf import SHAPE_TERMS, BinaryMRF
@@ -96,15 +96,18 @@ class HierarchicalMRF:
         field = self.field + log_odds * self.varied + strength * self.shapes.field
         return BinaryMRF(field, self.shapes.shape, **weights)
 
-    def log_densities(self, closed: Bool[np.ndarray, " barriers"]) -> Float[np.ndarray, "etas strengths"]:
-        """Return log p(z, δ, λ) + log Z(δ, λ) at each δ and λ, up to a constant.
+    def log_densities(
+        self, closed: Bool[np.ndarray, "*maps barriers"] | Integer[np.ndarray, "*maps barriers"]
+    ) -> Float[np.ndarray, "*maps etas strengths"]:
+        """Return log p(z, δ, λ) + log Z(δ, λ) of maps at each δ and λ, up to a constant.
 
         Args:
-            closed: z.
+            closed: Whether each barrier is closed.
         """
-        closed = np.asarray(closed, bool)
-        of_log_odds = self.field @ closed + self.log_odds * (self.varied & closed).sum()
-        return self.log_prior + of_log_odds[:, None] + self.strengths * self.shapes.log_density(closed)
+        of_field, varied = closed @ self.field, closed @ self.varied.astype(np.int64)
+        of_log_odds = of_field[..., None] + self.log_odds * varied[..., None]
+        of_shapes = self.strengths * self.shapes.log_density(closed)[..., None]
+        return self.log_prior + of_log_odds[..., :, None] + of_shapes[..., None, :]
 
 
 def hierarchical_mrf(
@@ -143,12 +146,14 @@ def hierarchical_mrf(
     return HierarchicalMRF(shapes, np.where(varied, 0.0, field), varied, LOG_ODDS, strengths, log_prior)
 
 
-def fixed(prior: BinaryMRF) -> HierarchicalMRF:
-    """Return a prior with known density and strength as a hierarchical one.
+def as_hierarchical(prior: BinaryMRF | HierarchicalMRF) -> HierarchicalMRF:
+    """Return a prior of known density and strength as a hierarchical one with a single δ = 0 and λ = 1.
 
     Args:
-        prior: The prior.
+        prior: The prior; a hierarchical one is returned as it is.
     """
+    if isinstance(prior, HierarchicalMRF):
+        return prior
     zeros = np.zeros(len(prior.field))
     return HierarchicalMRF(prior, zeros, zeros > 0, np.zeros(1), np.ones(1), np.zeros((1, 1)))
 

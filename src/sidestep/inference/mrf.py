@@ -74,10 +74,11 @@ class BinaryMRF:
         Args:
             closed: Whether each barrier is closed.
         """
-        total = np.asarray(closed @ self.field)
-        if self.shape is None:
-            return total
-        return total + shape_counts(np.asarray(closed, bool).reshape(*closed.shape[:-1], *self.shape)) @ self.weights
+        total = closed @ self.field
+        if self.shape is not None:
+            maps = np.asarray(closed, bool).reshape(*closed.shape[:-1], *self.shape)
+            total = total + shape_counts(maps) @ self.weights
+        return np.asarray(total)
 
 
 def shape_counts(closed: Bool[np.ndarray, "*maps rows columns"]) -> Int[np.ndarray, "*maps 4"]:
