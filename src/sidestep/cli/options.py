@@ -76,7 +76,10 @@ class LearnOptions:
     ] = None
     sweeps: Annotated[int | None, Option(help="The sweeps of each chain of samples; by default by the size.")] = None
     log_odds: Annotated[
-        float | None, Option(help="The log-odds of a blocked cell far from others (binary prior).", metavar="NATS")
+        float | None,
+        Option(
+            help="The log-odds of a blocked cell far from others (binary prior); by default sampled.", metavar="NATS"
+        ),
     ] = PriorConfig.log_odds
     prior_mean: Annotated[float | None, Option(help="The mean of unknown cells' logits (normal prior).")] = None
     prior_variance: Annotated[float | None, Option(help="The variance of these logits (normal prior).")] = None

@@ -39,7 +39,7 @@ LOG_ODDS_PRIOR, STRENGTH_PRIOR = (0.1, 0.3), (0.75, 0.6)
 """The means and standard deviations of δ and λ, normal and cut off at the ends of the grid."""
 STRENGTH_COST = 2.25
 """The log-odds that a closed cell loses for each unit of strength, so that walls of any strength are equally dense."""
-CROSSED_WEIGHT = 12.0
+CROSSED_WEIGHT = 15.0
 """c, the most crossed barriers that count as evidence of the density."""
 _SWEEPS, _PROPOSALS = 40, 20_000
 """The fewest sweeps at each δ and λ on the way up and down, and the fewest proposals."""

@@ -21,7 +21,7 @@ PosteriorMethod = Literal["sample", "mean_field", "mode"]
 _BINARY_FIELDS = ("log_odds", "lines", "pairs", "blocks", "isolated")
 _NORMAL_FIELDS = ("mean", "variance", "wall_prior")
 LOG_ODDS = -2.5
-"""The default of `PriorConfig.log_odds`."""
+"""η of the binary prior for a mean field, where `PriorConfig.log_odds` is None."""
 SHAPE_WEIGHTS = {
     "sample": {"lines": 2.5, "pairs": 0.0, "blocks": -3.0, "isolated": -1.0},
     "mean_field": {"lines": 0.5, "pairs": 1.5, "blocks": -3.0, "isolated": -1.0},
@@ -72,7 +72,8 @@ class PriorConfig:
 
     Attributes:
         kind: "binary", a cell is blocked or not (`BinaryMRF`); or "normal", the paper's prior of logits of P(blocked).
-        log_odds: η of the binary prior, the log-odds of a blocked cell far from others; None for the default.
+        log_odds: η of the binary prior, the log-odds of a blocked cell far from others. None is a density that is
+            sampled along with the strength of shapes (`hierarchical_mrf`), and `LOG_ODDS` for a mean field.
         lines, pairs, blocks, isolated: Its weights in nats (`BinaryMRF`); None for those of `SHAPE_WEIGHTS`.
         mean: The mean of each logit of the normal prior; 0 stands for P(blocked) = 1/2.
         variance: The variance of each logit, above 0.
