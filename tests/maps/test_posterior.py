@@ -56,7 +56,7 @@ def test_posterior_method_configured_does_not_depend_on_the_size(method):
 
 
 def test_sweeps_for_fall_with_the_size_between_bounds():
-    sizes = [0, 1, 100, 1_000, 6_000, 10_000, 10**5]
+    sizes = [0, 1, 100, 1_000, 6_000, 30_000, 10**5]
     sweeps = [sweeps_for(MapConfig(), size, 5) for size in sizes]
     assert sweeps == sorted(sweeps, reverse=True)
     assert sweeps[0] == sweeps[2] > sweeps[4] > sweeps[-1] == sweeps[-2] >= 12
@@ -169,7 +169,7 @@ def test_infer_map_passes_settings_on_to_the_sampler():
     again = inferred(config)
     np.testing.assert_array_equal(result.samples, again.samples)
     other = inferred(replace(config, seed=6))
-    assert (result.samples != other.samples).any()
+    assert (result.densities != other.densities).any()
     tempered = inferred(replace(config, behavior=BehaviorConfig(tempering=0.2)))
     assert abs(tempered.final.actions) < abs(result.final.actions)
     alone = inferred(replace(config, fit=FitConfig("transitions")))
