@@ -41,7 +41,7 @@ STRENGTH_COST = 2.25
 """The log-odds that a closed cell loses for each unit of strength, so that walls of any strength are equally dense."""
 CROSSED_WEIGHT = 15.0
 """c, the most crossed barriers that count as evidence of the density."""
-_SWEEPS, _PROPOSALS = 40, 20_000
+_SWEEPS, _PROPOSALS = 40, 10_000
 """The fewest sweeps at each δ and λ on the way up and down, and the fewest proposals."""
 
 

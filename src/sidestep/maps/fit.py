@@ -49,7 +49,7 @@ from sidestep.tabular.solve import SolveOptions
 MapPosterior = Fit[ObstacleGrid] | BarrierPosterior[ObstacleGrid]
 """What is learned of a map: a fit, or samples."""
 
-_PROPOSALS, _FEWEST_SWEEPS, _MOST_SWEEPS = 12_000_000, 150, 600
+_PROPOSALS, _FEWEST_SWEEPS, _MOST_SWEEPS = 12_000_000, 150, 500
 """The number of sweeps is this number over unknown cells × goals, within these bounds."""
 _BLOCKED_LOGIT = 8.0
 """The first logit of an unvisited cell of a large map: some 3,000 tries, longer than most detours."""
