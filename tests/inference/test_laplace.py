@@ -12,11 +12,12 @@ from helpers.spread import demonstrations
 from helpers.walled import BLANK
 from sidestep.errors import InputError
 from sidestep.inference.fit import Fit, fit
-from sidestep.inference.information import Information
-from sidestep.inference.laplace import laplace, natural_scale
+from sidestep.inference.laplace import laplace
+from sidestep.inference.natural_scale import natural_scale
 from sidestep.inference.objective import Parameters
 from sidestep.inference.optimizers import LBFGS, Adam
 from sidestep.inference.priors import Normal
+from sidestep.inference.tabular_information import TabularInformation
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.behavior_model import behavior_model
 from sidestep.tabular.demonstrations import Trajectory, gather
@@ -71,7 +72,7 @@ def test_laplace_of_a_coin_has_the_information_of_a_binomial():
 @pytest.mark.slow
 def test_information_is_the_difference_of_gradients():
     result = fit_of_maze()
-    information = Information(result.problem, parameters_of(result))
+    information = TabularInformation(result.problem, parameters_of(result))
     flat, unravel = ravel_pytree(information.parameters)
     objective, starts = information.objective, information.starts
     dense = information.dense()

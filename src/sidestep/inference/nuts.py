@@ -20,14 +20,15 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sidestep._typing import Tree
-from sidestep.errors import check_count
+from sidestep.errors import check, check_count
 from sidestep.inference.arviz_data import inference_data, require
 from sidestep.inference.batching import Batch
 from sidestep.inference.diagnostics import effective_sizes, split_rhat
 from sidestep.inference.fit import Fit
-from sidestep.inference.information import Information
-from sidestep.inference.laplace import laplace, natural_scale
+from sidestep.inference.laplace import laplace
+from sidestep.inference.natural_scale import natural_scale
 from sidestep.inference.objective import Parameters, Problem, actions_log_likelihood, transitions_and_prior
+from sidestep.inference.tabular_information import TabularInformation
 from sidestep.tabular.likelihood import Arrivals
 from sidestep.tabular.solvers.base import WarmStart
 
@@ -82,7 +83,8 @@ def sample(fit: Fit[Any], key: PRNGKeyArray, n: int = 1_000, *, chains: int = 4,
         The samples, with R̂ and effective sizes.
 
     Raises:
-        InputError: Where blackjax is not installed, for counts that are too small, and as `laplace` does.
+        InputError: Where blackjax is not installed, for counts that are too small or another kind of fit, and as
+            `laplace` does.
 
     Example:
         >>> import sidestep as ss
@@ -101,8 +103,10 @@ def sample(fit: Fit[Any], key: PRNGKeyArray, n: int = 1_000, *, chains: int = 4,
     require("blackjax", "sample")
     for count, least, field in ((n, 4, "n"), (chains, 1, "chains"), (warmup, 1, "warmup")):
         check_count(count, least, field)
+    message = f"expected a fit of a transition model, found {type(fit).__name__}"
+    check(isinstance(fit, Fit), message, source="sample", field="fit")
     normal = laplace(fit)
-    information = Information(fit.problem, normal.parameters)
+    information = TabularInformation(fit.problem, normal.parameters)
     objective = information.objective
     data = objective.batches, information.starts, objective.arrivals
     flat, unravel = ravel_pytree(normal.parameters)
