@@ -43,8 +43,9 @@ def laplace(fit: HasInformation | Information, *, dense: int = 500, rank: int = 
         The normal distribution, with standard errors, intervals and samples.
 
     Raises:
-        InputError: For a fit with values that did not converge, that ended before the maximum, at a bound, or where
-            the posterior does not determine some direction; the message names the parameters.
+        InputError: For a fit that did not converge (its values, or its policy), that ended before the maximum or at a
+            bound; for too few rollouts; and where the posterior does not determine some direction, with the names of
+            parameters.
         NotConverged: If the iterations for many parameters do not converge.
 
     Example:
@@ -132,6 +133,12 @@ def _check_determined(result: Laplace) -> None:
 def _at_maximum(result: Laplace, information: Information) -> Laplace:
     """Return the distribution with its distance from the maximum; raise if a Newton step would be long."""
     simulation, gradient = information.simulation(result), information.gradient
+    noise = float(np.sqrt(simulation.squared_distance))
+    message = (
+        f"expected a gradient without much noise of rollouts, found one of {noise:.2g} standard errors: take more "
+        "samples with laplace(fit.information(samples=…))"
+    )
+    check(noise <= information.farthest, message, source="laplace", field="samples")
     squared = gradient @ result.covariance_products(gradient[None])[0] - simulation.squared_distance
     distance = float(np.sqrt(max(squared, 0.0)))
     message = (

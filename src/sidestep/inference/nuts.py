@@ -20,7 +20,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sidestep._typing import Tree
-from sidestep.errors import check, check_count
+from sidestep.errors import check_count
 from sidestep.inference.arviz_data import inference_data, require
 from sidestep.inference.batching import Batch
 from sidestep.inference.diagnostics import effective_sizes, split_rhat
@@ -83,8 +83,7 @@ def sample(fit: Fit[Any], key: PRNGKeyArray, n: int = 1_000, *, chains: int = 4,
         The samples, with R̂ and effective sizes.
 
     Raises:
-        InputError: Where blackjax is not installed, for counts that are too small or another kind of fit, and as
-            `laplace` does.
+        InputError: Where blackjax is not installed, for counts that are too small, and as `laplace` does.
 
     Example:
         >>> import sidestep as ss
@@ -103,8 +102,6 @@ def sample(fit: Fit[Any], key: PRNGKeyArray, n: int = 1_000, *, chains: int = 4,
     require("blackjax", "sample")
     for count, least, field in ((n, 4, "n"), (chains, 1, "chains"), (warmup, 1, "warmup")):
         check_count(count, least, field)
-    message = f"expected a fit of a transition model, found {type(fit).__name__}"
-    check(isinstance(fit, Fit), message, source="sample", field="fit")
     normal = laplace(fit)
     information = TabularInformation(fit.problem, normal.parameters)
     objective = information.objective
