@@ -87,12 +87,9 @@ from .inference.enumeration import ExactPosterior as ExactPosterior, enumerate_b
 from .inference.fit import Estimate as Estimate, Fit as Fit, fit as fit
 from .inference.maximize import Progress as Progress, Status as Status
 from .inference.goals import GoalFit as GoalFit, fit_goals as fit_goals, goal_posterior as goal_posterior
-from .inference.laplace import (
-    Laplace as Laplace,
-    NaturalScale as NaturalScale,
-    laplace as laplace,
-    natural_scale as natural_scale,
-)
+from .inference.laplace import laplace as laplace
+from .inference.natural_scale import NaturalScale as NaturalScale, natural_scale as natural_scale
+from .inference.normal_posterior import Laplace as Laplace
 from .inference.mean_field import MeanField as MeanField
 from .inference.hierarchical import HierarchicalMRF as HierarchicalMRF, hierarchical_mrf as hierarchical_mrf
 from .inference.mrf import BinaryMRF as BinaryMRF

@@ -8,21 +8,24 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
+from helpers.problems import generic_task, random_problem
 from helpers.spread import demonstrations
 from helpers.walled import BLANK
 from sidestep.errors import InputError
 from sidestep.inference.fit import Fit, fit
-from sidestep.inference.information import Information
-from sidestep.inference.laplace import laplace, natural_scale
+from sidestep.inference.laplace import laplace
+from sidestep.inference.natural_scale import natural_scale
 from sidestep.inference.objective import Parameters
 from sidestep.inference.optimizers import LBFGS, Adam
 from sidestep.inference.priors import Normal
-from sidestep.tabular.backups import Behavior, BoltzmannAverage
+from sidestep.inference.tabular_information import TabularInformation
+from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
 from sidestep.tabular.behavior_model import behavior_model
 from sidestep.tabular.demonstrations import Trajectory, gather
-from sidestep.tabular.graph import graph
+from sidestep.tabular.graph import graph, straight_moves
 from sidestep.tabular.grid import Grid
-from sidestep.tabular.models import FIXED, ObstacleGrid, TabularModel, TiedModel, TransitionModel
+from sidestep.tabular.models import FIXED, ObstacleGrid, SlipperyGrid, TabularModel, TiedModel, TransitionModel
+from sidestep.tabular.simulation import simulate
 from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.tasks import reach, task
 
@@ -68,10 +71,37 @@ def test_laplace_of_a_coin_has_the_information_of_a_binomial():
     np.testing.assert_allclose(error, p * (1 - p) * information**-0.5, rtol=1e-9)
 
 
+def fit_of_slips() -> Fit:
+    """A fit of 25 logits of cells, and of slips on two terrains."""
+    terrain = np.arange(25).reshape(5, 5) % 2
+    return fit(SlipperyGrid(BLANK, -2.0, -1.0, terrain), demonstrations(), BEHAVIOR, prior=Normal(-1.0, 1.5))
+
+
+def fit_of_tastes() -> Fit:
+    """A fit of 25 logits, the costs of 25 states, two weights, and β of two persons."""
+    features = np.random.default_rng(0).normal(scale=0.1, size=(25, 4, 2))
+    person, aimed_at = np.array([0, 1, 0, 1, 1]), straight_moves(BLANK)
+    agents = Behavior(LogSumExp(), 5.0)
+    learned = behavior_model(agents, ["beta"], person=person, features=features, aimed_at=aimed_at)
+    return fit(ObstacleGrid(BLANK, -2.0), demonstrations(), learned, prior=Normal(-1.0, 1.5))
+
+
+def fit_of_table() -> Fit:
+    """A fit of the logits of every outcome of seven states."""
+    problem = random_problem()
+    task = generic_task(problem, 0.9)
+    walks = simulate(jax.random.key(0), problem.model, [task], [np.repeat(np.arange(1, 7), 5)], BEHAVIOR)
+    return fit(problem.model, gather(walks, [task]), BEHAVIOR, prior=Normal(0.0, VARIANCE))
+
+
+FITS = {"behavior": fit_of_maze, "slips": fit_of_slips, "tastes": fit_of_tastes, "table": fit_of_table}
+
+
 @pytest.mark.slow
-def test_information_is_the_difference_of_gradients():
-    result = fit_of_maze()
-    information = Information(result.problem, parameters_of(result))
+@pytest.mark.parametrize("learned", FITS)
+def test_laplace_has_the_information_of_differences_of_gradients(learned):
+    result = FITS[learned]()
+    information = TabularInformation(result.problem, parameters_of(result))
     flat, unravel = ravel_pytree(information.parameters)
     objective, starts = information.objective, information.starts
     dense = information.dense()
@@ -80,7 +110,10 @@ def test_information_is_the_difference_of_gradients():
         ends = (unravel(flat + by * direction) for by in (1, -1))
         up, down = (ravel_pytree(objective.evaluate(end, starts)[0].gradient)[0] for end in ends)
         columns.append((up - down) / (2 * step))
-    np.testing.assert_allclose(scale[:, None] * dense * scale, np.array(columns) * scale, atol=1e-5)
+    expected = np.array(columns) * scale
+    np.testing.assert_allclose(scale[:, None] * dense * scale, expected, atol=1e-5)
+    errors = scale * np.sqrt(np.diag(np.linalg.inv(expected)))
+    np.testing.assert_allclose(ravel_pytree(laplace(result).standard_errors)[0], errors, rtol=1e-4)
 
 
 @pytest.mark.slow

@@ -170,19 +170,50 @@ def value_gradient(
         Eq. 11 of the paper.
     """
     check_estimator(estimator, agent.dynamics, starts.tasks)
-    pathwise = estimator == "pathwise"
 
     def total(parameters: FloatTree) -> tuple[Array, Rollout]:
-        moved = replace(agent, dynamics=agent.dynamics.with_parameters(parameters))
-        rollouts = sample_rollouts(moved if pathwise else agent, starts, key, horizon, samples)
-        if critic is not None:
-            rollouts = with_control_variates(agent, rollouts, critic)
-        surrogates = (pathwise_surrogate if pathwise else score_surrogate)(moved, rollouts, critic)
-        rollouts = jax.lax.stop_gradient(rollouts)
+        size = {"horizon": horizon, "samples": samples}
+        surrogates, rollouts = sample_surrogates(agent, parameters, starts, key, critic, estimator, **size)
         weights = jax.lax.stop_gradient(_cross_weights(q_estimates(rollouts)[..., 0], weight_function))
         return jnp.sum(weights * surrogates) / samples, rollouts
 
     return jax.grad(total, has_aux=True)(agent.dynamics.parameters)
+
+
+def sample_surrogates(
+    agent: Agent,
+    parameters: FloatTree,
+    starts: Starts,
+    key: PRNGKeyArray,
+    critic: Critic | None,
+    estimator: Estimator,
+    *,
+    horizon: int,
+    samples: int,
+) -> tuple[PerSample, Rollout]:
+    """Sample rollouts, and return numbers with the estimates of ∇_θ Q^π as their derivatives by θ.
+
+    Args:
+        agent: T_θ, π and the backup.
+        parameters: θ, equal to that of the agent; derivatives by it are the estimates.
+        starts: The tasks, the states, and the candidates of each.
+        key: Draws everything random.
+        critic: V_w of baseline and control variates; None for none.
+        estimator: "score" or "pathwise".
+        horizon: τ, the number of moves, 1 or more.
+        samples: Rollouts of each candidate, 1 or more.
+
+    Returns:
+        A number for each rollout, and the rollouts, with axes (starts, candidates, samples); no derivatives pass
+        through the rollouts.
+    """
+    pathwise = estimator == "pathwise"
+    moved = replace(agent, dynamics=agent.dynamics.with_parameters(parameters))
+    rollouts = sample_rollouts(moved if pathwise else agent, starts, key, horizon, samples)
+    if critic is not None:
+        rollouts = with_control_variates(agent, rollouts, critic)
+    surrogates = (pathwise_surrogate if pathwise else score_surrogate)(moved, rollouts, critic)
+    return surrogates, jax.lax.stop_gradient(rollouts)
 
 
 def check_estimator(estimator: Estimator, dynamics: Dynamics, tasks: ContinuousTask) -> None:

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -27,12 +27,15 @@ from sidestep.continuous.likelihood import FitProblem, FitProgress, Schedule
 from sidestep.continuous.planner import Planner, PlannerState, plan_policy
 from sidestep.continuous.policies import Agent, SomePolicy
 from sidestep.continuous.tasks import task_at
-from sidestep.errors import NotConverged
+from sidestep.errors import NotConverged, check
 from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
 from sidestep.inference.priors import Normal, Prior
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import ALL_TERMS, Term
+
+if TYPE_CHECKING:
+    from sidestep.continuous.information import RolloutInformation
 
 Family = TypeVar("Family", bound=Dynamics)
 
@@ -43,6 +46,7 @@ class ContinuousFit(eqx.Module, Generic[Family, SomePolicy]):
     Attributes:
         dynamics: The family at the mean of θ over the last quarter of the iterations.
         planner_state: The agent's policy, its critic and their optimizers.
+        problem: What was maximized: demonstrations, prior, settings; with the dynamics and policy at the start.
         history: A `FitProgress` an iteration.
         drift: The largest distance, over parameters, between the means of θ over the last eighth and over the eighth
             before; as a fraction of the distance that steps of the full learning rate in one direction would give.
@@ -53,11 +57,30 @@ class ContinuousFit(eqx.Module, Generic[Family, SomePolicy]):
 
     dynamics: Family
     planner_state: PlannerState[SomePolicy]
+    problem: FitProblem
     history: tuple[FitProgress, ...] = eqx.field(static=True)
     drift: float = eqx.field(static=True)
     policy_gap: float = eqx.field(static=True)
     converged: bool = eqx.field(static=True)
     message: str = eqx.field(static=True)
+
+    def information(self, samples: int = 64, seed: int = 0) -> "RolloutInformation":
+        """Return the information at the end of the fit, as `sidestep.laplace` needs it.
+
+        Args:
+            samples: Rollouts of each candidate action, 2 or more; the more, the smaller `Laplace.simulated`.
+            seed: Draws everything random.
+
+        Raises:
+            InputError: For a fit that did not converge, an agent with another gradient than its likelihood's, or too
+                few samples.
+        """
+        from sidestep.continuous.information import RolloutInformation
+
+        check(self.converged, f"expected a fit that converged: {self.message}", source="laplace", field="fit")
+        return RolloutInformation(
+            self.problem, self.dynamics, self.planner_state, samples=samples, seed=seed, message=self.message
+        )
 
 
 class _State(eqx.Module):
@@ -197,7 +220,7 @@ def _result(problem: FitProblem, state: _State, history: list[FitProgress]) -> C
         f"over the last quarter parameters drifted by up to {drift:.2g} of what their steps allow (tolerance "
         f"{schedule.drift_tolerance:g}), and the policy gap was {gap:.2g} (tolerance {schedule.policy_gap_tolerance:g})"
     )
-    return ContinuousFit(learned, state.planner_state, tuple(history), float(drift), gap, converged, message)
+    return ContinuousFit(learned, state.planner_state, problem, tuple(history), float(drift), gap, converged, message)
 
 
 @eqx.filter_jit

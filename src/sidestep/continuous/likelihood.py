@@ -126,6 +126,11 @@ class FitProblem(eqx.Module):
         check_tasks(demos.tasks)
         check_starts(demos.states, demos.task, demos.tasks)
         check_estimator(self.estimator, agent.dynamics, demos.tasks)
+        check(
+            agent.behavior.lapse is None,
+            "expected an agent without lapses, which count for nothing here",
+            field="lapse",
+        )
         message = "over vectors of actions the policy is known for the log-sum-exp only: expected that, or a finite set"
         known = isinstance(agent.policy, FinitePolicy) or isinstance(agent.behavior.backup, LogSumExp)
         check(known, message, field="behavior")
@@ -169,7 +174,7 @@ class FitProblem(eqx.Module):
         """
         batch_key, rollout_key = jax.random.split(key)
         moves = self._draw_moves(batch_key)
-        slope, transitions, prior = self._rollout_free_terms(parameters, moves)
+        slope, (transitions, prior) = jax.grad(self.rollout_free_loss, has_aux=True)(parameters, moves)
         actions = zero = jnp.zeros_like(prior)
         figures = zero, zero, zero
         if "actions" in self.terms:
@@ -183,19 +188,19 @@ class FitProblem(eqx.Module):
         count = len(self.demonstrations)
         return jax.random.choice(key, count, (min(self.schedule.batch_size, count),), replace=False)
 
-    def _rollout_free_terms(self, parameters: Tree, moves: _Moves) -> tuple[Tree, Array, Array]:
-        """Return the gradient of minus the transitions' term (if it counts) and the prior, and the two values."""
+    def rollout_free_loss(self, parameters: Tree, moves: _Moves) -> tuple[Array, tuple[Array, Array]]:
+        """Return minus the transitions' term (if it counts) and the prior, and the two values.
+
+        Args:
+            parameters: θ.
+            moves: The indices of the moves, which stand for all.
+        """
         demos, agent = self.demonstrations, self.agent
-
-        def loss(parameters: Tree) -> tuple[Array, tuple[Array, Array]]:
-            dynamics, prior = agent.dynamics.with_parameters(parameters), self.prior.log_density(parameters)
-            transitions = jnp.zeros_like(prior)
-            if "transitions" in self.terms:
-                transitions = len(demos) / len(moves) * _log_densities(dynamics, agent.policy, demos, moves).sum()
-            return -(transitions + prior), (transitions, prior)
-
-        slope, (transitions, prior) = jax.grad(loss, has_aux=True)(parameters)
-        return slope, transitions, prior
+        dynamics, prior = agent.dynamics.with_parameters(parameters), self.prior.log_density(parameters)
+        transitions = jnp.zeros_like(prior)
+        if "transitions" in self.terms:
+            transitions = len(demos) / len(moves) * _log_densities(dynamics, agent.policy, demos, moves).sum()
+        return -(transitions + prior), (transitions, prior)
 
     def _action_terms(
         self, parameters: Tree, state: PlannerState[Any], moves: _Moves, key: PRNGKeyArray
@@ -211,7 +216,7 @@ class FitProblem(eqx.Module):
         choice_key, rollout_key = jax.random.split(key)
         tasks, states, observed = task_at(demos.tasks, demos.task[moves]), demos.states[moves], demos.actions[moves]
         drawn, probabilities = planner.candidate_actions(choice_key, agent.policy, tasks, states)
-        likelihood = _ActionLikelihood(agent, Starts(tasks, states, drawn), observed)
+        likelihood = ActionLikelihood(agent, Starts(tasks, states, drawn), observed)
         starts, probabilities = likelihood.candidates(probabilities)
         size = {"horizon": planner.horizon, "samples": planner.samples}
         method = {"critic": state.critic, "estimator": self.estimator}
@@ -229,7 +234,7 @@ def _log_densities(dynamics: Dynamics, policy: Policy, demos: Demonstrations, mo
     return jax.vmap(dynamics.log_prob)(demos.states[moves], actions, demos.next_states[moves])
 
 
-class _ActionLikelihood(NamedTuple):
+class ActionLikelihood(NamedTuple):
     """The likelihood of the choices of some demonstrated moves, by Q estimates.
 
     `drawn` has the choices of the policy (over a finite set, all actions), `observed` those of the demonstrations.
@@ -240,24 +245,48 @@ class _ActionLikelihood(NamedTuple):
     observed: Array
 
     def candidates(self, probabilities: Array) -> tuple[Starts, Array]:
-        """Return all actions of a finite set, or the observed choices followed by those that the policy draws."""
+        """Return all actions of a finite set, or the observed choices followed by those that the policy draws.
+
+        Args:
+            probabilities: Those of the drawn choices under the policy.
+
+        Returns:
+            The choices, and the probabilities with 0 for the observed choices that were not drawn.
+        """
         if isinstance(self.agent.policy, FinitePolicy):
             return self.drawn, probabilities
         choices = jnp.concatenate([self.observed[:, None], self.drawn.choices], axis=1)
         none = jnp.zeros_like(probabilities[:, :1])
         return replace(self.drawn, choices=choices), jnp.concatenate([none, probabilities], axis=1)
 
-    def weights(self, q: PerCandidate) -> PerCandidate:
-        """Return β (1 for the observed choice − π), the weights of ∇Q in ∇ log π of the observed choices."""
-        behavior = self.agent.behavior
+    def probabilities(self, q: PerCandidate) -> PerCandidate:
+        """Return π of every candidate, which add up to 1 for each start; 0 for observed choices that were not drawn.
+
+        Args:
+            q: Q of every candidate, in units of reward.
+        """
         if isinstance(self.agent.policy, FinitePolicy):
-            observed = jax.nn.one_hot(self.observed, q.shape[1], dtype=q.dtype)
-            return behavior.beta * (observed - jnp.exp(behavior.log_policy(q)))
-        probabilities = jax.nn.softmax(self._log_importance(q), axis=1)
-        return behavior.beta * jnp.concatenate([jnp.ones_like(probabilities[:, :1]), -probabilities], axis=1)
+            return jnp.exp(self.agent.behavior.log_policy(q))
+        drawn = jax.nn.softmax(self._log_importance(q), axis=1)
+        return jnp.concatenate([jnp.zeros_like(drawn[:, :1]), drawn], axis=1)
+
+    def weights(self, q: PerCandidate) -> PerCandidate:
+        """Return β (1 for the observed choice − π), the weights of ∇Q in ∇ log π of the observed choices.
+
+        Args:
+            q: Q of every candidate, in units of reward.
+        """
+        finite = isinstance(self.agent.policy, FinitePolicy)
+        which = self.observed if finite else jnp.zeros(len(q), int)
+        observed = jax.nn.one_hot(which, q.shape[1], dtype=q.dtype)
+        return self.agent.behavior.beta * (observed - self.probabilities(q))
 
     def log_probs(self, q: PerCandidate) -> Float[Array, " starts"]:
-        """Return ln π of the observed choices."""
+        """Return ln π of the observed choices.
+
+        Args:
+            q: Q of every candidate, in units of reward.
+        """
         behavior = self.agent.behavior
         if isinstance(self.agent.policy, FinitePolicy):
             return jnp.take_along_axis(behavior.log_policy(q), self.observed[:, None], axis=1)[:, 0]

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from sidestep.errors import check
-from sidestep.inference.laplace import NaturalScale
+from sidestep.inference.natural_scale import NaturalScale
 
 if TYPE_CHECKING:
     from arviz import InferenceData

@@ -9,7 +9,7 @@ is not the gradient of any function, so a line search is impossible: use `Adam` 
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -21,7 +21,7 @@ from sidestep.errors import check
 from sidestep.inference.batching import LARGE_MAP, MEMORY, plan_batches
 from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
 from sidestep.inference.maximize import Progress, Status, maximize, solve_tolerances
-from sidestep.inference.objective import Objective, Problem, SolveSummary, joined
+from sidestep.inference.objective import Objective, Parameters, Problem, SolveSummary, joined
 from sidestep.inference.optimizers import LBFGS, Adam, Optimizer
 from sidestep.inference.priors import Normal, Prior
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
@@ -30,6 +30,9 @@ from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import ALL_TERMS, Terms
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import SolveOptions, check_proper
+
+if TYPE_CHECKING:
+    from sidestep.inference.information import Information
 
 Model = TypeVar("Model", bound=TransitionModel)
 
@@ -110,6 +113,19 @@ class Fit(eqx.Module, Generic[Model]):
         from sidestep.inference.laplace import behavior_estimates
 
         return behavior_estimates(self)
+
+    def information(self) -> "Information":
+        """Return the observed information at the maximum, as `laplace` needs it.
+
+        Raises:
+            InputError: For values that did not converge.
+        """
+        from sidestep.inference.tabular_information import TabularInformation
+
+        converged = bool(np.asarray(self.task_converged).all())
+        check(converged, f"expected values that converged: {self.message}", source="laplace", field="fit")
+        parameters = Parameters(self.model.parameters, self.behavior.parameters)
+        return TabularInformation(self.problem, parameters, self.message)
 
     def summary(self) -> dict[str, Any]:
         """Return the fit's numbers: the objective and its parts in nats, and how the optimizer and the tasks ended.

@@ -1,133 +1,85 @@
-"""The observed information of a posterior, by products with vectors.
+"""The information of a posterior at the end of a fit: what `laplace` needs of every kind of fit."""
 
-    H = −∇² [log L(θ) + log p(θ)]
+import abc
+from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
-A product H v is the directional derivative of the exact gradient, by automatic differentiation: one linear solve
-forward and one for the adjoint, for each task and vector, beside the solves of the gradient
-(`sidestep.tabular.implicit`). So no step size has to be chosen, and the error is that of the solves.
-"""
-
-from collections.abc import Callable
-
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from sidestep._programs import keep_program
-from sidestep._typing import Tree
-from sidestep.inference.batching import Batch
-from sidestep.inference.objective import (
-    Objective,
-    Parameters,
-    Problem,
-    actions_log_likelihood,
-    transitions_and_prior,
-)
-from sidestep.inference.priors import Prior
-from sidestep.tabular.behavior_model import BehaviorModel
-from sidestep.tabular.likelihood import Arrivals
-from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.solvers.base import WarmStart
+from sidestep.inference.normal_posterior import Laplace
+from sidestep.inference.objective import Parameters
 
 Vectors = Float[np.ndarray, "vectors parameters"]
 
-_TOGETHER = 32
-"""The most vectors that are multiplied at a time."""
-_PROBABILITIES = 2**23
-"""The most probabilities that the vectors of all tasks together may have to do with at a time, for their memory."""
+
+class Simulation(NamedTuple):
+    """The errors that rollouts bring into a normal distribution.
+
+    Attributes:
+        errors: The largest error of a standard error (itself a standard error), as a fraction of it.
+        squared_distance: What noise in the gradient adds to the squared distance from the maximum, in standard errors.
+    """
+
+    errors: float
+    squared_distance: float
 
 
-class Information:
-    """The observed information at one θ, and the gradient of the objective there.
+class Information(abc.ABC):
+    """The information of a posterior at the end of a fit, and the gradient of the objective there.
 
     Vectors have the entries of `ravel_pytree(parameters)`.
-
-    Args:
-        problem: The problem.
-        parameters: θ.
 
     Attributes:
         parameters: θ.
         gradient: That of the objective at θ; NaN where a solve failed.
+        message: How the fit ended.
+        farthest: The most standard errors that the fit may end from the maximum.
     """
 
-    def __init__(self, problem: Problem, parameters: Parameters):
-        self.objective = Objective(problem)
-        evaluation, self.starts = self.objective.evaluate(parameters, self.objective.cold_starts())
-        self.parameters: Parameters = parameters
-        flat, self._unravel = ravel_pytree(parameters)
-        self.size: int = len(flat)
-        self.gradient: Float[np.ndarray, " parameters"] = -np.asarray(ravel_pytree(evaluation.gradient)[0])
+    parameters: Parameters
+    gradient: Float[np.ndarray, " parameters"]
+    message: str
+    farthest: ClassVar[float] = 0.1
 
+    @property
+    def size(self) -> int:
+        """The number of parameters."""
+        return len(self.gradient)
+
+    @abc.abstractmethod
     def products(self, vectors: Vectors) -> Vectors:
         """Return H v of each vector.
 
         Args:
             vectors: One a row.
         """
-        return self._in_parts(self._whole, vectors)
 
+    @abc.abstractmethod
     def of_prior(self, vectors: Vectors) -> Vectors:
         """Return the products with the prior's part of H alone.
 
         Args:
             vectors: One a row.
         """
-        return self._in_parts(lambda directions: self._without_actions(directions, None), vectors)
 
     def dense(self) -> Float[np.ndarray, "parameters parameters"]:
         """Return H."""
-        whole = self.products(np.eye(self.size))
-        return (whole + whole.T) / 2
+        products = self.products(np.eye(self.size))
+        return (products + products.T) / 2
 
-    def _in_parts(self, multiply: Callable[[Parameters], Tree], vectors: Vectors) -> Vectors:
-        each = self.objective.plan.size * self.objective.constants.model.graph.successors.size
-        count = max(1, min(_TOGETHER, len(vectors), _PROBABILITIES // each))
-        padded = np.pad(vectors, ((0, -len(vectors) % count), (0, 0)))
-        parts = [self._flat(multiply(self._trees(part))) for part in np.split(padded, len(padded) // count)]
-        return np.concatenate(parts)[: len(vectors)]
+    def simulation(self, normal: Laplace) -> Simulation:
+        """Return the errors by rollouts; none, unless a kind of information is simulated.
 
-    def _whole(self, directions: Parameters) -> Tree:
-        problem, parameters = self.objective.constants, self.parameters
-        total = self._without_actions(directions, self.objective.arrivals)
-        for batch, starts in zip(self.objective.batches, self.starts, strict=True):
-            total = jax.tree.map(jnp.add, total, _actions_products(problem, parameters, batch, starts, directions))
-        return total
-
-    def _without_actions(self, directions: Parameters, arrivals: Arrivals | None) -> Tree:
-        constants, parameters = self.objective.constants, self.parameters
-        return _other_products(constants.prior, constants.model, constants.behavior, arrivals, parameters, directions)
-
-    def _trees(self, vectors: Vectors) -> Parameters:
-        return jax.vmap(self._unravel)(jnp.asarray(vectors, ravel_pytree(self.parameters)[0].dtype))
-
-    def _flat(self, trees: Tree) -> Vectors:
-        leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(trees)]
-        return np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
+        Args:
+            normal: The normal distribution with this information.
+        """
+        return Simulation(0.0, 0.0)
 
 
-@keep_program
-def _actions_products(
-    problem: Problem, parameters: Parameters, batch: Batch, starts: WarmStart, directions: Parameters
-) -> Tree:
-    def loss(parameters: Parameters) -> Array:
-        return -actions_log_likelihood(problem, parameters, batch, starts, jnp.ones(starts.values.shape, bool))[0]
+@runtime_checkable
+class HasInformation(Protocol):
+    """A fit of any kind."""
 
-    return jax.vmap(jax.linearize(jax.grad(loss), parameters)[1])(directions)
-
-
-@keep_program
-def _other_products(
-    prior: Prior,
-    model: TransitionModel,
-    behavior: BehaviorModel,
-    arrivals: Arrivals | None,
-    parameters: Parameters,
-    directions: Parameters,
-) -> Tree:
-    def loss(parameters: Parameters) -> Array:
-        return -sum(transitions_and_prior(prior, model, behavior, arrivals, parameters), jnp.zeros(()))
-
-    return jax.vmap(jax.linearize(jax.grad(loss), parameters)[1])(directions)
+    def information(self) -> Information:
+        """Return the information at the end of the fit."""
+        ...

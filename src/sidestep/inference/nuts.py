@@ -25,9 +25,10 @@ from sidestep.inference.arviz_data import inference_data, require
 from sidestep.inference.batching import Batch
 from sidestep.inference.diagnostics import effective_sizes, split_rhat
 from sidestep.inference.fit import Fit
-from sidestep.inference.information import Information
-from sidestep.inference.laplace import laplace, natural_scale
+from sidestep.inference.laplace import laplace
+from sidestep.inference.natural_scale import natural_scale
 from sidestep.inference.objective import Parameters, Problem, actions_log_likelihood, transitions_and_prior
+from sidestep.inference.tabular_information import TabularInformation
 from sidestep.tabular.likelihood import Arrivals
 from sidestep.tabular.solvers.base import WarmStart
 
@@ -102,7 +103,7 @@ def sample(fit: Fit[Any], key: PRNGKeyArray, n: int = 1_000, *, chains: int = 4,
     for count, least, field in ((n, 4, "n"), (chains, 1, "chains"), (warmup, 1, "warmup")):
         check_count(count, least, field)
     normal = laplace(fit)
-    information = Information(fit.problem, normal.parameters)
+    information = TabularInformation(fit.problem, normal.parameters)
     objective = information.objective
     data = objective.batches, information.starts, objective.arrivals
     flat, unravel = ravel_pytree(normal.parameters)

@@ -24,10 +24,10 @@ from sidestep._programs import keep_program
 from sidestep.inference.cell_information import information, prior_closed
 from sidestep.inference.fit import Fit, fit
 from sidestep.inference.hierarchical import HierarchicalMRF
-from sidestep.inference.information import Information
 from sidestep.inference.objective import Parameters
 from sidestep.inference.priors import Prior
 from sidestep.inference.sampler import BarrierPosterior
+from sidestep.inference.tabular_information import TabularInformation
 from sidestep.maps.config import MapConfig
 from sidestep.maps.fit import MapPosterior, prior_of_fit, sampled_prior
 from sidestep.tabular.grid import Cell
@@ -101,7 +101,7 @@ def _slopes(posterior: Fit[ObstacleGrid], prior: Prior) -> Float[Array, " cells"
     whole = np.zeros(len(logits))
     if not posterior.final.gradient <= _NO_GRADIENT:
         parameters = Parameters(logits, posterior.behavior.parameters)
-        whole = Information(posterior.problem, parameters).gradient[: len(logits)]
+        whole = TabularInformation(posterior.problem, parameters).gradient[: len(logits)]
     # where solves failed, a fit counts as ended at its maximum
     whole = jnp.asarray(np.where(np.isfinite(whole), whole, 0.0), logits.dtype)
     return (whole - alone) / jnp.maximum(chances * (1 - chances), _LEAST_SLOPE)

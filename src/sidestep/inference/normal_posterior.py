@@ -1,0 +1,143 @@
+"""A normal distribution around the mode of a posterior: standard errors, intervals, samples.
+
+Parameters are unconstrained (ln β, the logit of a lapse), where posteriors are closer to a normal distribution than on
+the natural scale. So intervals are computed there, and their ends mapped.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from sidestep.errors import check, check_count
+from sidestep.inference.natural_scale import NaturalScale, natural_scale
+from sidestep.inference.objective import Parameters
+
+if TYPE_CHECKING:
+    from arviz import InferenceData
+
+
+@dataclass(frozen=True, eq=False)
+class Laplace:
+    """A normal approximation of the posterior of what a fit has learned; made by `laplace`.
+
+    Its covariance is S (1 + V (M⁻¹ − 1) Vᵀ) S, with S a diagonal matrix, V orthonormal and M diagonal.
+
+    Attributes:
+        parameters: The mode θ̂; a vector of parameters has the entries of `ravel_pytree(parameters)`.
+        scale: The diagonal of S, the standard deviations before the vectors count.
+        vectors: V, in its columns.
+        eigenvalues: M: the information in the direction of each vector, in units of `scale`.
+        neglected: A bound of |λ| of what is left out; 0 where the information is complete. A variance is wrong by at
+            most this fraction of it.
+    """
+
+    parameters: Parameters
+    scale: Float[np.ndarray, " parameters"]
+    vectors: Float[np.ndarray, "parameters vectors"]
+    eigenvalues: Float[np.ndarray, " vectors"]
+    neglected: float
+    distance: float = 0.0
+    simulated: float = 0.0
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "parameters parameters"]:
+        """Return the covariance of all parameters; it has the square of their number of entries."""
+        inner = np.eye(len(self.scale)) + (self.vectors * (1 / self.eigenvalues - 1)) @ self.vectors.T
+        return self.scale[:, None] * inner * self.scale
+
+    def covariance_products(self, vectors: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, "n parameters"]:
+        """Return the products of the covariance with vectors.
+
+        Args:
+            vectors: One a row.
+        """
+        scaled = vectors * self.scale
+        return self.scale * (scaled + (scaled @ self.vectors * (1 / self.eigenvalues - 1)) @ self.vectors.T)
+
+    @property
+    def standard_errors(self) -> Parameters:
+        """Return the standard error of each parameter, unconstrained: of ln β, the logits of lapse and discount."""
+        inner = 1 + self.vectors**2 @ (1 / self.eigenvalues - 1)
+        return self._tree(self.scale * np.sqrt(inner))
+
+    @property
+    def natural_errors(self) -> NaturalScale:
+        """Return the standard error of each number on its natural scale, by the delta method."""
+        return jax.jvp(natural_scale, (self.parameters,), (self.standard_errors,))[1]
+
+    def error_of(self, function: Callable[[Parameters], Float[Array, "*shape"]]) -> Float[Array, "*shape"]:
+        """Return the standard error of a function of the parameters, by the delta method.
+
+        Args:
+            function: Differentiable by JAX, such as the slip of a model with these parameters.
+        """
+        flat, unravel = ravel_pytree(self.parameters)
+        jacobian = np.asarray(jax.jacrev(lambda x: function(unravel(x)))(flat), np.float64) * self.scale
+        inner = np.sum(jacobian**2, axis=-1) + (jacobian @ self.vectors) ** 2 @ (1 / self.eigenvalues - 1)
+        return jnp.sqrt(jnp.asarray(inner))
+
+    def interval(self, level: float = 0.95) -> tuple[NaturalScale, NaturalScale]:
+        """Return the ends of an interval for each number, mapped from the unconstrained scale.
+
+        So β is above 0, and a lapse between 0 and 1.
+
+        Args:
+            level: The probability of each interval, above 0 and below 1.
+
+        Returns:
+            The lower and the upper ends.
+
+        Raises:
+            InputError: For another level.
+        """
+        check(0 < level < 1, f"expected a probability above 0 and below 1, found {level}", field="level")
+        width = float(jax.scipy.special.ndtri((1 + level) / 2))
+        errors = self.standard_errors
+        lower, upper = (
+            natural_scale(jax.tree.map(lambda mode, error, by=by: mode + by * error, self.parameters, errors))
+            for by in (-width, width)
+        )
+        return lower, upper
+
+    def sample(self, key: PRNGKeyArray, n: int) -> Parameters:
+        """Return samples from the normal distribution; `natural_scale` maps them to their natural scales.
+
+        Args:
+            key: Of the random numbers.
+            n: The number of samples, at least 1.
+
+        Returns:
+            The parameters, each with a leading axis of samples.
+
+        Raises:
+            InputError: For n below 1.
+        """
+        check_count(n, 1, "n")
+        white = np.asarray(jax.random.normal(key, (n, len(self.scale))), np.float64)
+        inner = white + (white @ self.vectors * (1 / np.sqrt(self.eigenvalues) - 1)) @ self.vectors.T
+        flat, unravel = ravel_pytree(self.parameters)
+        return jax.vmap(unravel)(flat + jnp.asarray(inner * self.scale, flat.dtype))
+
+    def to_arviz(self, key: PRNGKeyArray, n: int = 1_000) -> "InferenceData":
+        """Return samples as ArviZ's `InferenceData`, on their natural scales; needs `sidestep[samplers]`.
+
+        Args:
+            key: Of the random numbers.
+            n: The number of samples, at least 1.
+
+        Raises:
+            InputError: Where ArviZ is not installed, and for n below 1.
+        """
+        from sidestep.inference.arviz_data import inference_data
+
+        return inference_data(natural_scale(jax.tree.map(lambda leaf: leaf[None], self.sample(key, n))))
+
+    def _tree(self, vector: Float[np.ndarray, " parameters"]) -> Parameters:
+        flat, unravel = ravel_pytree(self.parameters)
+        return unravel(jnp.asarray(vector, flat.dtype))
