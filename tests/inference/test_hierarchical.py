@@ -92,8 +92,9 @@ def test_sample_barriers_with_unknown_density_has_the_exact_probabilities():
     sampled = found.sampled
     assert np.abs(found.closed - exact)[sampled].mean() < 0.03
     assert np.abs(known_density - exact)[sampled].mean() > 0.1
-    deviation = found.summary()["prior_log_odds"]["deviation"]
-    assert 0 < deviation < 2
+    assert 0 < found.summary()["prior_density"]["deviation"] < 2
+    known = sample_barriers(*one.problem, prior=prior.at(-2.0, 0.75), sweeps=12)
+    assert "prior_density" not in known.summary()
 
 
 @pytest.mark.parametrize(
@@ -105,6 +106,7 @@ def test_sample_barriers_with_unknown_density_has_the_exact_probabilities():
         ({"log_prior": np.full((3, 7), np.inf)}, "log_prior"),
         ({"field": np.full(12, np.nan)}, "field"),
         ({"crossed_weight": -1.0}, "crossed_weight"),
+        ({"strengths": np.ones(1), "log_prior": np.zeros((3, 1))}, "strengths"),
     ],
 )
 def test_hierarchical_mrf_with_numbers_out_of_range_is_refused(changes, field):

@@ -22,7 +22,7 @@ Both are implemented as *surrogates*: numbers with the estimate as their derivat
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -42,7 +42,7 @@ WeightFunction = Callable[[PerCandidate], PerCandidate]
 """The weights of ∇Q of all candidates, as a function of the estimates of Q."""
 
 
-def with_control_variates(agent: Agent, rollouts: Rollout, critic: Critic) -> Rollout:
+def with_control_variates(agent: Agent[Any], rollouts: Rollout, critic: Critic) -> Rollout:
     """Return the rollouts with the z_i of a critic; no gradients pass through them.
 
     Args:
@@ -68,7 +68,7 @@ def with_control_variates(agent: Agent, rollouts: Rollout, critic: Critic) -> Ro
     return eqx.tree_at(lambda rollouts: rollouts.transition_control_variates, rollouts, variates)
 
 
-def score_surrogate(agent: Agent, rollouts: Rollout, critic: Critic | None = None) -> Float[Array, "*batch"]:
+def score_surrogate(agent: Agent[Any], rollouts: Rollout, critic: Critic | None = None) -> Float[Array, "*batch"]:
     """Return numbers with the score estimate of eq. 11 as their derivative by θ, one a rollout.
 
     Args:
@@ -103,7 +103,7 @@ def score_surrogate(agent: Agent, rollouts: Rollout, critic: Critic | None = Non
     return jnp.sum(log_probs * jax.lax.stop_gradient(credit), axis=-1)
 
 
-def pathwise_surrogate(agent: Agent, rollouts: Rollout, critic: Critic | None = None) -> Float[Array, "*batch"]:
+def pathwise_surrogate(agent: Agent[Any], rollouts: Rollout, critic: Critic | None = None) -> Float[Array, "*batch"]:
     """Return numbers with the pathwise estimate as their derivative by θ, for rollouts that are functions of θ.
 
     Args:
@@ -123,7 +123,7 @@ def pathwise_surrogate(agent: Agent, rollouts: Rollout, critic: Critic | None = 
 
 
 def value_gradient(
-    agent: Agent,
+    agent: Agent[Any],
     starts: Starts,
     key: PRNGKeyArray,
     weight_function: WeightFunction,
@@ -181,7 +181,7 @@ def value_gradient(
 
 
 def sample_surrogates(
-    agent: Agent,
+    agent: Agent[Any],
     parameters: FloatTree,
     starts: Starts,
     key: PRNGKeyArray,

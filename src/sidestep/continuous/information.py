@@ -89,12 +89,13 @@ class RolloutInformation(Information):
         average = isinstance(problem.agent.behavior.backup, BoltzmannAverage)
         expected = "expected another backup: with the Boltzmann average the gradient is not that of a likelihood"
         check(not (uses_actions and average), expected, source="laplace", field="behavior")
-        self.parameters, self.message = Parameters(dynamics.parameters, BehaviorParameters()), message
+        self.parameters: Parameters = Parameters(dynamics.parameters, BehaviorParameters())
+        self.message: str = message
         self._problem = problem
         exact = np.asarray(ravel_pytree(_slope(problem, dynamics.parameters))[0], np.float64)
         halves = _halves(problem, dynamics, planner_state, samples, seed) if uses_actions else _nothing(len(exact))
         self._factors, self._scores = (np.asarray(part, np.float64) for part in halves)
-        self.gradient = self._scores.mean(axis=0).sum(axis=0) - exact
+        self.gradient: Float[np.ndarray, " parameters"] = self._scores.mean(axis=0).sum(axis=0) - exact
 
     def products(self, vectors: Vectors) -> Vectors:
         """Return H v of each vector, with the expected information of the actions.

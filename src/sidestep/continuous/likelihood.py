@@ -240,7 +240,7 @@ class ActionLikelihood(NamedTuple):
     `drawn` has the choices of the policy (over a finite set, all actions), `observed` those of the demonstrations.
     """
 
-    agent: Agent
+    agent: Agent[Any]
     drawn: Starts
     observed: Array
 

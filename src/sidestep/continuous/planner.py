@@ -25,7 +25,7 @@ The gradient is 0 where q_λ/β are the advantages of Q^π.
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Generic, NamedTuple
+from typing import Any, Generic, NamedTuple
 
 import equinox as eqx
 import jax
@@ -287,7 +287,9 @@ def plan_policy(
 
 
 @eqx.filter_jit
-def _first_moves(planner: Planner, agent: Agent, tasks: ContinuousTask, states: States, key: PRNGKeyArray) -> tuple:
+def _first_moves(
+    planner: Planner, agent: Agent[Any], tasks: ContinuousTask, states: States, key: PRNGKeyArray
+) -> tuple:
     """Return a key for the critic, whether each move of some first rollouts counts, and what the critic is made of."""
     start_key, rollout_key, choice_key, critic_key = jax.random.split(key, 4)
     batch = jax.random.choice(start_key, len(states), (min(len(states), 8 * planner.batch_size),), replace=False)
@@ -307,7 +309,7 @@ def _fresh_moments(planner: Planner, policy: Policy, critic: Critic) -> tuple[Tr
 
 @eqx.filter_jit
 def _plan_step(
-    planner: Planner, agent: Agent, tasks: ContinuousTask, states: States, state: PlannerState, key: PRNGKeyArray
+    planner: Planner, agent: Agent[Any], tasks: ContinuousTask, states: States, state: PlannerState, key: PRNGKeyArray
 ) -> tuple[PlannerState, PlanProgress]:
     start_key, choice_key, rollout_key = jax.random.split(key, 3)
     count, agent = len(states), replace(agent, policy=state.policy)

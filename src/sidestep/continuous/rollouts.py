@@ -21,6 +21,7 @@ The *Q estimate* of Q^π(s_i, a_i), for an agent that looks τ moves ahead, is t
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -124,7 +125,7 @@ class Rollout(eqx.Module):
 
 
 def sample_rollout(
-    agent: Agent, task: ContinuousTask, key: PRNGKeyArray, state: State, horizon: int, choice: Choice | None = None
+    agent: Agent[Any], task: ContinuousTask, key: PRNGKeyArray, state: State, horizon: int, choice: Choice | None = None
 ) -> Rollout:
     """Sample one rollout from a state.
 
@@ -182,7 +183,7 @@ def sample_rollout(
     return Rollout(task, states, choices, rewards, bonuses, jnp.zeros_like(bonuses), acting)
 
 
-def sample_rollouts(agent: Agent, starts: Starts, key: PRNGKeyArray, horizon: int, samples: int) -> Rollout:
+def sample_rollouts(agent: Agent[Any], starts: Starts, key: PRNGKeyArray, horizon: int, samples: int) -> Rollout:
     """Sample several rollouts from every start with each of its first choices.
 
     The candidates of one start share their random numbers (common random numbers), which reduces the variance of

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 import sidestep as ss
-from sidestep.errors import check, check_count
+from sidestep.errors import InputError, check, check_count
 from sidestep.evaluation.metrics import shortest_lengths
 from sidestep.inference.chains import PASSING
 from sidestep.inference.mrf import BinaryMRF
@@ -27,6 +27,8 @@ QUANTITIES = {"path_length": "path length from A to B", "log_likelihood": "log-l
 _LOG_ODDS, _WEIGHT = -2.25, 0.7
 """η of the prior of maps, and the factor of the default weights of shapes."""
 
+_MOST_DRAWS = 100
+"""The most draws of a map with walks that cross no closed cell."""
 Closed = Bool[np.ndarray, " cells"]
 
 
@@ -127,13 +129,17 @@ def draw_case(config: CalibrationConfig, random: np.random.Generator) -> Case:
     Args:
         config: The model.
         random: The generator.
+
+    Raises:
+        InputError: Where walks crossed a closed cell in each of 100 draws, as many long walks do.
     """
     prior, known = config.barrier_prior, config.grid.known.ravel()
-    while True:
+    for _ in range(_MOST_DRAWS):
         [closed] = sample_prior(prior, known, 1, seed=draw_seed(random))
         walks = simulate_walks(config, closed, draw_seed(random))
         if not closed[np.asarray(walks.next_states)].any():
             return Case(closed, walks)
+    raise InputError(f"walks crossed a closed cell in {_MOST_DRAWS} draws; expected fewer walks", field="walks")
 
 
 def simulate_walks(config: CalibrationConfig, closed: Closed, seed: int) -> ss.Demonstrations:

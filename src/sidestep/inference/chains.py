@@ -85,7 +85,7 @@ class BarrierProblem:
     world: World
     evidence: Evidence
     prior: HierarchicalMRF
-    log_normalizers: Float[np.ndarray, "etas strengths"]
+    log_normalizers: Float[np.ndarray, "densities strengths"]
     free: Int[np.ndarray, " free"]
     backup: tuple[int, float]
     terminal: Bool[np.ndarray, "tasks states"]
@@ -183,7 +183,7 @@ class BarrierProblem:
         state.log_priors[number] = self._log_priors(state)[place]
         state.densities[number] = density
 
-    def _log_priors(self, state: ChainState) -> Float[np.ndarray, "etas strengths"]:
+    def _log_priors(self, state: ChainState) -> Float[np.ndarray, "densities strengths"]:
         return self.prior.log_densities(state.chain.closed) - self.log_normalizers
 
     def _draw_density(self, state: ChainState, heat: float) -> tuple[int, int]:

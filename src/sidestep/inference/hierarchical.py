@@ -31,18 +31,19 @@ from sidestep.inference.prior_chains import native_terms, run_prior
 from sidestep.tabular.grid import Cell
 from sidestep.tabular.solvers.native import run_batch
 
-LOG_ODDS = np.arange(-1.0, 1.26, 0.25)
+_LOG_ODDS = np.arange(-1.0, 1.26, 0.25)
 """The values of δ."""
-STRENGTHS = np.arange(0.0, 1.76, 0.25)
+_STRENGTHS = np.arange(0.0, 1.76, 0.25)
 """The values of λ."""
-LOG_ODDS_PRIOR, STRENGTH_PRIOR = (0.1, 0.3), (0.75, 0.6)
+_LOG_ODDS_PRIOR, _STRENGTH_PRIOR = (0.1, 0.3), (0.75, 0.6)
 """The means and standard deviations of δ and λ, normal and cut off at the ends of the grid."""
-STRENGTH_COST = 2.25
+_STRENGTH_COST = 2.25
 """The log-odds that a closed cell loses for each unit of strength, so that walls of any strength are equally dense."""
-CROSSED_WEIGHT = 15.0
+_CROSSED_WEIGHT = 15.0
 """c, the most crossed barriers that count as evidence of the density."""
-_SWEEPS, _PROPOSALS = 40, 10_000
-"""The fewest sweeps at each δ and λ on the way up and down, and the fewest proposals."""
+_SWEEPS, _PROPOSALS, _CELLS = 40, 10_000, 2_000_000
+"""The fewest sweeps at each δ and λ on the way up and down; the proposals from which more are not made, and the most
+barriers that more may store."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +55,7 @@ class HierarchicalMRF:
         field: f, the log-odds of each barrier that do not vary.
         varied: u, whether δ adds to the log-odds of each barrier.
         log_odds: The values of δ.
-        strengths: The values of λ, ascending; from 0 where there is more than one value.
+        strengths: The values of λ, ascending from 0; any single value where δ has a single one too.
         log_prior: log p(δ, λ), up to a constant.
         crossed_weight: c, at least 0.
 
@@ -70,18 +71,24 @@ class HierarchicalMRF:
     shapes: BinaryMRF
     field: Float[np.ndarray, " barriers"]
     varied: Bool[np.ndarray, " barriers"]
-    log_odds: Float[np.ndarray, " etas"]
+    log_odds: Float[np.ndarray, " densities"]
     strengths: Float[np.ndarray, " strengths"]
-    log_prior: Float[np.ndarray, "etas strengths"]
-    crossed_weight: float = CROSSED_WEIGHT
+    log_prior: Float[np.ndarray, "densities strengths"]
+    crossed_weight: float = _CROSSED_WEIGHT
 
     def __post_init__(self) -> None:
         check(np.isfinite(self.field).all(), "expected finite numbers", field="field")
         check(np.isfinite(self.log_odds).all(), "expected finite numbers", field="log_odds")
         rises = np.isfinite(self.strengths).all() and (np.diff(self.strengths) > 0).all()
-        starts = len(self.strengths) == 1 or self.strengths[0] == 0
-        check(rises and starts, "expected ascending numbers from 0, or a single one", field="strengths")
+        starts = self.log_prior.size == 1 or self.strengths[0] == 0
+        check(rises and starts, "expected ascending numbers from 0, or a single one with one δ", field="strengths")
         check(np.isfinite(self.log_prior).all(), "expected finite numbers", field="log_prior")
+        sizes = len(self.log_odds), len(self.strengths)
+        check(self.log_prior.shape == sizes, f"expected shape {sizes}, found {self.log_prior.shape}", field="log_prior")
+        barriers = len(self.shapes.field)
+        for name in ("field", "varied"):
+            size = len(getattr(self, name))
+            check(size == barriers, f"expected {barriers} barriers, found {size}", field=name)
         message = f"expected a number of at least 0, found {self.crossed_weight}"
         check(self.crossed_weight >= 0, message, field="crossed_weight")
 
@@ -98,7 +105,7 @@ class HierarchicalMRF:
 
     def log_densities(
         self, closed: Bool[np.ndarray, "*maps barriers"] | Integer[np.ndarray, "*maps barriers"]
-    ) -> Float[np.ndarray, "*maps etas strengths"]:
+    ) -> Float[np.ndarray, "*maps densities strengths"]:
         """Return log p(z, δ, λ) + log Z(δ, λ) of maps at each δ and λ, up to a constant.
 
         Args:
@@ -134,16 +141,16 @@ def hierarchical_mrf(
         1
     """
     varied = np.isnan(field)
-    strengths = np.zeros(1) if shape is None else STRENGTHS
+    strengths = np.zeros(1) if shape is None else _STRENGTHS
     weights = (0.0,) * 4 if shape is None else (lines, pairs, blocks, isolated)
-    cost = 0.0 if shape is None else STRENGTH_COST
+    cost = 0.0 if shape is None else _STRENGTH_COST
     shapes = BinaryMRF(np.where(varied, -cost, 0.0), shape, *weights)
     of_log_odds, of_strengths = (
         -(((values - mean) / deviation) ** 2) / 2
-        for values, (mean, deviation) in ((LOG_ODDS, LOG_ODDS_PRIOR), (strengths, STRENGTH_PRIOR))
+        for values, (mean, deviation) in ((_LOG_ODDS, _LOG_ODDS_PRIOR), (strengths, _STRENGTH_PRIOR))
     )
     log_prior = of_log_odds[:, None] + of_strengths
-    return HierarchicalMRF(shapes, np.where(varied, 0.0, field), varied, LOG_ODDS, strengths, log_prior)
+    return HierarchicalMRF(shapes, np.where(varied, 0.0, field), varied, _LOG_ODDS, strengths, log_prior)
 
 
 def as_hierarchical(prior: BinaryMRF | HierarchicalMRF) -> HierarchicalMRF:
@@ -160,7 +167,7 @@ def as_hierarchical(prior: BinaryMRF | HierarchicalMRF) -> HierarchicalMRF:
 
 def log_normalizers(
     prior: HierarchicalMRF, free: Int[np.ndarray, " free"], closed: Bool[np.ndarray, " barriers"], seed: int
-) -> Float[np.ndarray, "etas strengths"]:
+) -> Float[np.ndarray, "densities strengths"]:
     """Return log Z(δ, λ) over some barriers, given the others, up to a constant.
 
     Args:
@@ -172,14 +179,13 @@ def log_normalizers(
     result = np.zeros(prior.log_prior.shape)
     others = closed.copy()
     others[free] = False
-    sweeps = max(_SWEEPS, _PROPOSALS // max(1, len(free)))
-    sequences = np.random.SeedSequence(seed).spawn(len(prior.log_odds))
+    sweeps = max(_SWEEPS, min(_PROPOSALS // max(1, len(free)), _CELLS // max(1, len(closed))))
+    # other streams than those of the sampler's chains, which have the same seed
+    sequences = np.random.SeedSequence(seed, spawn_key=(1,)).spawn(len(prior.log_odds))
 
-    def integrate(index: tuple[int, ...]) -> None:
-        (at,) = index
-        field = prior.at(prior.log_odds[at], 0.0).field
-        result[at] = np.logaddexp(0, field[free]).sum() + field @ others
-        random = np.random.Generator(np.random.PCG64(sequences[at]))
+    def integrals(at: int, field: np.ndarray, sequence: np.random.SeedSequence) -> np.ndarray:
+        """Return the integrals of E[h] from λ = 0 to each other λ."""
+        random = np.random.Generator(np.random.PCG64(sequence))
         z = others.astype(np.uint8)
         z[free] = random.random(len(free)) < 1 / (1 + np.exp(-field[free]))
         means = np.zeros((2, len(prior.strengths)))
@@ -189,7 +195,14 @@ def log_normalizers(
                 samples = run_prior(terms, free, z, sweeps, random)[sweeps // 3 :]
                 means[way, place] = prior.shapes.log_density(samples).mean()
         slopes = means.mean(axis=0)
-        result[at, 1:] += np.cumsum((slopes[1:] + slopes[:-1]) / 2 * np.diff(prior.strengths))
+        return np.cumsum((slopes[1:] + slopes[:-1]) / 2 * np.diff(prior.strengths))
+
+    def integrate(index: tuple[int, ...]) -> None:
+        (at,) = index
+        field = prior.at(prior.log_odds[at], 0.0).field
+        result[at] = np.logaddexp(0, field[free]).sum() + field @ others
+        if len(prior.strengths) > 1:
+            result[at, 1:] += integrals(at, field, sequences[at])
 
     if prior.log_prior.size > 1:
         run_batch(integrate, [(at,) for at in range(len(prior.log_odds))])
@@ -198,7 +211,7 @@ def log_normalizers(
 
 def evidence_normalizers(
     prior: HierarchicalMRF, known: Int[np.ndarray, " barriers"], free: Int[np.ndarray, " free"], seed: int
-) -> Float[np.ndarray, "etas strengths"]:
+) -> Float[np.ndarray, "densities strengths"]:
     """Return log Z(δ, λ) in which barriers that walks crossed have their weight, up to a constant.
 
     Args:

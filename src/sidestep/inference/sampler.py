@@ -219,10 +219,10 @@ class BarrierPosterior(Generic[Model]):
 
     def _density_summary(self) -> dict[str, dict[str, float]]:
         """Return the means and standard deviations of δ and λ; nothing where they are known."""
-        if not self.densities.std():
+        if not np.ptp(self.densities, axis=(0, 1)).any():
             return {}
         means, deviations = self.densities.mean(axis=(0, 1)), self.densities.std(axis=(0, 1))
-        pairs = zip(("prior_log_odds", "prior_strength"), means, deviations, strict=True)
+        pairs = zip(("prior_density", "prior_strength"), means, deviations, strict=True)
         return {name: {"mean": float(mean), "deviation": float(deviation)} for name, mean, deviation in pairs}
 
 

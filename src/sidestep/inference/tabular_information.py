@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from sidestep._programs import keep_program
 from sidestep._typing import Tree
@@ -48,11 +48,12 @@ class TabularInformation(Information):
     """
 
     def __init__(self, problem: Problem, parameters: Parameters, message: str = ""):
-        self.objective = Objective(problem)
+        self.objective: Objective = Objective(problem)
         evaluation, self.starts = self.objective.evaluate(parameters, self.objective.cold_starts())
-        self.parameters, self.message = parameters, message
+        self.parameters: Parameters = parameters
+        self.message: str = message
         _, self._unravel = ravel_pytree(parameters)
-        self.gradient = -np.asarray(ravel_pytree(evaluation.gradient)[0])
+        self.gradient: Float[np.ndarray, " parameters"] = -np.asarray(ravel_pytree(evaluation.gradient)[0])
 
     def products(self, vectors: Vectors) -> Vectors:
         """Return H v of each vector.
