@@ -24,6 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
+from scipy.special import expit
 
 from sidestep.errors import check
 from sidestep.inference.mrf import SHAPE_TERMS, BinaryMRF
@@ -187,7 +188,7 @@ def log_normalizers(
         """Return the integrals of E[h] from λ = 0 to each other λ."""
         random = np.random.Generator(np.random.PCG64(sequence))
         z = others.astype(np.uint8)
-        z[free] = random.random(len(free)) < 1 / (1 + np.exp(-field[free]))
+        z[free] = random.random(len(free)) < expit(field[free])
         means = np.zeros((2, len(prior.strengths)))
         for way, order in enumerate((1, -1)):
             for place in np.arange(len(prior.strengths))[::order]:
