@@ -1,7 +1,7 @@
 """Behavior-aware modeling beside its baselines: walls, the next actions of others, and robots with new goals.
 
     python -m benchmarks baselines --worlds offices
-    python -m benchmarks baselines --worlds tartarus --set select=true
+    python -m benchmarks baselines --worlds tartarus --walks 10 40 150
     python -m benchmarks baselines --worlds tartarus --walks 10 --methods behavior visits
 
 `offices` are drawn by seed, with simulated agents that take the best paths, ties at random, between eight places;

@@ -2,7 +2,6 @@
 
     python -m benchmarks people --set beta=5 log_odds=-3
     python -m benchmarks people --set prior.kind=normal prior.mean=-2
-    python -m benchmarks people --set select=true --seeds 1
     python -m benchmarks people --animal rats --trials 1 4 --json rats.json
 
 Tartarus (de Cothi et al. 2022): twelve mazes of 10×10 cells, all unknown to the learner. People and rats learn the
@@ -41,7 +40,6 @@ from sidestep.io.walks import Walks, read_walks
 from sidestep.maps.config import MapConfig
 from sidestep.maps.fit import demonstrations_of
 from sidestep.maps.learn import learn_map
-from sidestep.maps.selection import select_behavior
 from sidestep.plotting.reliability import figure_reliability
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Connectivity, Grid
@@ -122,14 +120,12 @@ def learn_by(
     Args:
         methods: Names in `METHODS`.
         maze: The maze, with the walks to learn from.
-        config: The configuration; where it selects the behavior, all methods have the selected one.
+        config: The configuration.
         others: Held-out walks, to be predicted.
         goals: The goals of robots (states), where they are not all free cells.
         paths: Whether robots plan and walk.
     """
     moves = grid_walks(maze.walks, maze.blank)
-    if config.behavior.select:
-        config = select_behavior(maze.blank, moves, config).config
     demonstrations = demonstrations_of(moves, maze.blank, config)
     heldout = None if others is None else demonstrations_of(grid_walks(others, maze.blank), maze.blank, config)
     problem, fitted = Problem(maze.name, maze.blank, maze.truth, demonstrations, heldout, goals), {}

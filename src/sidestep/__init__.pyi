@@ -75,9 +75,7 @@ from .tabular.solvers.jacobi import Jacobi as Jacobi
 
 # learning: maps from walks, and any model from demonstrations
 from .inference.calibration import (
-    Dispersion as Dispersion,
     ScoreStatistics as ScoreStatistics,
-    dispersion as dispersion,
     effective_sample_ratio as effective_sample_ratio,
     score_statistics as score_statistics,
 )

@@ -213,7 +213,7 @@ def test_main_with_a_failing_callback_prints_one_line_and_writes_no_map(here, ca
 
     @contextmanager
     def failing_progress(_):
-        yield (lambda progress: print(1 / (2 - progress.iteration))), print
+        yield lambda progress: print(1 / (2 - progress.iteration))
 
     monkeypatch.setattr(display, "fit_progress", failing_progress)
     assert run("learn walks.csv --map map.yaml --out out") == 1
@@ -229,7 +229,7 @@ def test_main_with_version_prints_the_version(capsys):
 
 
 @pytest.mark.parametrize(("old", "present"), [
-    ("--behavior auto", "--select-behavior"),
+    ("--behavior auto", "--behavior auto"),
     ("--behavior=given", ""),
     ("--unknown sharpness --unknown=lapses", "--learn beta --learn lapse"),
     ("--person name --candidates g.csv", "--person-column name --goal-candidates g.csv"),

@@ -1,6 +1,5 @@
 """`sidestep compare`: one table for all methods, from files."""
 
-import json
 import shutil
 from contextlib import redirect_stdout
 from dataclasses import replace
@@ -16,13 +15,11 @@ from helpers.office import OFFICE, call, simulated, summary, write_office
 from sidestep.baselines import BASELINES
 from sidestep.baselines.comparison import compare_methods
 from sidestep.io.demonstrations import demonstrations_from_walks
-from sidestep.io.gridding import grid_walks
 from sidestep.io.maps import read_map, write_map
 from sidestep.io.walks import read_walks, write_walks
 from sidestep.maps.annotations import WalkAnnotations
 from sidestep.maps.config import BehaviorConfig, FitConfig, MapConfig
 from sidestep.maps.learn import learn_map
-from sidestep.maps.selection import select_behavior
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.likelihood import log_likelihood, log_policies
 from sidestep.tabular.reward import Reward
@@ -160,7 +157,7 @@ def test_compare_takes_every_option_of_learn(capsys):
     for command in ("learn", "compare"):
         assert call(command, "--help") == 0
         options.append({word for word in capsys.readouterr().out.split() if word.startswith("--")})
-    assert {"--map", "--beta", "--select-behavior"} <= options[0] <= options[1]
+    assert {"--map", "--beta", "--sensor-map"} <= options[0] <= options[1]
 
 
 def test_compare_methods_with_a_method_without_values_scores_the_others(data):
@@ -174,21 +171,6 @@ def test_compare_methods_with_a_method_without_values_scores_the_others(data):
     assert costs.evaluation.auc is None
     assert behavior.failure is None
     assert behavior.evaluation.auc is not None
-
-
-def test_compare_methods_with_selection_selects_by_the_walks_that_are_learned_from(data):
-    grid, truth, walks = *data[:2], simulated(walks=10, goals=4, beta=7.0)
-    config = MapConfig(behavior=BehaviorConfig(select=True), fit=FitConfig(max_iterations=1), seed=3)
-    comparison = compare_methods(grid, truth, walks, config=config, baselines={})
-    train = walks.select(np.sort(np.random.default_rng(3).permutation(10)[2:]))
-    selection = select_behavior(grid, grid_walks(train, grid), config)
-    assert comparison.selection is not None
-    assert comparison.selection.reasons == selection.reasons
-    assert comparison.config == selection.config
-    assert comparison.config.behavior.learn == ("lapse",)
-    assert not comparison.config.behavior.select
-    result = json.loads(json.dumps(comparison.summary(), allow_nan=False))
-    assert result["behavior"]["reasons"] == selection.reasons
 
 
 def test_compare_methods_with_persons_scores_held_out_walks_by_their_own_beta(data):

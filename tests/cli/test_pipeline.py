@@ -235,11 +235,11 @@ def test_learn_resumes_after_an_interruption(office, learned, tmp_path, monkeypa
             if progress.iteration == 4:
                 raise KeyboardInterrupt
 
-        yield stop, print
+        yield stop
 
     @contextmanager
     def recording(_):
-        yield (lambda progress: iterations.append(progress.iteration)), print
+        yield lambda progress: iterations.append(progress.iteration)
 
     monkeypatch.setattr(display, "fit_progress", interrupting)
     assert call(*command) == 1

@@ -18,7 +18,7 @@ from sidestep.cli.app import main
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-SLOW = re.compile("sidestep (demo|reproduce|experiment|compare)|--(person-column|goal-candidates|sensor-map|select)")
+SLOW = re.compile("sidestep (demo|reproduce|experiment|compare)|--(person-column|goal-candidates|sensor-map)")
 BLOCK = re.compile(r"(<!-- not run: [^>]+ -->\n+)?^```(python|sh)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 

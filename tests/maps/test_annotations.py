@@ -98,10 +98,9 @@ CANDIDATES = {
 @pytest.mark.parametrize(("options", "expected"), [
     ("--person-column person", "walks.csv, field 'person': the column is missing"),
     ("--person-column step", "walks.csv, field 'step': expected a column of metadata"),
-    ("--select-behavior --tempering 0.5", "field 'tempering'"),
     ("--goal-candidates none.csv", "none.csv"),
     ("--goal-candidates two.csv --person-column person", "field 'person_column'"),
-    ("--goal-candidates two.csv --select-behavior", "field 'select_behavior'"),
+    ("--goal-candidates two.csv --tempering 0.5", "field 'tempering'"),
     ("--goal-candidates two.csv --learn lapse", "field 'learn'"),
     ("--goal-candidates outside.csv", "outside.csv, row 2, field 'goal_x, goal_y'"),
     ("--goal-candidates twice.csv", "twice.csv, row 2"),

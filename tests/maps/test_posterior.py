@@ -40,6 +40,11 @@ NORMAL, FEW = PriorConfig("normal"), PosteriorConfig("sample", sweeps=15)
 # Configurations
 
 
+def test_behavior_config_refuses_unknown_parameters():
+    with pytest.raises(InputError, match="field 'learn': expected one of beta, lapse, discount, found 'mood'"):
+        BehaviorConfig(learn=("mood",))
+
+
 def test_posterior_method_by_prior_size_and_horizon():
     config = MapConfig()
     assert posterior_method(config, MAX_SAMPLED // 5, 5) == "sample"

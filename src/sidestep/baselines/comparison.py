@@ -18,7 +18,6 @@ from sidestep.maps.config import MapConfig
 from sidestep.maps.fit import behavior_of, demonstrations_of
 from sidestep.maps.learn import Learning, learn_map, sample_walks
 from sidestep.maps.learned_map import LearnedMap
-from sidestep.maps.selection import Selection
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Grid
 
@@ -29,7 +28,7 @@ class Comparison:
 
     Attributes:
         problem: The map, the true map, what was learned from and what was held out.
-        config: The configuration, with what the selection chose.
+        config: The configuration; with persons, β is learned.
         records: The scores of each method, behavior-aware modeling first.
         learned: The map of behavior-aware modeling; None if it failed.
     """
@@ -38,11 +37,6 @@ class Comparison:
     config: MapConfig
     records: list[Record]
     learned: LearnedMap | None
-
-    @property
-    def selection(self) -> Selection | None:
-        """The selection of the behavior, if there was one."""
-        return self.learned.learning.selection if self.learned and self.learned.learning else None
 
     def method_scores(self) -> dict[str, dict[str, Any]]:
         """Return the scores of each method by name."""
@@ -56,7 +50,6 @@ class Comparison:
         return {
             "settings": asdict(self.config),
             "connectivity": self.problem.grid.connectivity,
-            "behavior": self.selection.summary() if self.selection else {},
             "data": {**data, "heldout_walks": held[0], "heldout_moves": held[1]},
             "methods": self.method_scores(),
         }
@@ -76,8 +69,8 @@ def compare_methods(
 ) -> Comparison:
     """Learn by every method from some of the walks, and evaluate the results.
 
-    Behavior-aware modeling is `learn_map` with all that is known. Its selected behavior, and the most probable goals of
-    walks that do not name theirs, hold for the baselines too. The baselines know nothing of sensors and persons.
+    Behavior-aware modeling is `learn_map` with all that is known. The most probable goals of walks that do not name
+    theirs hold for the baselines too. The baselines know nothing of sensors and persons.
 
     Args:
         grid: What is known of the map.
@@ -96,17 +89,14 @@ def compare_methods(
     Raises:
         InputError: For a fraction that leaves no walk to learn from, or none to score though it is above 0; and as
             `learn_map` does.
-        ImproperTask, NotConverged: Where the selection of the behavior fails.
     """
     walks, config = sample_walks(walks, config), replace(config, max_walks=None)
     train, test = _split(walks, hold_out, config.seed)
     notify("map: behavior learns")
     learned, failure = None, None
     try:
-        learned = learn_map(grid, train, config, annotations=annotations, notify=notify, **options)
+        learned = learn_map(grid, train, config, annotations=annotations, **options)
     except (ImproperTask, NotConverged) as error:
-        if config.behavior.select:
-            raise  # the baselines need the selected behavior too
         failure = str(error)
     learning = learned.learning if learned else None
     moves = learning.goals.moves if learning and learning.goals else grid_walks(annotations.without_goals(train), grid)

@@ -42,7 +42,6 @@ def compare(
             save_learned(comparison.learned, out / "behavior", command="learn", files=files)
         write_json(out / "summary.json", {"command": "compare", "files": files, **comparison.summary()})
     checkpoint.unlink(missing_ok=True)
-    print_lines(*(comparison.selection.reasons if comparison.selection else ()))
     rows = comparison.method_scores()
     print_scores(rows, _COLUMNS)
     for name, scores in rows.items():

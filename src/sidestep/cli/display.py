@@ -103,7 +103,7 @@ def _bar(*before_remaining: str, left: str) -> "Progress":
 
 
 @contextmanager
-def fit_progress(iterations: int) -> "Iterator[tuple[FitCallback, Callable[[str], None]]]":
+def fit_progress(iterations: int) -> "Iterator[FitCallback]":
     """Show a progress bar on a terminal for a fit of at most `iterations`; the results report to it.
 
     When a fit converges cannot be known. So the time is the longest that is left, at the pace of the last ten minutes.
@@ -112,7 +112,7 @@ def fit_progress(iterations: int) -> "Iterator[tuple[FitCallback, Callable[[str]
         iterations: The most iterations of the fit.
 
     Returns:
-        A context manager with two functions: one reports the progress of the fit, the other shows a text.
+        A context manager with a function that reports the progress of the fit.
     """
     with _bar("at most", left="left; {task.fields[state]}") as bar:
         task = bar.add_task("learning", total=iterations, state="compiling")
@@ -120,7 +120,7 @@ def fit_progress(iterations: int) -> "Iterator[tuple[FitCallback, Callable[[str]
         def report(progress: "FitProgress | SweepProgress") -> None:
             bar.update(task, completed=progress.iteration, total=progress.total, state=progress.description)
 
-        yield report, lambda text: bar.update(task, state=text)
+        yield report
 
 
 @contextmanager

@@ -21,9 +21,9 @@ def learn(walks: Walks, map_file: MapFile, out: Folder, options: LearnOptions) -
     from sidestep.maps.learn import learn_map
 
     config, grid, checkpoint = options.config(), options.grid(map_file), out / "fit.checkpoint"
-    with fit_progress(max_iterations(config.fit)) as (callback, notify):
+    with fit_progress(max_iterations(config.fit)) as callback:
         table, inputs = read_walks(walks), options.more_inputs(grid, checkpoint)
-        learned = learn_map(grid, table, config, callback=callback, notify=notify, **inputs)
+        learned = learn_map(grid, table, config, callback=callback, **inputs)
         save_learned(learned, out, command="learn", files={"walks": str(walks), "map": str(map_file)})
     checkpoint.unlink(missing_ok=True)
     learning = learned.learning
@@ -33,7 +33,6 @@ def learn(walks: Walks, map_file: MapFile, out: Folder, options: LearnOptions) -
     if data.walks_left_out or data.moves_left_out:
         walks_out, moves_out = data.walks_left_out, data.moves_left_out
         print_lines(f"left out: {walks_out} walks that start at their goal, and {moves_out} moves after the arrival")
-    print_lines(*(learning.selection.reasons if learning.selection else ()))
     print_notes(*(f"note: {note}" for note in learning.notes))
     print_lines(learning.fit.description)
     for name, number in learning.fit.learned_behavior.items():

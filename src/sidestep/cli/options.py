@@ -45,9 +45,6 @@ BumpCost = Annotated[float, Option(help="The cost of a first bump at a place in 
 class LearnOptions:
     """How a map is learned, as options of `learn` and `compare`; the defaults are those of `MapConfig`."""
 
-    select_behavior: Annotated[
-        bool, Option("--select-behavior", help="Select reward, β, lapses and tempering by cross-validation.")
-    ] = BehaviorConfig.select
     backup: Backup = BehaviorConfig.backup
     beta: Annotated[float, Option(help="The inverse temperature β, in units of one over reward.")] = BehaviorConfig.beta
     lapse: Annotated[float | None, Option(help="The probability of a random action, if any.")] = BehaviorConfig.lapse
@@ -107,7 +104,7 @@ class LearnOptions:
     def config(self) -> MapConfig:
         """Return the configuration."""
         learned = tuple(dict.fromkeys(self.learn or ()))
-        behavior = self._part(BehaviorConfig, learn=learned, select=self.select_behavior)
+        behavior = self._part(BehaviorConfig, learn=learned)
         prior, posterior = self._prior(), PosteriorConfig(self._method(), self.sweeps)
         fit = self._part(FitConfig, gradient=self.gradient.replace("-", "_"))
         others = {name: getattr(self, name) for name in ("max_walks", "unknown_below", "seed")}
@@ -247,8 +244,8 @@ def present_spelling(arguments: list[str]) -> list[str]:
         arguments: The words of the command line.
 
     Example:
-        >>> present_spelling(["learn", "--behavior", "auto", "--lines=2", "--unknown", "lapses"])
-        ['learn', '--select-behavior', '--wall-prior=2', '--learn', 'lapse']
+        >>> present_spelling(["learn", "--behavior", "given", "--lines=2", "--unknown", "lapses"])
+        ['learn', '--wall-prior=2', '--learn', 'lapse']
     """
     result, rest = [], list(arguments)
     while rest:
@@ -256,7 +253,7 @@ def present_spelling(arguments: list[str]) -> list[str]:
         if option in ("--behavior", "--unknown") and not equals:
             value = rest.pop(0) if rest else ""
         if option == "--behavior":
-            result += {"auto": ["--select-behavior"], "given": []}.get(value, [option, value])
+            result += [] if value == "given" else [option, value]
         elif option == "--unknown":
             result += ["--learn", _OLD_VALUES.get(value, value)]
         else:

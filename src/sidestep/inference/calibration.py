@@ -16,7 +16,6 @@ is the ratio of effective to actual steps. A composite likelihood is adjusted by
 2011). κ above 1 means that behavior is more regular than the model's.
 """
 
-import enum
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -127,36 +126,3 @@ def effective_sample_ratio(held_out: Sequence[ScoreStatistics]) -> float:
     by_trajectory = np.bincount(trajectory, score - score.mean())
     variation = float(np.sum(by_trajectory**2))
     return float(information.sum()) / variation if variation > 0 else float("inf")
-
-
-class Dispersion(enum.Enum):
-    """Whether scores vary more, less or as much as those of independent steps.
-
-    Example:
-        >>> Dispersion.OVERDISPERSED.value
-        'overdispersed'
-    """
-
-    OVERDISPERSED = "overdispersed"
-    UNDERDISPERSED = "underdispersed"
-    CONSISTENT = "consistent"
-
-
-def dispersion(ratio: float, trajectories: int, standard_errors: float) -> Dispersion:
-    """Return whether κ differs from 1 significantly: κ < 1 is overdispersion.
-
-    A sum of n squares of normal numbers has a relative standard error of √(2/n).
-
-    Args:
-        ratio: κ (see `effective_sample_ratio`).
-        trajectories: The number of trajectories that it was estimated from.
-        standard_errors: The number of standard errors that count as significant.
-
-    Example:
-        >>> dispersion(0.2, trajectories=100, standard_errors=3.0)
-        <Dispersion.OVERDISPERSED: 'overdispersed'>
-    """
-    margin = standard_errors * (2 / trajectories) ** 0.5
-    if abs(np.log(ratio)) <= margin:
-        return Dispersion.CONSISTENT
-    return Dispersion.OVERDISPERSED if ratio < 1 else Dispersion.UNDERDISPERSED

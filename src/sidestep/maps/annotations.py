@@ -45,7 +45,6 @@ class WalkAnnotations:
             return
         refused = {
             "person_column": self.person_column is not None,
-            "select_behavior": config.select,
             "resume": resume,
             "learn": bool(config.learn),
             "tempering": config.tempering != 1,

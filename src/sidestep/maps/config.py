@@ -42,7 +42,6 @@ class BehaviorConfig:
         learn: What is learned together with the map: any of "beta", "lapse", "discount".
         tempering: κ in (0, 1], the weight of the actions' log-likelihood; below 1 where actions are not independent.
         horizon: The number of actions that agents look ahead; None for no limit.
-        select: Choose the reward, β, and κ by cross-validation before learning; lapses are then learned.
 
     Raises:
         InputError: For an unknown backup or parameter.
@@ -58,7 +57,6 @@ class BehaviorConfig:
     learn: tuple[str, ...] = ()
     tempering: float = 1.0
     horizon: int | None = None
-    select: bool = False
 
     def __post_init__(self) -> None:
         _check_choice(self.backup, BackupName, "backup")

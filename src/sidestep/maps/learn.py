@@ -23,7 +23,6 @@ from sidestep.maps.fit import MapPosterior, behavior_model_of, demonstrations_of
 from sidestep.maps.goal_candidates import GoalPosterior, fit_with_unknown_goals
 from sidestep.maps.information import map_information
 from sidestep.maps.learned_map import LearnedMap
-from sidestep.maps.selection import Selection, select_behavior
 from sidestep.maps.sensors import SensorMap, first_logits, seen_cells
 from sidestep.tabular.demonstrations import Demonstrations, split_by_person
 from sidestep.tabular.grid import Cell, Grid
@@ -62,11 +61,10 @@ class Learning:
     """How a map was learned.
 
     Attributes:
-        config: The configuration, with what the selection chose.
+        config: The configuration; with persons, β is learned.
         fit: The posterior, as samples or a fit: model, behavior, history, convergence.
         demonstrations: The moves that counted.
         data: Their numbers.
-        selection: The selection of the behavior, if there was one.
         persons: β of each person, where persons were named.
         goals: The posterior over goals, where walks did not name them.
         sensor: What sensors had seen.
@@ -80,7 +78,6 @@ class Learning:
     fit: MapPosterior
     demonstrations: Demonstrations
     data: DataCounts
-    selection: Selection | None
     persons: dict[str, float]
     goals: GoalPosterior | None
     sensor: SensorMap | None
@@ -105,7 +102,6 @@ class Learning:
                 "lapse": None if behavior.lapse is None else float(behavior.lapse),
                 **({"persons": self.persons} if self.persons else {}),
                 **({"goals": self.goals.summary()} if self.goals else {}),
-                **(self.selection.summary() if self.selection else {}),
             },
             "data": asdict(self.data),
             "posterior": self.method,
@@ -125,7 +121,6 @@ def learn_map(
     sensor: SensorMap | None = None,
     annotations: WalkAnnotations = NO_ANNOTATIONS,
     callback: Callable[[Progress | SweepProgress], None] | None = None,
-    notify: Callable[[str], None] | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
 ) -> LearnedMap:
@@ -138,7 +133,6 @@ def learn_map(
         sensor: What sensors saw of unknown cells.
         annotations: The persons of the walks, and candidates for goals that walks do not name.
         callback: Called with the progress of every iteration of a fit, or every sweep of a sampler.
-        notify: Called with a line of text at each stage of the selection of the behavior.
         checkpoint: A file that is kept up to date while the fit runs.
         resume: Continue from the checkpoint. The result is that of an uninterrupted run.
 
@@ -167,8 +161,6 @@ def learn_map(
     walks = annotations.without_goals(sample_walks(walks, config))
     moves = grid_walks(walks, grid)
     resumed = resume and checkpoint is not None and Path(checkpoint).exists()
-    selection = select_behavior(grid, moves, config, sensor, notify) if config.behavior.select else None
-    config = selection.config if selection else config
     model = ObstacleGrid(grid, first_logits(sensor, grid.known, config.prior))
     candidates, goals, names, person = annotations.goal_candidates, None, [], None
     if candidates is not None:
@@ -192,7 +184,6 @@ def learn_map(
         fit=fit,
         demonstrations=demonstrations,
         data=_counts(grid, moves, demonstrations, sensor),
-        selection=selection,
         persons={str(name): float(fit.behavior.behavior_of(index).beta) for index, name in enumerate(names)},
         goals=goals,
         sensor=sensor,
