@@ -25,7 +25,7 @@ from sidestep.inference.checkpoints import Checkpoint
 from sidestep.inference.enumeration import enumerate_barriers
 from sidestep.inference.maximize import Status
 from sidestep.inference.mrf import BinaryMRF
-from sidestep.inference.sampler import BarrierPosterior, heat, heated_sweeps, sample_barriers
+from sidestep.inference.sampler import BarrierPosterior, heat, heated_sweeps, sample_barriers, stages
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax, LogSumExp
 from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.grid import Cell, Grid
@@ -114,20 +114,55 @@ def test_sample_barriers_without_open_questions_has_mixed():
     assert result.status is Status.MIXED
 
 
-def test_sample_barriers_that_cannot_mix_says_so():
-    """Four cells that are all open or all closed, with 60 nats between."""
+def stuck_world() -> BarrierWorld:
+    """Return a world with four cells that are all open or all closed, with 60 nats between."""
     grid = Grid(np.array([[0, 0, 0, 0], [0, 0, 0, 0], [0, -1, -1, 0], [0, -1, -1, 0]]))
     walk = Trajectory(np.arange(4), np.array([RIGHT] * 3), task=0)
     shown = gather([walk], [DISCOUNTED.reach(grid, 3)])
     prior = BinaryMRF(np.full(16, -60.0), (4, 4), pairs=60.0)
-    stuck = BarrierWorld(ObstacleGrid(grid), shown, Behavior(BoltzmannAverage()), prior)
-    result = sampled(stuck, chains=4)
+    return BarrierWorld(ObstacleGrid(grid), shown, Behavior(BoltzmannAverage()), prior)
+
+
+def test_sample_barriers_that_cannot_mix_says_so():
+    result = sampled(stuck_world(), chains=4)
     ends = result.samples[:, -1, [9, 10, 13, 14]].sum(axis=-1)
     assert set(ends) == {0, 4}
     assert result.status is Status.NOT_MIXED
     assert not result.converged
     assert not np.isfinite(result.rhat).all()
     assert result.summary()["largest_rhat"] is None
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_sample_barriers_continues_until_chains_have_mixed(name):
+    """The sweeps of a shorter run, and as many more as the check asks for."""
+    one = WORLDS[name]
+    ended = [sampled(one, sweeps=12, most_sweeps=most) for most in stages(12, 400)]
+    last = ended[-1]
+    assert last.status is Status.MIXED
+    assert len(last.history) in {len(each.history) for each in ended}
+    assert last.samples.shape[1] == len(last.history) - heated_sweeps(len(last.history))
+    for each in ended:
+        mixed = each.status is Status.MIXED
+        assert (len(each.history) == len(last.history)) is mixed
+        assert [sweep.objective for sweep in each.history] == [
+            sweep.objective for sweep in last.history[: len(each.history)]
+        ]
+
+
+def test_sample_barriers_that_cannot_mix_stops_at_the_most_sweeps():
+    stuck = stuck_world()
+    assert len(sampled(stuck, sweeps=12, most_sweeps=30, chains=4).history) == 30
+
+
+@pytest.mark.parametrize(("sweeps", "most", "expected"), [
+    (200, 200, [200]),
+    (200, 201, [200, 201]),
+    (200, 400, [200, 400]),
+    (200, 1000, [200, 400, 800, 1000]),
+])  # fmt: skip
+def test_stages_double_up_to_the_most(sweeps, most, expected):
+    assert stages(sweeps, most) == expected
 
 
 # What a result says
@@ -260,6 +295,17 @@ def test_sample_barriers_resumed_equals_uninterrupted(checkpoint, name):
     assert_equal(resumed, expected)
 
 
+def test_sample_barriers_continued_and_resumed_equals_uninterrupted(checkpoint):
+    one, settings = stuck_world(), {"sweeps": 12, "most_sweeps": 40, "chains": 4}
+    expected = sampled(one, **settings)
+    for sweep in (5, 12, 30):
+        with pytest.raises(KeyboardInterrupt):
+            sampled(one, **settings, report=interrupted_at(sweep), checkpoint=checkpoint, resume=True)
+    resumed = sampled(one, **settings, checkpoint=checkpoint, resume=True)
+    assert len(resumed.history) == 40
+    assert_equal(resumed, expected)
+
+
 def test_sample_barriers_resumed_at_the_end_returns_the_same(checkpoint):
     expected = sampled(world(), checkpoint=checkpoint)
     resumed = sampled(world(), checkpoint=checkpoint, resume=True, report=lambda _: pytest.fail("it had ended"))
@@ -277,6 +323,7 @@ def test_sample_barriers_without_resume_starts_again(checkpoint):
 OTHERS = {
     "seed": {"seed": 1},
     "sweeps": {"sweeps": 25},
+    "most sweeps": {"most_sweeps": 48},
     "chains": {"chains": 3},
     "tempering": {"tempering": 0.5},
     "terms": {"terms": ("actions",)},
@@ -319,6 +366,7 @@ def test_sample_barriers_to_resume_without_a_checkpoint_raises():
 
 @pytest.mark.parametrize(("settings", "field"), [
     ({"sweeps": 11}, "sweeps"),
+    ({"most_sweeps": 23}, "most_sweeps"),
     ({"chains": 1}, "chains"),
     ({"tempering": 0.0}, "tempering"),
     ({"tempering": 1.1}, "tempering"),

@@ -62,12 +62,15 @@ def test_posterior_method_configured_does_not_depend_on_the_size(method):
 
 def test_sweeps_for_fall_with_the_size_between_bounds():
     sizes = [0, 1, 100, 1_000, 6_000, 30_000, 10**5]
-    sweeps = [sweeps_for(MapConfig(), size, 5) for size in sizes]
-    assert sweeps == sorted(sweeps, reverse=True)
-    assert sweeps[0] == sweeps[2] > sweeps[4] > sweeps[-1] == sweeps[-2] >= 12
+    fewest, most = zip(*(sweeps_for(MapConfig(), size, 5) for size in sizes), strict=True)
+    for sweeps in (fewest, most):
+        assert list(sweeps) == sorted(sweeps, reverse=True)
+        assert sweeps[0] == sweeps[2] > sweeps[-1] == sweeps[-2] >= 12
+    assert all(first <= last for first, last in zip(fewest, most, strict=True))
+    assert fewest[0] < most[0]
     # what counts is the product
     assert sweeps_for(MapConfig(), 3_000, 5) == sweeps_for(MapConfig(), 5, 3_000)
-    assert sweeps_for(MapConfig(posterior=PosteriorConfig(sweeps=77)), 10**5, 5) == 77
+    assert sweeps_for(MapConfig(posterior=PosteriorConfig(sweeps=77)), 10**5, 5) == (77, 77)
 
 
 @pytest.mark.parametrize(("make", "field"), [

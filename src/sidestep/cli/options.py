@@ -71,7 +71,10 @@ class LearnOptions:
         Literal["sample", "mean-field", "mode"] | None,
         Option(help="Samples of maps, or a fit; by default by the prior and the size."),
     ] = None
-    sweeps: Annotated[int | None, Option(help="The sweeps of each chain of samples; by default by the size.")] = None
+    sweeps: Annotated[
+        int | None,
+        Option(help="The sweeps of each chain of samples; by default until they mix, up to a number by the size."),
+    ] = None
     log_odds: Annotated[
         float | None,
         Option(

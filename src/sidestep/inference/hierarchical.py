@@ -12,7 +12,8 @@ falling, and Z(δ, 0) = Π_i (1 + exp(f_i + u_i δ)).
 
 Agents are in open cells because they have to be. A place has halls where they walk and walls between, and one density
 does not describe both: with each crossed cell as evidence of the density, the walls of an office vanish. So barriers
-that walks crossed enter with a weight α = min(1, c / crossed), as if walks had crossed at most c of them:
+that walks crossed enter with a weight α = min(1, (c / crossed)²). Together they count as c² / crossed: a few count in
+full, many as almost none:
 
     log Z = (1 − α) log Z(barriers that were not crossed, given the others) + α log Z(all unknown barriers)
 
@@ -40,8 +41,8 @@ _LOG_ODDS_PRIOR, _STRENGTH_PRIOR = (0.1, 0.3), (0.75, 0.6)
 """The means and standard deviations of δ and λ, normal and cut off at the ends of the grid."""
 _STRENGTH_COST = 2.25
 """The log-odds that a closed cell loses for each unit of strength, so that walls of any strength are equally dense."""
-_CROSSED_WEIGHT = 15.0
-"""c, the most crossed barriers that count as evidence of the density."""
+_CROSSED = 35.0
+"""c, the most crossed barriers that count in full as evidence of the density."""
 _SWEEPS, _PROPOSALS, _CELLS = 40, 10_000, 2_000_000
 """The fewest sweeps at each δ and λ on the way up and down; the proposals from which more are not made, and the most
 barriers that more may store."""
@@ -58,7 +59,7 @@ class HierarchicalMRF:
         log_odds: The values of δ.
         strengths: The values of λ, ascending from 0; any single value where δ has a single one too.
         log_prior: log p(δ, λ), up to a constant.
-        crossed_weight: c, at least 0.
+        crossed: c, the number of crossed barriers up to which all count in full; at least 0.
 
     Raises:
         InputError: For numbers that do not fit these ranges.
@@ -75,7 +76,7 @@ class HierarchicalMRF:
     log_odds: Float[np.ndarray, " densities"]
     strengths: Float[np.ndarray, " strengths"]
     log_prior: Float[np.ndarray, "densities strengths"]
-    crossed_weight: float = _CROSSED_WEIGHT
+    crossed: float = _CROSSED
 
     def __post_init__(self) -> None:
         check(np.isfinite(self.field).all(), "expected finite numbers", field="field")
@@ -90,8 +91,8 @@ class HierarchicalMRF:
         for name in ("field", "varied"):
             size = len(getattr(self, name))
             check(size == barriers, f"expected {barriers} barriers, found {size}", field=name)
-        message = f"expected a number of at least 0, found {self.crossed_weight}"
-        check(self.crossed_weight >= 0, message, field="crossed_weight")
+        message = f"expected a number of at least 0, found {self.crossed}"
+        check(self.crossed >= 0, message, field="crossed")
 
     def at(self, log_odds: float, strength: float) -> BinaryMRF:
         """Return the prior at one δ and λ.
@@ -224,7 +225,7 @@ def evidence_normalizers(
     unknown, closed = np.flatnonzero(known == Cell.UNKNOWN), known == Cell.OCCUPIED
     crossed = len(unknown) - len(free)
     result = log_normalizers(prior, free, closed, seed)
-    if crossed == 0 or prior.crossed_weight == 0:
+    if crossed == 0 or prior.crossed == 0:
         return result
-    weight = min(1.0, prior.crossed_weight / crossed)
+    weight = min(1.0, (prior.crossed / crossed) ** 2)
     return (1 - weight) * result + weight * log_normalizers(prior, unknown, closed, seed)

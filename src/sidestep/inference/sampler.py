@@ -18,6 +18,8 @@ The chain is that of Metropolis et al. (1953), *Equation of state calculations b
 4. In the first third of the sweeps the posterior is heated: log p/T, with T falling from 4 to 1. These are dropped.
 5. Several chains start from few and from many closed barriers. Split-R̂ and effective sample sizes
    (`diagnostics`) compare them.
+6. Chains that have not mixed are continued: twice as many sweeps in all, again and again up to a limit. The first third
+   of all sweeps is dropped.
 
 Barriers that walks crossed are open and stay so. The density and strength of a hierarchical prior are drawn before each
 sweep, given the map (`hierarchical`); while the chain is heated they are at their mode.
@@ -26,6 +28,7 @@ sweep, given the map (`hierarchical`); while the chain is heated they are at the
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -235,6 +238,7 @@ def sample_barriers(
     tempering: float = 1.0,
     terms: Terms = ALL_TERMS,
     sweeps: int = 300,
+    most_sweeps: int | None = None,
     chains: int = 2,
     seed: int = 0,
     report: Callable[[SweepProgress], None] | None = None,
@@ -251,6 +255,7 @@ def sample_barriers(
         tempering: κ in (0, 1], a factor of the actions' log-likelihood.
         terms: The parts of the likelihood that count.
         sweeps: The number of sweeps of each chain, at least 12; a sweep has a proposal for each unknown barrier.
+        most_sweeps: The number of sweeps up to which chains that have not mixed are continued; None for `sweeps`.
         chains: The number of chains, at least 2.
         seed: The seed. The result does not depend on the number of cores.
         report: Called with a `SweepProgress` after every sweep.
@@ -270,6 +275,8 @@ def sample_barriers(
         Metropolis et al. (1953); Christen & Fox (2005), *Markov chain Monte Carlo using an approximation*.
     """
     check_count(sweeps, MIN_SWEEPS, "sweeps")
+    most = sweeps if most_sweeps is None else most_sweeps
+    check_count(most, sweeps, "most_sweeps")
     check_count(chains, 2, "chains")
     check(0 < tempering <= 1, f"expected a number in (0, 1], found {tempering}", field="tempering")
     agents = behavior if isinstance(behavior, BehaviorModel) else behavior_model(behavior)
@@ -277,28 +284,45 @@ def sample_barriers(
     check_prior(barriers, prior)
     check_proper(demonstrations.tasks, agents.behavior_of(), model.graph.actions)
     problem = barrier_problem(barriers, demonstrations, agents, prior, seed=seed, tempering=tempering, terms=terms)
-    states = start_chains(problem, sweeps, chains, seed)
-    saver = Saver(checkpoint, fingerprint((astuple(problem), sweeps, chains, seed)))
+    states = start_chains(problem, most, chains, seed)
+    saver = Saver(checkpoint, fingerprint((astuple(problem), sweeps, most, chains, seed)))
     done = _load(saver, states) if resume else 0
-    free = max(1, len(problem.free))
-    for number in range(done, sweeps):
-        run_sweep(problem, states, number, heat(number, sweeps))
-        if report is not None:
-            report(_progress(states, number, free))
-        saver.save([_saved(state) for state in states], [[number + 1]])
-    history = tuple(_progress(states, number, free) for number in range(sweeps))
-    samples = np.stack([state.samples for state in states])[:, heated_sweeps(sweeps) :]
-    count = samples.shape[0] * samples.shape[1]
+    free, status, total = max(1, len(problem.free)), Status.NOT_MIXED, 0
+    for total in stages(sweeps, most):
+        for number in range(done, total):
+            run_sweep(problem, states, number, heat(number, sweeps))
+            if report is not None:
+                report(_progress(states, number, total, free))
+            saver.save([_saved(state) for state in states], [[number + 1]])
+        done = max(done, total)
+        samples = np.stack([state.samples[heated_sweeps(total) : total] for state in states])
+        rhat = split_rhat(samples)
+        if not len(problem.free) or (rhat[problem.free] <= MIXED_RHAT).mean() >= _MIXED_FRACTION:
+            status = Status.MIXED
+            break
+    history = tuple(_progress(states, number, total, free) for number in range(total))
     known = barriers.known != Cell.UNKNOWN
-    closed = np.where(known, samples[0, 0], (samples.sum(axis=(0, 1)) + 0.5) / (count + 1))
-    rhat = split_rhat(samples)
-    mixed = (rhat[problem.free] <= MIXED_RHAT).mean() >= _MIXED_FRACTION if len(problem.free) else True
-    status = Status.MIXED if mixed else Status.NOT_MIXED
+    draws = samples.shape[0] * samples.shape[1]
+    closed = np.where(known, samples[0, 0], (samples.sum(axis=(0, 1)) + 0.5) / (draws + 1))
     learned = with_closed(model, np.clip(closed, _SURE, 1 - _SURE))
     sampled = np.isin(np.arange(len(closed)), problem.free)
     sizes = effective_sizes(samples)
-    densities = np.stack([state.densities for state in states])[:, heated_sweeps(sweeps) :]
+    densities = np.stack([state.densities[heated_sweeps(total) : total] for state in states])
     return BarrierPosterior(learned, agents, densities, sampled, samples, closed, rhat, sizes, history, status)
+
+
+def stages(sweeps: int, most_sweeps: int) -> list[int]:
+    """Return the numbers of sweeps after which it is checked whether the chains have mixed, ascending.
+
+    Args:
+        sweeps: The first of them.
+        most_sweeps: The last of them; each of the others is twice the one before.
+
+    Example:
+        >>> stages(200, 500)
+        [200, 400, 500]
+    """
+    return [*takewhile(lambda total: total < most_sweeps, (sweeps * 2**stage for stage in count())), most_sweeps]
 
 
 def heated_sweeps(sweeps: int) -> int:
@@ -350,13 +374,11 @@ def run_sweep(problem: BarrierProblem, states: Sequence[ChainState], number: int
     run_batch(lambda index: problem.sweep(states[index[0]], number, heat), [(at,) for at in range(len(states))])
 
 
-def _progress(states: Sequence[ChainState], number: int, free: int) -> SweepProgress:
+def _progress(states: Sequence[ChainState], number: int, total: int, free: int) -> SweepProgress:
     actions, transitions = np.mean([state.log_likelihoods[number] for state in states], axis=0).tolist()
     prior = float(np.mean([state.log_priors[number] for state in states]))
     accepted = float(np.mean([state.accepted[number] for state in states])) / free
-    return SweepProgress(
-        number + 1, len(states[0].samples), actions + transitions + prior, actions, transitions, prior, accepted
-    )
+    return SweepProgress(number + 1, total, actions + transitions + prior, actions, transitions, prior, accepted)
 
 
 def _saved(state: ChainState) -> tuple[Any, ...]:

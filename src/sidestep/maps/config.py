@@ -121,7 +121,8 @@ class PosteriorConfig:
         method: "sample" draws maps, "mean_field" treats cells as independent, "mode" maximizes the posterior of the
             normal prior. None is "mode" for the normal prior, and for the binary one "sample" on maps up to
             `MAX_SAMPLED` unknown cells × goals and "mean_field" beyond.
-        sweeps: The number of sweeps of each chain, at least 12; None for a number by the size of the map.
+        sweeps: The number of sweeps of each chain, at least 12. None continues chains until they have mixed, up to a
+            number by the size of the map.
         chains: The number of chains, at least 2.
 
     Raises:

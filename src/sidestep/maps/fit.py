@@ -49,8 +49,10 @@ from sidestep.tabular.solve import SolveOptions
 MapPosterior = Fit[ObstacleGrid] | BarrierPosterior[ObstacleGrid]
 """What is learned of a map: a fit, or samples."""
 
-_PROPOSALS, _FEWEST_SWEEPS, _MOST_SWEEPS = 12_000_000, 150, 500
-"""The number of sweeps is this number over unknown cells × goals, within these bounds."""
+_PROPOSALS, _FEWEST_SWEEPS, _MOST_SWEEPS = 12_000_000, 150, 800
+"""Chains are continued up to this number over unknown cells × goals sweeps, within these bounds."""
+_FIRST_SWEEPS = 200
+"""The number of sweeps after which it is first checked whether chains have mixed."""
 _BLOCKED_LOGIT = 8.0
 """The first logit of an unvisited cell of a large map: some 3,000 tries, longer than most detours."""
 _TOLERANCE_PER_MOVE = 1e-3
@@ -123,8 +125,8 @@ def method_of(posterior: MapPosterior, config: MapConfig) -> PosteriorMethod:
     return "mean_field" if config.prior.kind == "binary" else "mode"
 
 
-def sweeps_for(config: MapConfig, unknown: int, goals: int) -> int:
-    """Return the number of sweeps: the configured one, or one by the size.
+def sweeps_for(config: MapConfig, unknown: int, goals: int) -> tuple[int, int]:
+    """Return the fewest and the most sweeps: the configured number for both, or numbers by the size.
 
     Args:
         config: The configuration.
@@ -132,8 +134,9 @@ def sweeps_for(config: MapConfig, unknown: int, goals: int) -> int:
         goals: The number of tasks.
     """
     if config.posterior.sweeps is not None:
-        return config.posterior.sweeps
-    return max(_FEWEST_SWEEPS, min(_MOST_SWEEPS, _PROPOSALS // max(1, unknown * goals)))
+        return config.posterior.sweeps, config.posterior.sweeps
+    most = max(_FEWEST_SWEEPS, min(_MOST_SWEEPS, _PROPOSALS // max(1, unknown * goals)))
+    return min(_FIRST_SWEEPS, most), most
 
 
 def barrier_prior(
@@ -222,6 +225,7 @@ def infer_map(
     learned: Fit[ObstacleGrid] | None = None
     if any(leaf is not None for leaf in behavior.parameters):
         learned = fit_map(model, demonstrations, config, sensor=sensor, behavior=behavior, callback=callback)
+    sweeps, most_sweeps = sweeps_for(config, *size)
     posterior = sample_barriers(
         model,
         demonstrations,
@@ -229,7 +233,8 @@ def infer_map(
         prior=sampled_prior(config.prior, known, sensor),
         tempering=config.behavior.tempering,
         terms=ALL_TERMS if config.fit.terms == "both" else (config.fit.terms,),
-        sweeps=sweeps_for(config, *size),
+        sweeps=sweeps,
+        most_sweeps=most_sweeps,
         chains=config.posterior.chains,
         seed=config.seed,
         report=callback,
