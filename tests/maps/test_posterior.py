@@ -19,6 +19,8 @@ from sidestep.inference.sampler import BarrierPosterior
 from sidestep.maps.config import (
     LOG_ODDS,
     MAX_SAMPLED,
+    PEOPLE,
+    PLAIN,
     SHAPE_WEIGHTS,
     BehaviorConfig,
     FitConfig,
@@ -303,3 +305,18 @@ def test_learn_map_resumed_equals_uninterrupted(tmp_path):
 def test_sampled_model_has_logits_of_its_probabilities():
     result = inferred(MapConfig(posterior=FEW))
     np.testing.assert_allclose(jax.nn.sigmoid(jnp.asarray(result.model.parameters)), result.closed, atol=1e-6)
+
+
+def test_agents_are_people_unless_something_of_them_is_set_or_learned():
+    assert MapConfig().agents == PEOPLE
+    assert MapConfig(behavior=BehaviorConfig(tempering=0.5)).agents == PEOPLE
+    assert MapConfig(behavior=BehaviorConfig(beta=3.0)).agents == (3.0, PLAIN.lapse)
+    assert MapConfig(behavior=BehaviorConfig(lapse=0.2)).agents == (PLAIN.beta, 0.2)
+    assert MapConfig(behavior=BehaviorConfig(learn=("discount",))).agents == PLAIN
+    assert MapConfig(prior=PriorConfig("normal")).agents == PLAIN
+
+
+def test_agents_of_a_configuration_with_their_numbers_are_the_same():
+    for config in (MapConfig(), MapConfig(prior=PriorConfig("normal"))):
+        numbers = replace(config.behavior, **config.agents._asdict())
+        assert replace(config, behavior=numbers).agents == config.agents

@@ -163,7 +163,7 @@ def _with_probable_goals(moves: Moves, learned: LearnedMap | None) -> Moves:
         return moves
     posterior, config = learning.goals, learning.config
     tasks = [config.reward.reach(learned.grid, int(state)) for state in posterior.candidates]
-    behavior, walks = behavior_of(config.behavior), moves.trajectories()
+    behavior, walks = behavior_of(config), moves.trajectories()
     probability, _ = goal_posterior(learned.model, walks, tasks, behavior, posterior.fit.goal_probabilities)
     goals = moves.goals.copy()
     goals[np.unique(moves.walk)] = posterior.candidates[probability.argmax(axis=1)]

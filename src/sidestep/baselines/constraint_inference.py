@@ -47,7 +47,7 @@ def constraint_inference(grid: Grid, demonstrations: Demonstrations, config: Map
     visited = np.zeros(grid.size, dtype=bool)
     visited[np.concatenate(demonstrations.paths())] = True
     candidates = ~visited & (grid.known.ravel() == Cell.UNKNOWN)
-    behavior, forbidden = behavior_of(config.behavior), []
+    behavior, forbidden = behavior_of(config), []
     visits, log_likelihood = _predict(grid, forbidden, demonstrations, behavior)
     while len(forbidden) < candidates.sum():
         ranking = np.where(candidates, visits, -np.inf)

@@ -108,5 +108,5 @@ def model_result(
     """
     ranking = np.asarray(model.blocked, dtype=np.float64) if ranking is None else ranking
     planner = risk_averse_robot(model, np.concatenate(demonstrations.paths()))
-    behavior, options = behavior_of(config.behavior), SolveOptions(horizon=config.behavior.horizon)
+    behavior, options = behavior_of(config), SolveOptions(horizon=config.behavior.horizon)
     return ModelResult(model, config.reward, behavior, ranking, planner, converged=True, options=options)

@@ -107,9 +107,9 @@ def cost_behavior_model(grid: Grid, config: MapConfig) -> BehaviorModel:
 
     Args:
         grid: The known map.
-        config: β in `config.behavior`.
+        config: The configuration, for β.
     """
-    behavior = Behavior(LogSumExp(), config.behavior.beta)
+    behavior = Behavior(LogSumExp(), config.agents.beta)
     return behavior_model(behavior, aimed_at=np.asarray(grid_graph(grid).successors[..., 0]))
 
 

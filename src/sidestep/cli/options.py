@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast, get_ty
 from typer import Argument, BadParameter, Option
 
 from sidestep.maps.config import (
+    PEOPLE,
+    PLAIN,
     BackupName,
     BehaviorConfig,
     FitConfig,
@@ -46,8 +48,20 @@ class LearnOptions:
     """How a map is learned, as options of `learn` and `compare`; the defaults are those of `MapConfig`."""
 
     backup: Backup = BehaviorConfig.backup
-    beta: Annotated[float, Option(help="The inverse temperature β, in units of one over reward.")] = BehaviorConfig.beta
-    lapse: Annotated[float | None, Option(help="The probability of a random action, if any.")] = BehaviorConfig.lapse
+    beta: Annotated[
+        float | None,
+        Option(
+            help=f"The inverse temperature β, in units of one over reward; by default {PEOPLE.beta:g}, and {PLAIN.beta:g} "
+            "with --lapse, --learn or the normal prior."
+        ),
+    ] = BehaviorConfig.beta
+    lapse: Annotated[
+        float | None,
+        Option(
+            help=f"The probability of a random action; by default {PEOPLE.lapse:g} if β is {PEOPLE.beta:g} by default, "
+            "otherwise none."
+        ),
+    ] = BehaviorConfig.lapse
     learn: Annotated[
         list[str] | None, Option(help="Learned with the map; repeat it for several.", metavar="beta|lapse|discount")
     ] = None

@@ -63,7 +63,7 @@ class CalibrationConfig:
     sweeps: int = 1500
     draws: int = 60
     prior: PriorConfig = field(default_factory=_prior)
-    behavior: ss.BehaviorConfig = field(default_factory=ss.BehaviorConfig)
+    behavior: ss.BehaviorConfig = field(default_factory=lambda: ss.BehaviorConfig(beta=7.0))
     reward: ss.Reward = field(default_factory=ss.Reward)
 
     def __post_init__(self) -> None:
@@ -150,7 +150,7 @@ def simulate_walks(config: CalibrationConfig, closed: Closed, seed: int) -> ss.D
         closed: Whether each cell is closed.
         seed: The seed of their choices and of the moves that fail.
     """
-    world, behavior = world_of(config, closed), behavior_of(config.behavior)
+    world, behavior = world_of(config, closed), behavior_of(config.learning("sample"))
     goals = config.places[:2].tolist()
     tasks, keys = [config.reward.reach(config.grid, goal) for goal in goals], jax.random.split(jax.random.key(seed))
     trajectories = []
@@ -210,4 +210,4 @@ def _path_length(config: CalibrationConfig, closed: Closed) -> float:
 
 
 def _log_likelihood(config: CalibrationConfig, closed: Closed, walks: ss.Demonstrations) -> float:
-    return float(ss.log_likelihood(world_of(config, closed), walks, behavior_of(config.behavior)).total)
+    return float(ss.log_likelihood(world_of(config, closed), walks, behavior_of(config.learning("sample"))).total)

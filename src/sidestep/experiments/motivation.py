@@ -177,7 +177,7 @@ def true_result(form: Form) -> ModelResult:
     Args:
         form: The form of the reward.
     """
-    world, behavior = true_world(), behavior_of(form.config.behavior)
+    world, behavior = true_world(), behavior_of(form.config)
     ranking, robot = np.asarray(world.blocked), ss.risk_averse_robot(world, [])
     return ModelResult(world, form.config.reward, behavior, ranking, robot, converged=True)
 

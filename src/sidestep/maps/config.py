@@ -6,7 +6,7 @@ line can show the defaults without delay.
 
 from dataclasses import dataclass, field
 from math import isfinite
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 from sidestep.errors import check, check_count, check_not_negative, check_positive
 from sidestep.tabular.reward import Reward
@@ -31,14 +31,36 @@ MAX_SAMPLED = 60_000
 """The number of unknown cells × goals up to which maps are sampled."""
 
 
+class Agents(NamedTuple):
+    """How random the actions of agents are.
+
+    Attributes:
+        beta: The inverse temperature β, above 0.
+        lapse: The probability of a random action; None for no lapses.
+
+    Example:
+        >>> PLAIN.beta
+        7.0
+    """
+
+    beta: float
+    lapse: float | None
+
+
+PEOPLE = Agents(28.0, 0.05)
+"""Agents that are near optimal, with lapses."""
+PLAIN = Agents(7.0, None)
+"""Agents that are softly random at every step."""
+
+
 @dataclass(frozen=True)
 class BehaviorConfig:
     """How agents choose their actions, and what of it is learned together with the map.
 
     Attributes:
         backup: The backup by which agents value states, a name in `sidestep.tabular.backups.BACKUPS`.
-        beta: The inverse temperature β, above 0, in units of one over reward.
-        lapse: The probability of a random action, at least 0 and below 1; None for no lapses.
+        beta: The inverse temperature β, above 0, in units of one over reward; None for the default (`MapConfig.agents`).
+        lapse: The probability of a random action, at least 0 and below 1; None for the default.
         learn: What is learned together with the map: any of "beta", "lapse", "discount".
         tempering: κ in (0, 1], the weight of the actions' log-likelihood; below 1 where actions are not independent.
         horizon: The number of actions that agents look ahead; None for no limit.
@@ -52,7 +74,7 @@ class BehaviorConfig:
     """
 
     backup: BackupName = "boltzmann"
-    beta: float = 7.0
+    beta: float | None = None
     lapse: float | None = None
     learn: tuple[str, ...] = ()
     tempering: float = 1.0
@@ -194,8 +216,8 @@ class MapConfig:
 
     Example:
         >>> config = MapConfig(reward=Reward(discount=1.0, step_cost=1.0), behavior=BehaviorConfig(beta=0.5))
-        >>> config.prior.kind
-        'binary'
+        >>> config.prior.kind, config.agents.lapse, MapConfig().agents.lapse
+        ('binary', None, 0.05)
 
     Raises:
         InputError: For a method that does not go with the prior, and for a threshold below 0 or not finite.
@@ -216,6 +238,17 @@ class MapConfig:
         expected = "mode" if kind == "normal" else "sample or mean_field"
         fits = method is None or (method == "mode") == (kind == "normal")
         check(fits, f"the {kind} prior has {expected}, found {method}", field="posterior")
+
+    @property
+    def agents(self) -> Agents:
+        """Return β and the lapse with their defaults.
+
+        With the binary prior these are `PEOPLE` if neither of them is set, and nothing is learned of the behavior.
+        Otherwise `PLAIN` has what is not set.
+        """
+        given = {name: value for name in Agents._fields if (value := getattr(self.behavior, name)) is not None}
+        for_people = self.prior.kind == "binary" and not given and not self.behavior.learn
+        return PEOPLE if for_people else PLAIN._replace(**given)
 
 
 @dataclass(frozen=True)

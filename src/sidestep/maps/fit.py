@@ -30,7 +30,6 @@ from sidestep.io.gridding import Moves
 from sidestep.maps.config import (
     MAX_SAMPLED,
     SHAPE_WEIGHTS,
-    BehaviorConfig,
     FitConfig,
     MapConfig,
     PosteriorMethod,
@@ -73,7 +72,7 @@ def demonstrations_of(moves: Moves, grid: Grid, config: MapConfig) -> Demonstrat
     return demonstrations_from_moves(moves, grid, discount=config.reward.discount, step_cost=config.reward.step_cost)
 
 
-def behavior_of(config: BehaviorConfig) -> Behavior:
+def behavior_of(config: MapConfig) -> Behavior:
     """Return the behavior that a configuration describes.
 
     Args:
@@ -82,7 +81,7 @@ def behavior_of(config: BehaviorConfig) -> Behavior:
     Raises:
         InputError: For a β or lapse out of range.
     """
-    return Behavior(BACKUPS[config.backup](), config.beta, config.lapse)
+    return Behavior(BACKUPS[config.behavior.backup](), config.agents.beta, config.agents.lapse)
 
 
 def behavior_model_of(config: MapConfig, person: Int[np.ndarray, " tasks"] | None = None) -> BehaviorModel:
@@ -94,7 +93,7 @@ def behavior_model_of(config: MapConfig, person: Int[np.ndarray, " tasks"] | Non
     """
     learn = config.behavior.learn
     discount = config.reward.discount if "discount" in learn else None
-    return behavior_model(behavior_of(config.behavior), learn, discount=discount, person=person)
+    return behavior_model(behavior_of(config), learn, discount=discount, person=person)
 
 
 def posterior_method(config: MapConfig, unknown: int, goals: int) -> PosteriorMethod:

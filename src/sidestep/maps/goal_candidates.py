@@ -164,7 +164,7 @@ def fit_with_unknown_goals(
         first = current is model
         return fit_map(current, demonstrations, config, sensor=sensor, initialize=first, callback=callback)
 
-    result = fit_goals(model, moves.trajectories(), tasks, behavior_of(config.behavior), learn)
+    result = fit_goals(model, moves.trajectories(), tasks, behavior_of(config), learn)
     goals = moves.goals.copy()
     goals[walks] = states[result.posterior.argmax(axis=1)]
     return GoalPosterior(result, walks, states, replace(moves, goals=goals), [labels[walk] for walk in walks.tolist()])

@@ -158,6 +158,7 @@ def learn_map(
     started = time.monotonic()
     config = config or MapConfig()
     annotations.check(config.behavior, resume)
+    config = _completed(config, annotations)
     walks = annotations.without_goals(sample_walks(walks, config))
     moves = grid_walks(walks, grid)
     resumed = resume and checkpoint is not None and Path(checkpoint).exists()
@@ -173,8 +174,6 @@ def learn_map(
         if annotations.person_column is not None:
             names, person_of_walk = persons_of(walks, moves, annotations.person_column)
             demonstrations, person = split_by_person(demonstrations, person_of_walk)
-            learn = tuple(dict.fromkeys((*config.behavior.learn, "beta")))
-            config = replace(config, behavior=replace(config.behavior, learn=learn))
         behavior = behavior_model_of(config, person)
         run: dict[str, Any] = {"callback": callback, "checkpoint": checkpoint, "resume": resume}
         fit = infer_map(model, demonstrations, config, sensor=sensor, behavior=behavior, **run)
@@ -247,6 +246,15 @@ def _counts(grid: Grid, moves: Moves, demonstrations: Demonstrations, sensor: Se
     )
 
 
+def _completed(config: MapConfig, annotations: WalkAnnotations) -> MapConfig:
+    """Return the configuration with the numbers of its agents; the β of persons is learned."""
+    behavior = config.behavior
+    if annotations.person_column is not None:
+        behavior = replace(behavior, learn=tuple(dict.fromkeys((*behavior.learn, "beta"))))
+    config = replace(config, behavior=behavior)
+    return replace(config, behavior=replace(behavior, **config.agents._asdict()))
+
+
 def _notes(grid: Grid, demonstrations: Demonstrations, config: MapConfig, nothing_to_resume: bool) -> tuple[str, ...]:
     """Return what one should know before one trusts the numbers."""
     notes = ["there was no checkpoint to resume from, so the fit started anew"] if nothing_to_resume else []
@@ -257,7 +265,7 @@ def _notes(grid: Grid, demonstrations: Demonstrations, config: MapConfig, nothin
         )
     moves = int(np.median(np.bincount(np.asarray(demonstrations.trajectory))))
     discount = config.reward.discount
-    preference = config.behavior.beta * (1 - discount**2) * discount**moves
+    preference = config.agents.beta * (1 - discount**2) * discount**moves
     if config.reward.step_cost is None and preference < _NEGLIGIBLE_PREFERENCE:
         notes.append(
             f"half of the walks have {moves} moves or more; so far from the goal a step towards it and one away "
