@@ -12,7 +12,8 @@ map; then the robot arrives without a bump.
 The reliability error of P(open) is the expected calibration error of `sidestep.evaluation.reliability`, over the plans
 of all offices together. The standard error of the fraction of open paths is that over offices, as plans in the same
 office are not independent. Plans of which P(open) is too low for `--max-risk` come with a warning; they are counted on
-their own. Chains that have not mixed are counted too; `learn` warns of these.
+their own. Plans are *not sure* where P(open) is below 1, as they need cells that no walk passed. Chains that have not
+mixed are counted too; `learn` warns of these.
 
 Constants of planning were chosen with the seeds 100 to 199, so none of these are judged here.
 
@@ -135,6 +136,7 @@ def kinds(records: Sequence[Record]) -> Mapping[str, list[Record]]:
         if bound is not None:
             named[f"{name}, met"] = [record for record in own if record["met"]]
             named[f"{name}, warned"] = [record for record in own if not record["met"]]
+        named[f"{name}, not sure"] = [record for record in own if record["open_probability"] < 1]
         named[f"{name}, walked ends"] = [record for record in own if record["walked"]]
         named[f"{name}, other ends"] = [record for record in own if not record["walked"]]
         named[f"{name}, mixed"] = [record for record in own if record["mixed"]]
