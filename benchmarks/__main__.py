@@ -27,6 +27,7 @@ BENCHMARKS = {
     "people": "walls learned from real walks in the twelve Tartarus mazes",
     "baselines": "all methods of `sidestep compare`: walls, held-out actions, robots with new goals",
     "domains": "simulated offices, apartments and blocks, all of them learned: how well, and how well calibrated",
+    "risk": "whether plans with risk mean what they say: P(path is open) beside true offices",
     "shapes": "the shape of maps: weights of a binary Markov random field, fitted to true maps",
     "towns": "one-way streets from taxi trips in Shanghai, buildings from drives in MAGELLAN's towns",
 }

@@ -17,8 +17,8 @@ from sidestep.io.maps import read_map
 from sidestep.io.walks import read_walks, write_walks
 from sidestep.maps.config import BehaviorConfig, FitConfig, MapConfig, PriorConfig
 from sidestep.maps.learn import learn_map, sample_walks
-from sidestep.maps.learned_map import load_map
-from sidestep.tabular.grid import Cell
+from sidestep.maps.learned_map import LearnedMap, load_map
+from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.reward import Reward
 
 pytestmark = pytest.mark.slow
@@ -165,6 +165,24 @@ def test_plan_writes_a_legal_path(office, learned, capsys):
     with Image.open(learned / "plan" / "path.png") as picture:
         assert min(picture.size) > 100
     assert "12 moves, 6 m" in capsys.readouterr().out
+
+
+def test_plan_warns_of_a_doubtful_goal_and_of_a_risk_that_no_path_has(tmp_path, capsys):
+    """The second cell is blocked in a tenth of the maps, the goal in half; walks passed the first and the third."""
+    samples = np.zeros((200, 1, 4), dtype=bool)
+    samples[:20, 0, 1], samples[::2, 0, 3] = True, True
+    blocked = np.array([[0.01, 0.1, 0.01, 0.5]])
+    LearnedMap(Grid.unknown(1, 4), blocked, np.array([[0, 2], [2, 2]]), Reward(), samples=samples).save(tmp_path)
+    plan = ("plan", tmp_path, "--start", "0.5,0.5", "--goal")
+    assert call(*plan, "3.5,0.5", "--max-risk", 0.05) == 0
+    printed = capsys.readouterr()
+    assert "open with probability 0.896 in maps from the posterior, given that start and goal are free" in printed.out
+    assert "note: the goal itself is blocked with probability 0.500" in printed.err
+    assert "warning: no path has a risk of at most 0.05; this one has the least, 0.1" in printed.err
+    result = summary(tmp_path / "plan")
+    assert (result["goal_probability_blocked"], result["open_probability"]) == (0.5, pytest.approx(90.5 / 101))
+    assert call(*plan, "2.5,0.5", "--max-risk", 0.15) == 0
+    assert capsys.readouterr().err == ""
 
 
 def test_plan_from_a_cell_to_itself_has_no_moves(learned, tmp_path):

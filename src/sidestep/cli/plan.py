@@ -7,6 +7,9 @@ import typer
 
 from sidestep.cli.options import BUMP_COST, BumpCost, LearnedFolder, position_of
 
+_DOUBTFUL = 0.05
+"""The P(blocked) of a goal above which a note says that it may not be free, where no risk is named."""
+
 
 def plan(
     folder: LearnedFolder,
@@ -47,6 +50,7 @@ def plan(
     risk = {
         "max_probability_blocked": likeliest,
         "open_probability": path.open_probability,
+        "goal_probability_blocked": path.goal_blocked,
         "expected_length_metres": path.expected_length,
         "alternatives": alternatives,
     }
@@ -55,11 +59,16 @@ def plan(
     picture.result()
     print_lines(f"{moves} moves, {path.length:g} m; the likeliest obstacle on the way has P(blocked) = {likeliest:.3f}")
     joint = "in maps from the posterior" if learned.samples is not None else "if cells were independent"
-    print_lines(f"open with probability {path.open_probability:.3f} {joint}")
+    print_lines(f"open with probability {path.open_probability:.3f} {joint}, given that start and goal are free")
     if path.expected_length is not None:
         print_lines(f"expected length with bumps and detours: {path.expected_length:.4g} m")
     for other in path.alternatives:
         print_lines(f"alternative: {other.length:g} m, open with probability {other.open_probability:.3f}")
-    if max_risk is not None and 1 - path.open_probability > max_risk:
-        print_notes(f"warning: no path has a risk of at most {max_risk:g}; this one has the least")
+    if path.goal_blocked > (_DOUBTFUL if max_risk is None else max_risk):
+        print_notes(
+            f"note: the goal itself is blocked with probability {path.goal_blocked:.3f}; this is not counted above"
+        )
+    if max_risk is not None and not path.within(max_risk):
+        risk = 1 - path.open_probability
+        print_notes(f"warning: no path has a risk of at most {max_risk:g}; this one has the least, {risk:.2g}")
     print_lines(f"path in {out}")

@@ -50,8 +50,10 @@ class PlannedPath:
         positions: x, y of their centers in metres.
         blocked: P(blocked) of each.
         length: The length of the path in metres.
-        open_probability: The probability that the path is open: over maps from the posterior, or where there are none
-            the product over its cells, as if they were independent.
+        open_probability: The probability that the path is open given that its start and goal are free: over maps from
+            the posterior, or where there are none the product over its cells, as if they were independent. It is 1 for
+            a path along cells that walks passed or the map knew.
+        goal_blocked: P(blocked) of the goal, which the risk of the path does not contain; 0 where walks passed it.
         expected_length: The mean length in metres that the robot executes in maps from the posterior, with bumps and
             detours; None where there are none, or where it arrives in none.
         alternatives: Other paths, the shortest first, where a risk was named.
@@ -62,8 +64,17 @@ class PlannedPath:
     blocked: Float[np.ndarray, " steps"]
     length: float
     open_probability: float
+    goal_blocked: float
     expected_length: float | None
     alternatives: tuple["PlannedPath", ...] = ()
+
+    def within(self, max_risk: float) -> bool:
+        """Return whether the path is open with a probability of at least 1 − `max_risk`.
+
+        Args:
+            max_risk: The largest probability that the path is not open.
+        """
+        return self.open_probability >= 1 - max_risk
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,13 +148,15 @@ class LearnedMap:
         """Plan a path as a robot does, or the shortest path with a bounded risk.
 
         With `max_risk`, paths are planned at several bump costs. The shortest of those that are open with a probability
-        of 1 − `max_risk` or more is chosen, or where there is none the one that is most probably open.
+        of 1 − `max_risk` or more is chosen, or where there is none the one that is most probably open
+        (`PlannedPath.within` tells). A risk of 0 allows only cells that walks passed or the map knew.
 
         Args:
             start: x, y in metres.
             goal: x, y in metres.
             bump_cost: As for `robot`.
-            max_risk: The largest probability that the path is not open, from 0 to 1; None for the robot's own path.
+            max_risk: The largest probability that the path is not open though its start and goal are free, from 0 to 1;
+                None for the robot's own path.
 
         Returns:
             The states, positions and P(blocked) along the path, its length in metres, and its risk.
@@ -165,23 +178,28 @@ class LearnedMap:
         paths = sorted((self._planned(*each) for each in plans.values()), key=lambda path: path.length)
         if max_risk is None:
             return paths[0]
-        sure = [path for path in paths if 1 - path.open_probability <= max_risk]
+        sure = [path for path in paths if path.within(max_risk)]
         chosen = sure[0] if sure else max(paths, key=lambda path: path.open_probability)
         return replace(chosen, alternatives=tuple(path for path in paths if path is not chosen))
+
+    @cached_property
+    def _passed(self) -> Grid:
+        """The grid in which the cells that walks passed are known to be free, as the robot knows them."""
+        return replace(self.grid, known=np.asarray(self.robot().model.known).reshape(self.grid.shape))
 
     def _planned(self, plan: GoalPlan, states: Int[np.ndarray, " steps"]) -> PlannedPath:
         """Return a robot's path with its length and risk."""
         positions = self.grid.centers(states)
         length = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+        blocked = np.where(self._passed.known == Cell.FREE, 0.0, self.blocked)
         if self.samples is None:
-            blocked = self.blocked.copy()
-            blocked.reshape(-1)[self.visited[:, 0]] = 0.0
-            risk = independent_open_probability(self.grid, states, blocked), None
+            chance, metres = independent_open_probability(self.grid, states, blocked), None
         else:
             expected = expected_length(self.grid, plan, states, self.samples)
             metres = None if expected is None else expected * self.grid.resolution
-            risk = open_probability(self.grid, states, self.samples), metres
-        return PlannedPath(states, positions, self.blocked.reshape(-1)[states], length, *risk)
+            chance = open_probability(self._passed, states, self.samples)
+        known, goal_blocked = self.blocked.reshape(-1)[states], float(blocked.reshape(-1)[states[-1]])
+        return PlannedPath(states, positions, known, length, chance, goal_blocked, metres)
 
     def evaluate(
         self,

@@ -1,4 +1,4 @@
-"""Reliability diagrams: the fraction of obstacles among cells against their P(blocked).
+"""Reliability diagrams: the fraction of obstacles among cells against their P(blocked), or of other events.
 
 The interval of a bin is Wilson's, at 95 %, which takes cells for independent. Neighboring cells of one map are not, so
 the true uncertainty is larger.
@@ -31,11 +31,20 @@ _LEAST_CELLS = 0.5
 """Where the logarithmic scale of numbers of cells begins."""
 
 
-def figure_reliability(diagrams: Mapping[str, Reliability]) -> Figure:
+def figure_reliability(
+    diagrams: Mapping[str, Reliability],
+    *,
+    probability: str = "P(blocked)",
+    event: str = "obstacles",
+    unit: str = "cells",
+) -> Figure:
     """Return a figure with a reliability diagram for each name, side by side, the number of cells below.
 
     Args:
         diagrams: The cells of each diagram by title.
+        probability: The name of the probability.
+        event: What has this probability, in the plural.
+        unit: What is counted, in the plural.
     """
     # places in inches: a constrained layout takes longer than the drawing itself
     width, across = _LEFT + _PANEL * len(diagrams) + _GAP * (len(diagrams) - 1) + _GAP, _GAP / _PANEL
@@ -46,10 +55,10 @@ def figure_reliability(diagrams: Mapping[str, Reliability]) -> Figure:
     for fractions, numbers, (title, bins) in zip(upper, lower, diagrams.items(), strict=True):
         error = bins.calibration_error
         fractions.set_title(title if error is None else f"{title}\ncalibration error {error:.3f}", fontsize=10)
-        draw_reliability(fractions, bins)
-        draw_cell_numbers(numbers, bins)
-    upper[0].set_ylabel("fraction of obstacles")
-    lower[0].set_ylabel("cells (log)")
+        draw_reliability(fractions, bins, unit)
+        draw_cell_numbers(numbers, bins, probability)
+    upper[0].set_ylabel(f"fraction of {event}")
+    lower[0].set_ylabel(f"{unit} (log)")
     # numbers stand above the bars
     lower[0].set_ylim(_LEAST_CELLS, 5 * max(1, *(bins.cells.max() for bins in diagrams.values())))
     handles, labels = upper[0].get_legend_handles_labels()
@@ -57,29 +66,31 @@ def figure_reliability(diagrams: Mapping[str, Reliability]) -> Figure:
     return figure
 
 
-def draw_reliability(axes: Axes, bins: Reliability) -> None:
+def draw_reliability(axes: Axes, bins: Reliability, unit: str = "cells") -> None:
     """Draw the fraction of obstacles of each bin with its interval, beside the diagonal of perfect calibration.
 
     Args:
         axes: Where to draw.
         bins: The cells.
+        unit: What is counted, in the plural.
     """
     axes.plot([0, 1], [0, 1], "--", color="0.55", linewidth=1.0, label="calibrated")
     filled = bins.cells > 0
     x, y = bins.mean_prediction[filled], bins.obstacle_fraction[filled]
     low, high = wilson_intervals(bins.obstacles[filled], bins.cells[filled])
     style = {"color": palette.BLUE, "markersize": 5, "linewidth": 1.2, "capsize": 2.5, "elinewidth": 0.9}
-    axes.errorbar(x, y, (y - low, high - y), fmt="-o", label="cells, 95 % interval", **style)
+    axes.errorbar(x, y, (y - low, high - y), fmt="-o", label=f"{unit}, 95 % interval", **style)
     axes.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
     axes.grid(color="0.92")
 
 
-def draw_cell_numbers(axes: Axes, bins: Reliability) -> None:
+def draw_cell_numbers(axes: Axes, bins: Reliability, probability: str = "P(blocked)") -> None:
     """Draw how many cells each bin has: a bar on a logarithmic scale, and the number.
 
     Args:
         axes: Where to draw.
         bins: The cells.
+        probability: The name of the probability.
     """
     edges = np.linspace(0, 1, BINS + 1)
     axes.stairs(bins.cells, edges, baseline=_LEAST_CELLS, fill=True, color="0.8")
@@ -87,7 +98,7 @@ def draw_cell_numbers(axes: Axes, bins: Reliability) -> None:
     for left, count in zip(edges, bins.cells, strict=False):
         height = max(count, _LEAST_CELLS)
         axes.text(left + 0.5 / BINS, 1.3 * height, str(count), ha="center", va="bottom", fontsize=6.5)
-    axes.set(yscale="log", xlabel="P(blocked)")
+    axes.set(yscale="log", xlabel=probability)
     axes.yaxis.set(major_locator=NullLocator(), minor_locator=NullLocator())
 
 
