@@ -308,15 +308,15 @@ def test_sampled_model_has_logits_of_its_probabilities():
 
 
 def test_agents_are_people_unless_something_of_them_is_set_or_learned():
-    assert MapConfig().agents == PEOPLE
-    assert MapConfig(behavior=BehaviorConfig(tempering=0.5)).agents == PEOPLE
-    assert MapConfig(behavior=BehaviorConfig(beta=3.0)).agents == (3.0, PLAIN.lapse)
-    assert MapConfig(behavior=BehaviorConfig(lapse=0.2)).agents == (PLAIN.beta, 0.2)
+    assert MapConfig().agents == MapConfig(behavior=BehaviorConfig("logsumexp")).agents == PEOPLE
+    assert MapConfig(behavior=BehaviorConfig(beta=3.0)).agents == PLAIN._replace(beta=3.0)
+    assert MapConfig(behavior=BehaviorConfig(lapse=0.2)).agents == PLAIN._replace(lapse=0.2)
+    assert MapConfig(behavior=BehaviorConfig(tempering=0.7)).agents == PLAIN._replace(tempering=0.7)
     assert MapConfig(behavior=BehaviorConfig(learn=("discount",))).agents == PLAIN
     assert MapConfig(prior=PriorConfig("normal")).agents == PLAIN
 
 
-def test_agents_of_a_configuration_with_their_numbers_are_the_same():
+def test_completed_has_the_same_agents():
     for config in (MapConfig(), MapConfig(prior=PriorConfig("normal"))):
-        numbers = replace(config.behavior, **config.agents._asdict())
-        assert replace(config, behavior=numbers).agents == config.agents
+        assert config.completed().agents == config.agents
+    assert replace(MapConfig().completed(), prior=PriorConfig("normal")).agents == PEOPLE

@@ -86,13 +86,13 @@ class ModelResult(NamedTuple):
 
 
 def with_normal_prior(config: MapConfig) -> MapConfig:
-    """Return a configuration of a baseline: the mode of the posterior after a normal prior of logits.
+    """Return a configuration of a baseline: the mode of the posterior after a normal prior of logits, the same agents.
 
     Args:
         config: The configuration of the comparison.
     """
     prior = config.prior if config.prior.kind == "normal" else PriorConfig("normal")
-    return replace(config, prior=prior, posterior=replace(config.posterior, method="mode"))
+    return replace(config.completed(), prior=prior, posterior=replace(config.posterior, method="mode"))
 
 
 def model_result(

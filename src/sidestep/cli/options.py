@@ -52,7 +52,7 @@ class LearnOptions:
         float | None,
         Option(
             help=f"The inverse temperature β, in units of one over reward; by default {PEOPLE.beta:g}, and {PLAIN.beta:g} "
-            "with --lapse, --learn or the normal prior."
+            "with --lapse, --tempering, --learn or the normal prior."
         ),
     ] = BehaviorConfig.beta
     lapse: Annotated[
@@ -71,7 +71,11 @@ class LearnOptions:
         Option(help="A table of goal_x, goal_y that walks without goals may have had.", metavar="GOALS.csv"),
     ] = None
     tempering: Annotated[
-        float, Option(help="The weight of the actions, above 0 and at most 1; below 1 if they are dependent.")
+        float | None,
+        Option(
+            help="The weight of the actions, above 0 and at most 1, below 1 if they are dependent; by default "
+            f"{PEOPLE.tempering:g} if β is {PEOPLE.beta:g} by default, otherwise 1."
+        ),
     ] = BehaviorConfig.tempering
     horizon: Annotated[int | None, Option(help="How many actions agents look ahead, if limited.")] = (
         BehaviorConfig.horizon

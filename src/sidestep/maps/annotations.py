@@ -47,7 +47,7 @@ class WalkAnnotations:
             "person_column": self.person_column is not None,
             "resume": resume,
             "learn": bool(config.learn),
-            "tempering": config.tempering != 1,
+            "tempering": config.tempering not in (None, 1),
             "horizon": config.horizon is not None,
         }
         for field, is_set in refused.items():

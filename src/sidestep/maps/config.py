@@ -4,7 +4,7 @@
 line can show the defaults without delay.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import isfinite
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -32,11 +32,12 @@ MAX_SAMPLED = 60_000
 
 
 class Agents(NamedTuple):
-    """How random the actions of agents are.
+    """How random the actions of agents are, and how much they count.
 
     Attributes:
         beta: The inverse temperature β, above 0.
         lapse: The probability of a random action; None for no lapses.
+        tempering: κ in (0, 1], the weight of the actions' log-likelihood.
 
     Example:
         >>> PLAIN.beta
@@ -45,11 +46,12 @@ class Agents(NamedTuple):
 
     beta: float
     lapse: float | None
+    tempering: float
 
 
-PEOPLE = Agents(28.0, 0.05)
-"""Agents that are near optimal, with lapses."""
-PLAIN = Agents(7.0, None)
+PEOPLE = Agents(28.0, 0.05, 0.5)
+"""Agents that are near optimal, with lapses. The actions of a walk depend on each other, so they count half."""
+PLAIN = Agents(7.0, None, 1.0)
 """Agents that are softly random at every step."""
 
 
@@ -62,7 +64,8 @@ class BehaviorConfig:
         beta: The inverse temperature β, above 0, in units of one over reward; None for the default (`MapConfig.agents`).
         lapse: The probability of a random action, at least 0 and below 1; None for the default.
         learn: What is learned together with the map: any of "beta", "lapse", "discount".
-        tempering: κ in (0, 1], the weight of the actions' log-likelihood; below 1 where actions are not independent.
+        tempering: κ in (0, 1], the weight of the actions' log-likelihood, below 1 where actions are not independent;
+            None for the default.
         horizon: The number of actions that agents look ahead; None for no limit.
 
     Raises:
@@ -77,7 +80,7 @@ class BehaviorConfig:
     beta: float | None = None
     lapse: float | None = None
     learn: tuple[str, ...] = ()
-    tempering: float = 1.0
+    tempering: float | None = None
     horizon: int | None = None
 
     def __post_init__(self) -> None:
@@ -241,14 +244,18 @@ class MapConfig:
 
     @property
     def agents(self) -> Agents:
-        """Return β and the lapse with their defaults.
+        """Return β, the lapse and κ with their defaults.
 
-        With the binary prior these are `PEOPLE` if neither of them is set, and nothing is learned of the behavior.
+        With the binary prior these are `PEOPLE` if none of the three is set, and nothing is learned of the behavior.
         Otherwise `PLAIN` has what is not set.
         """
         given = {name: value for name in Agents._fields if (value := getattr(self.behavior, name)) is not None}
         for_people = self.prior.kind == "binary" and not given and not self.behavior.learn
         return PEOPLE if for_people else PLAIN._replace(**given)
+
+    def completed(self) -> "MapConfig":
+        """Return the configuration with the numbers of its agents in place of defaults."""
+        return replace(self, behavior=replace(self.behavior, **self.agents._asdict()))
 
 
 @dataclass(frozen=True)

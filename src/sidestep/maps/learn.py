@@ -247,12 +247,16 @@ def _counts(grid: Grid, moves: Moves, demonstrations: Demonstrations, sensor: Se
 
 
 def _completed(config: MapConfig, annotations: WalkAnnotations) -> MapConfig:
-    """Return the configuration with the numbers of its agents; the β of persons is learned."""
+    """Return the configuration with the numbers of its agents.
+
+    The β of persons is learned. The actions of walks with unknown goals count in full.
+    """
     behavior = config.behavior
+    if annotations.goal_candidates is not None:
+        behavior = replace(behavior, tempering=1.0)
     if annotations.person_column is not None:
         behavior = replace(behavior, learn=tuple(dict.fromkeys((*behavior.learn, "beta"))))
-    config = replace(config, behavior=behavior)
-    return replace(config, behavior=replace(behavior, **config.agents._asdict()))
+    return replace(config, behavior=behavior).completed()
 
 
 def _notes(grid: Grid, demonstrations: Demonstrations, config: MapConfig, nothing_to_resume: bool) -> tuple[str, ...]:
