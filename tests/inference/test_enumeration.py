@@ -5,16 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.barrier_worlds import RIGHT, all_maps, corridor, world
+from helpers.barrier_worlds import COSTLY, RIGHT, all_maps, corridor, world
 from helpers.problems import dense_obstacles, plain_policy, plain_values
-from sidestep.errors import InputError
+from sidestep.errors import InputError, NotConverged
 from sidestep.inference.chains import PASSING
 from sidestep.inference.enumeration import ExactPosterior, enumerate_barriers
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.grid import Grid
-from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.models import ObstacleGrid, walled_grid
 from sidestep.tabular.tasks import reach
 
 BETA, DISCOUNT, LAPSE = 5.0, 0.9, 0.1
@@ -79,6 +79,14 @@ def crossing(unknown: int):
 def test_enumerate_barriers_of_17_unknown_cells_raises():
     with pytest.raises(InputError, match=r"'model'.*at most 16 unknown.*found 17"):
         enumerate_barriers(*crossing(17))
+
+
+def test_enumerate_barriers_where_a_map_has_no_values_raises():
+    """At a small β the Boltzmann average has no fixed point in some maps that sweeps find."""
+    grid = Grid.unknown(2, 3)
+    shown = gather([Trajectory(np.array([0, 1]), np.array([RIGHT]), task=0)], [COSTLY.reach(grid, 1)])
+    with pytest.raises(NotConverged, match="each of 64 maps"):
+        enumerate_barriers(walled_grid(grid), shown, Behavior(BoltzmannAverage(), 2.0), BinaryMRF(np.zeros(7)))
 
 
 @pytest.mark.slow

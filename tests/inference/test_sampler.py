@@ -13,6 +13,7 @@ from helpers.barrier_worlds import (
     COSTLY,
     DISCOUNTED,
     RIGHT,
+    UP,
     BarrierWorld,
     corridor,
     room,
@@ -29,7 +30,7 @@ from sidestep.inference.sampler import BarrierPosterior, heat, heated_sweeps, sa
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax, LogSumExp
 from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.grid import Cell, Grid
-from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.models import ObstacleGrid, walled_grid
 from sidestep.tabular.models.barriers import barriers_of
 
 WORLDS = {
@@ -68,6 +69,21 @@ def test_sample_barriers_has_the_exact_probabilities(name):
     result = sampled(one, sweeps=1200)
     assert_close(result, exact)
     assert result.status is Status.MIXED
+    assert result.converged
+
+
+def test_sample_barriers_without_a_grid_exchanges_walls_that_explain_the_same_detour():
+    """Walks from corner to corner and back go around one of two walls; the prior hardly allows both."""
+    grid = Grid.unknown(2, 3)
+    there = Trajectory(np.array([0, 3, 4, 5, 2]), np.array([1, RIGHT, RIGHT, UP]), task=0)
+    back = Trajectory(np.array([2, 5, 4, 3, 0]), np.array([1, 2, 2, UP]), task=1)
+    shown = gather([there, back] * 3, [DISCOUNTED.reach(grid, goal) for goal in (2, 0)])
+    problem = walled_grid(grid), shown, Behavior(LogSumExp(), beta=30.0)
+    prior = BinaryMRF(np.full(7, -12.0))
+    exact = enumerate_barriers(*problem, prior).closed
+    assert sorted(exact)[-2:] == pytest.approx([0.5, 0.5], abs=0.01)
+    result = sample_barriers(*problem, prior=prior, sweeps=3000)
+    assert_close(result, exact)
     assert result.converged
 
 

@@ -1,26 +1,41 @@
 """The exact posterior of few barriers, by the likelihood of every map: the standard that samplers are compared with."""
 
+from functools import partial
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, Int
 
-from sidestep.errors import check
+from sidestep.errors import NotConverged, check
 from sidestep.inference.chains import PASSING, check_prior, crossed_barriers
 from sidestep.inference.hierarchical import HierarchicalMRF, as_hierarchical, evidence_normalizers
 from sidestep.inference.mrf import BinaryMRF
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Cell
-from sidestep.tabular.likelihood import ALL_TERMS, Terms, log_likelihood
+from sidestep.tabular.likelihood import (
+    ALL_TERMS,
+    Arrivals,
+    Choices,
+    Terms,
+    arrival_log_likelihood,
+    arrivals_of,
+    choice_log_likelihood,
+    choices_of,
+)
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.models.barriers import barriers_of
+from sidestep.tabular.solve import SolveOptions, default_solver
+from sidestep.tabular.tasks import Task
 
 MAX_BARRIERS = 16
 """The most unknown barriers; each doubles the number of maps."""
-_BATCH = 1024
+_BATCH = 128
+"""The number of maps that are evaluated at once."""
 
 
 class ExactPosterior(NamedTuple):
@@ -61,6 +76,7 @@ def enumerate_barriers(
 
     Raises:
         InputError: For more than 16 barriers that are unknown and that no walk crossed, and a prior of others.
+        NotConverged: Where the values of a map do not converge, as those of Boltzmann averages at a small β may not.
 
     Example:
         >>> import sidestep as ss
@@ -80,24 +96,49 @@ def enumerate_barriers(
     maps = np.zeros((2 ** len(free), len(barriers.known)), dtype=np.int64)
     maps[:, free] = np.arange(len(maps))[:, None] >> np.arange(len(free)) & 1
     maps[:, barriers.known == Cell.OCCUPIED] = 1
-    log_odds = np.log(PASSING[0]) - np.log(PASSING[1])
-    weights = np.array([tempering, 1.0])
-
-    @jax.jit
-    def log_likelihoods(batch: jax.Array) -> jax.Array:
-        def one(closed: jax.Array) -> jax.Array:
-            parameters = model.parameters.at[: len(closed)].set(log_odds * (2.0 * closed - 1))
-            parts = log_likelihood(model.with_parameters(parameters), demonstrations, behavior, terms=terms)
-            return jnp.stack([parts.actions, parts.transitions])
-
-        return jax.vmap(one)(batch)
-
-    parts = [log_likelihoods(jnp.asarray(maps[at : at + _BATCH])) for at in range(0, len(maps), _BATCH)]
+    choices = choices_of(demonstrations) if "actions" in terms else None
+    arrivals = arrivals_of(demonstrations) if "transitions" in terms else None
+    evidence = demonstrations.tasks, choices, arrivals, behavior
+    # whole batches, so that one compiled function serves any number of maps
+    batches = np.resize(maps, (-(-len(maps) // _BATCH), _BATCH, maps.shape[1]))
+    parts = np.concatenate([_log_likelihoods(model, to_jax(batch), *evidence) for batch in batches])[: len(maps)]
+    if np.isnan(parts).any():
+        missing = int(np.isnan(parts).any(axis=1).sum())
+        raise NotConverged(f"expected values in each of {len(maps)} maps; in {missing} of them they did not converge")
     hierarchical = as_hierarchical(prior)
     log_normalizers = evidence_normalizers(hierarchical, barriers.known, free, seed)
     densities = hierarchical.log_densities(maps) - log_normalizers
     log_priors = np.logaddexp.reduce(densities.reshape(len(maps), -1), axis=1)
-    log_posterior = np.concatenate(parts) @ weights + log_priors
+    log_posterior = parts @ np.array([tempering, 1.0]) + log_priors
     log_evidence = np.logaddexp.reduce(log_posterior)
     closed = np.minimum(np.exp(log_posterior - log_evidence) @ maps, 1.0)  # sums of rounded numbers
     return ExactPosterior(np.where(maps.all(axis=0), 1.0, closed), float(log_evidence))
+
+
+@eqx.filter_jit
+def _log_likelihoods(
+    model: TransitionModel,
+    maps: Int[Array, "maps barriers"],
+    tasks: Task,
+    choices: Choices | None,
+    arrivals: Arrivals | None,
+    behavior: Behavior,
+) -> Float[Array, "maps 2"]:
+    """Return the log-likelihoods of actions and transitions in each map; 0 for what does not count."""
+    dtype, states = jax.eval_shape(model.probabilities).dtype, model.graph.states
+    # the solver of large problems: `Jacobi` sweeps over all maps until the slowest one has converged
+    solver = default_solver(behavior.backup, states * len(maps))
+    start, options = solver.cold_start(states, dtype), SolveOptions(solver=solver)
+    log_odds = np.log(PASSING[0]) - np.log(PASSING[1])
+
+    def of_map(closed: Array) -> Array:
+        parameters = model.parameters.at[: len(closed)].set(log_odds * (2.0 * closed - 1))
+        actions, transitions, world = jnp.zeros((), dtype), jnp.zeros((), dtype), model.with_parameters(parameters)
+        if choices is not None:
+            of_task = partial(choice_log_likelihood, world, behavior=behavior, start=start, options=options)
+            actions = jax.vmap(of_task)(tasks, choices)[0].sum()
+        if arrivals is not None:
+            transitions = arrival_log_likelihood(world, arrivals)
+        return jnp.stack([actions, transitions])
+
+    return jax.vmap(of_map)(maps)

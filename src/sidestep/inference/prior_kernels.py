@@ -84,15 +84,23 @@ def flip_prior(closed, i, prior):  # pragma: no cover
 def propose(rng, free, is_free, closed, prior, kinds, changed):  # pragma: no cover
     """Fill in the barriers of a proposal; return their number, 0 where the proposal is no change.
 
-    A proposal and its reverse are equally probable. `kinds` are the cumulative probabilities of a flip and of a move.
+    A proposal and its reverse are equally probable. `kinds` are the cumulative probabilities of a flip and of a move;
+    where there is no grid, all but moves are flips.
     """
     kind = rng.random()
     i = free[int(rng.random() * len(free))]
-    if kind < kinds[0] or prior.rows == 0:
+    on_grid, moves = prior.rows > 0, kinds[0] <= kind < kinds[1]
+    if kind < kinds[0] or not (on_grid or moves):
         changed[0] = i
         return 1
+    if not on_grid:
+        j = free[int(rng.random() * len(free))]
+        if closed[i] == closed[j]:
+            return 0
+        changed[0], changed[1] = i, j
+        return 2
     row, column = i // prior.columns, i % prior.columns
-    if kind < kinds[1]:
+    if moves:
         way = int(rng.random() * 8)
         way += way >= 4
         r, c = row + way // 3 - 1, column + way % 3 - 1

@@ -9,7 +9,8 @@ barrier lets an agent pass with probability .003, an open one with .997, so that
 The chain is that of Metropolis et al. (1953), *Equation of state calculations by fast computing machines*:
 
 1. A proposal flips a barrier, exchanges a cell with one of the eight around it that is not equal, or flips a run of 2
-   to 7 equal cells of a row or column. A proposal and its reverse are equally probable.
+   to 7 equal cells of a row or column. Where there is no grid, it flips a barrier or exchanges any two that are not
+   equal. A proposal and its reverse are equally probable.
 2. It is accepted in two stages (delayed acceptance, Christen & Fox 2005): with probability min(1, p(z′)/p(z)) by the
    prior, and if so with probability min(1, L(z′)/L(z)). The likelihood is computed for what the prior accepts only.
    Detailed balance holds in each stage, so also together.
