@@ -18,7 +18,7 @@ from sidestep.io.demonstrations import demonstrations_from_walks
 from sidestep.io.maps import read_map, write_map
 from sidestep.io.walks import read_walks, write_walks
 from sidestep.maps.annotations import WalkAnnotations
-from sidestep.maps.config import PEOPLE, BehaviorConfig, FitConfig, MapConfig
+from sidestep.maps.config import NEAR_OPTIMAL, BehaviorConfig, FitConfig, MapConfig
 from sidestep.maps.learn import learn_map
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.likelihood import log_likelihood, log_policies
@@ -133,7 +133,7 @@ def test_compare_scores_held_out_walks_by_the_map_of_the_others(data, compared):
     drawn = np.random.default_rng(3).permutation(WALKS)
     learned = learn_map(grid, walks.select(np.sort(drawn[8:])))
     heldout = demonstrations_from_walks(walks.select(np.sort(drawn[:8])), grid)
-    behavior = Behavior(BoltzmannAverage(), PEOPLE.beta, PEOPLE.lapse)
+    behavior = Behavior(BoltzmannAverage(), NEAR_OPTIMAL.beta, NEAR_OPTIMAL.lapse)
     expected = log_likelihood(learned.model, heldout, behavior, terms=("actions",)).actions / len(heldout)
     assert compared["methods"]["behavior"]["heldout_log_likelihood"] == pytest.approx(float(expected), rel=1e-6)
 

@@ -53,7 +53,7 @@ def test_quantities_of_equal_maps_are_equal_and_their_likelihood_is_that_of_the_
     other = ~case.closed & (SMALL.grid.known.ravel() == ss.Cell.UNKNOWN)
     found = quantities_of(SMALL, case.walks, np.stack([case.closed, other, case.closed]))
     assert found[0].tolist() == found[2].tolist()
-    behavior = ss.Behavior(ss.BoltzmannAverage(), SMALL.behavior.beta)
+    behavior = ss.Behavior(ss.BoltzmannAverage(), SMALL.learning("sample").agents.beta)
     for closed, (_, log_likelihood, _) in zip((case.closed, other), found, strict=False):
         assert log_likelihood == float(ss.log_likelihood(world_of(SMALL, closed), case.walks, behavior).total)
 

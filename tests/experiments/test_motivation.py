@@ -22,7 +22,7 @@ GOAL = 8 * COLUMNS + 12
 def uniform_costs(form: Form, cost: float) -> ModelResult:
     """Return a model without obstacles, in which all cells cost the same."""
     reward = CostlyReward(form.config.reward.discount, form.config.reward.step_cost, costs=np.full(BLANK.size, cost))
-    free, behavior = ss.ObstacleGrid(BLANK.passable()), behavior_of(form.config.behavior)
+    free, behavior = ss.ObstacleGrid(BLANK.passable()), behavior_of(form.config)
     return ModelResult(free, reward, behavior, np.zeros(BLANK.shape), ss.risk_averse_robot(free, []), True)
 
 

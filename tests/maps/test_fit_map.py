@@ -71,7 +71,7 @@ def test_fit_map_of_actions_alone_ignores_first_cells():
     config = replace(CONFIG, fit=FitConfig("actions"))
     prior = Normal(config.prior.mean, config.prior.variance)
     model = ObstacleGrid(GRID, config.prior.mean)
-    by_actions = fit(model, walks(3, 3), behavior_of(config.behavior), prior=prior, terms=("actions",)).model.parameters
+    by_actions = fit(model, walks(3, 3), behavior_of(config), prior=prior, terms=("actions",)).model.parameters
     np.testing.assert_allclose(logits(walks(3, 3), config), by_actions, atol=1e-6)
     # with transitions, the first cell is freer than by actions
     assert logits(walks(3, 3), replace(CONFIG, fit=FitConfig("both")))[0] < float(by_actions[0]) - 1

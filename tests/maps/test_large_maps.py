@@ -73,7 +73,7 @@ def test_fit_map_of_a_large_map_starts_with_unvisited_unknown_cells_blocked(demo
     unknown = grid.known.ravel() == -1
     first = np.bincount(demonstrations.states[demonstrations.first_moves()], minlength=grid.size)
     prior = FreeCellEvidence(Normal(0.5, 4.0), jnp.asarray(np.where(unknown, first, 0.0)))
-    behavior = behavior_of(SMALL.behavior)
+    behavior = behavior_of(SMALL)
     by_transitions = fit(ObstacleGrid(grid, 0.5), demonstrations, behavior, prior=prior, terms=("transitions",)).final
     visited = np.unique([*demonstrations.states, *demonstrations.next_states])
     unvisited = np.setdiff1d(np.flatnonzero(unknown), visited)

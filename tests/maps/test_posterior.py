@@ -19,9 +19,9 @@ from sidestep.inference.sampler import BarrierPosterior
 from sidestep.maps.config import (
     LOG_ODDS,
     MAX_SAMPLED,
-    PEOPLE,
-    PLAIN,
+    NEAR_OPTIMAL,
     SHAPE_WEIGHTS,
+    SOFT,
     BehaviorConfig,
     FitConfig,
     MapConfig,
@@ -307,16 +307,16 @@ def test_sampled_model_has_logits_of_its_probabilities():
     np.testing.assert_allclose(jax.nn.sigmoid(jnp.asarray(result.model.parameters)), result.closed, atol=1e-6)
 
 
-def test_agents_are_people_unless_something_of_them_is_set_or_learned():
-    assert MapConfig().agents == MapConfig(behavior=BehaviorConfig("logsumexp")).agents == PEOPLE
-    assert MapConfig(behavior=BehaviorConfig(beta=3.0)).agents == PLAIN._replace(beta=3.0)
-    assert MapConfig(behavior=BehaviorConfig(lapse=0.2)).agents == PLAIN._replace(lapse=0.2)
-    assert MapConfig(behavior=BehaviorConfig(tempering=0.7)).agents == PLAIN._replace(tempering=0.7)
-    assert MapConfig(behavior=BehaviorConfig(learn=("discount",))).agents == PLAIN
-    assert MapConfig(prior=PriorConfig("normal")).agents == PLAIN
+def test_agents_are_near_optimal_unless_something_of_them_is_set_or_learned():
+    assert MapConfig().agents == MapConfig(behavior=BehaviorConfig("logsumexp")).agents == NEAR_OPTIMAL
+    assert MapConfig(behavior=BehaviorConfig(beta=3.0)).agents == SOFT._replace(beta=3.0)
+    assert MapConfig(behavior=BehaviorConfig(lapse=0.2)).agents == SOFT._replace(lapse=0.2)
+    assert MapConfig(behavior=BehaviorConfig(tempering=0.7)).agents == SOFT._replace(tempering=0.7)
+    assert MapConfig(behavior=BehaviorConfig(learn=("discount",))).agents == SOFT
+    assert MapConfig(prior=PriorConfig("normal")).agents == SOFT
 
 
 def test_completed_has_the_same_agents():
     for config in (MapConfig(), MapConfig(prior=PriorConfig("normal"))):
         assert config.completed().agents == config.agents
-    assert replace(MapConfig().completed(), prior=PriorConfig("normal")).agents == PEOPLE
+    assert replace(MapConfig().completed(), prior=PriorConfig("normal")).agents == NEAR_OPTIMAL

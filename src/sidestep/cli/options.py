@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast, get_ty
 from typer import Argument, BadParameter, Option
 
 from sidestep.maps.config import (
-    PEOPLE,
-    PLAIN,
+    NEAR_OPTIMAL,
+    SOFT,
     BackupName,
     BehaviorConfig,
     FitConfig,
@@ -51,14 +51,14 @@ class LearnOptions:
     beta: Annotated[
         float | None,
         Option(
-            help=f"The inverse temperature β, in units of one over reward; by default {PEOPLE.beta:g}, and {PLAIN.beta:g} "
-            "with --lapse, --tempering, --learn or the normal prior."
+            help=f"The inverse temperature β, in units of one over reward; by default {NEAR_OPTIMAL.beta:g}, but "
+            f"{SOFT.beta:g} with --lapse, --tempering, --learn or the normal prior."
         ),
     ] = BehaviorConfig.beta
     lapse: Annotated[
         float | None,
         Option(
-            help=f"The probability of a random action; by default {PEOPLE.lapse:g} if β is {PEOPLE.beta:g} by default, "
+            help=f"The probability of a random action; by default {NEAR_OPTIMAL.lapse:g} if β is {NEAR_OPTIMAL.beta:g} by default, "
             "otherwise none."
         ),
     ] = BehaviorConfig.lapse
@@ -74,7 +74,7 @@ class LearnOptions:
         float | None,
         Option(
             help="The weight of the actions, above 0 and at most 1, below 1 if they are dependent; by default "
-            f"{PEOPLE.tempering:g} if β is {PEOPLE.beta:g} by default, otherwise 1."
+            f"{NEAR_OPTIMAL.tempering:g} if β is {NEAR_OPTIMAL.beta:g} by default, otherwise 1."
         ),
     ] = BehaviorConfig.tempering
     horizon: Annotated[int | None, Option(help="How many actions agents look ahead, if limited.")] = (

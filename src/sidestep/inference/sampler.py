@@ -288,7 +288,8 @@ def sample_barriers(
     states = start_chains(problem, most, chains, seed)
     saver = Saver(checkpoint, fingerprint((astuple(problem), sweeps, most, chains, seed)))
     done = _load(saver, states) if resume else 0
-    free, status, total = max(1, len(problem.free)), Status.NOT_MIXED, 0
+    free = max(1, len(problem.free))
+    status, total, samples, rhat = Status.NOT_MIXED, 0, np.zeros((0, 0, 0), bool), np.zeros(0)
     for total in stages(sweeps, most):
         for number in range(done, total):
             run_sweep(problem, states, number, heat(number, sweeps))

@@ -40,7 +40,7 @@ class Agents(NamedTuple):
         tempering: κ in (0, 1], the weight of the actions' log-likelihood.
 
     Example:
-        >>> PLAIN.beta
+        >>> SOFT.beta
         7.0
     """
 
@@ -49,9 +49,9 @@ class Agents(NamedTuple):
     tempering: float
 
 
-PEOPLE = Agents(28.0, 0.05, 0.5)
-"""Agents that are near optimal, with lapses. The actions of a walk depend on each other, so they count half."""
-PLAIN = Agents(7.0, None, 1.0)
+NEAR_OPTIMAL = Agents(28.0, 0.05, 0.5)
+"""Agents that are near optimal, with lapses; the actions of a walk depend on each other, and so count half."""
+SOFT = Agents(7.0, None, 1.0)
 """Agents that are softly random at every step."""
 
 
@@ -61,7 +61,7 @@ class BehaviorConfig:
 
     Attributes:
         backup: The backup by which agents value states, a name in `sidestep.tabular.backups.BACKUPS`.
-        beta: The inverse temperature β, above 0, in units of one over reward; None for the default (`MapConfig.agents`).
+        beta: The inverse temperature β, above 0, in units of one over reward; None for a default (`agents`).
         lapse: The probability of a random action, at least 0 and below 1; None for the default.
         learn: What is learned together with the map: any of "beta", "lapse", "discount".
         tempering: κ in (0, 1], the weight of the actions' log-likelihood, below 1 where actions are not independent;
@@ -246,12 +246,12 @@ class MapConfig:
     def agents(self) -> Agents:
         """Return β, the lapse and κ with their defaults.
 
-        With the binary prior these are `PEOPLE` if none of the three is set, and nothing is learned of the behavior.
-        Otherwise `PLAIN` has what is not set.
+        With the binary prior these are `NEAR_OPTIMAL` if none of the three is set, and nothing is learned of the behavior.
+        Otherwise `SOFT` has what is not set.
         """
-        given = {name: value for name in Agents._fields if (value := getattr(self.behavior, name)) is not None}
-        for_people = self.prior.kind == "binary" and not given and not self.behavior.learn
-        return PEOPLE if for_people else PLAIN._replace(**given)
+        chosen = {name: value for name in Agents._fields if (value := getattr(self.behavior, name)) is not None}
+        near_optimal = self.prior.kind == "binary" and not chosen and not self.behavior.learn
+        return NEAR_OPTIMAL if near_optimal else SOFT._replace(**chosen)
 
     def completed(self) -> "MapConfig":
         """Return the configuration with the numbers of its agents in place of defaults."""
