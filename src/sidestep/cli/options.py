@@ -58,7 +58,7 @@ class LearnOptions:
     lapse: Annotated[
         float | None,
         Option(
-            help=f"The probability of a random action; by default {NEAR_OPTIMAL.lapse:g} if β is {NEAR_OPTIMAL.beta:g} by default, "
+            help=f"The probability of a random action; {NEAR_OPTIMAL.lapse:g} if β is {NEAR_OPTIMAL.beta:g} by default, "
             "otherwise none."
         ),
     ] = BehaviorConfig.lapse

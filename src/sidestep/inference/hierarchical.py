@@ -37,11 +37,11 @@ _LOG_ODDS = np.arange(-1.0, 1.26, 0.25)
 """The values of δ."""
 _STRENGTHS = np.arange(0.0, 1.76, 0.25)
 """The values of λ."""
-_LOG_ODDS_PRIOR, _STRENGTH_PRIOR = (0.1, 0.3), (0.75, 0.6)
+_LOG_ODDS_PRIOR, _STRENGTH_PRIOR = (-0.3, 0.3), (0.75, 0.6)
 """The means and standard deviations of δ and λ, normal and cut off at the ends of the grid."""
 _STRENGTH_COST = 2.25
 """The log-odds that a closed cell loses for each unit of strength, so that walls of any strength are equally dense."""
-_CROSSED = 45.0
+_CROSSED = 42.0
 """c, the most crossed barriers that count in full as evidence of the density."""
 _SWEEPS, _PROPOSALS, _CELLS = 40, 10_000, 2_000_000
 """The fewest sweeps at each δ and λ on the way up and down; the proposals from which more are not made, and the most

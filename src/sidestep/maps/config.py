@@ -246,8 +246,8 @@ class MapConfig:
     def agents(self) -> Agents:
         """Return β, the lapse and κ with their defaults.
 
-        With the binary prior these are `NEAR_OPTIMAL` if none of the three is set, and nothing is learned of the behavior.
-        Otherwise `SOFT` has what is not set.
+        With the binary prior these are `NEAR_OPTIMAL` if none of the three is set and nothing of the behavior is
+        learned. Otherwise `SOFT` has what is not set.
         """
         chosen = {name: value for name in Agents._fields if (value := getattr(self.behavior, name)) is not None}
         near_optimal = self.prior.kind == "binary" and not chosen and not self.behavior.learn
