@@ -58,8 +58,8 @@ class LearnOptions:
     lapse: Annotated[
         float | None,
         Option(
-            help=f"The probability of a random action; {NEAR_OPTIMAL.lapse:g} if β is {NEAR_OPTIMAL.beta:g} by default, "
-            "otherwise none."
+            help=f"The probability of a random action; {NEAR_OPTIMAL.lapse:g} where β is {NEAR_OPTIMAL.beta:g} by "
+            "default, otherwise none."
         ),
     ] = BehaviorConfig.lapse
     learn: Annotated[
@@ -73,8 +73,8 @@ class LearnOptions:
     tempering: Annotated[
         float | None,
         Option(
-            help="The weight of the actions, above 0 and at most 1, below 1 if they are dependent; by default "
-            f"{NEAR_OPTIMAL.tempering:g} if β is {NEAR_OPTIMAL.beta:g} by default, otherwise 1."
+            help="The weight of the actions, above 0 and at most 1, below 1 if they are dependent; "
+            f"{NEAR_OPTIMAL.tempering:g} where β is {NEAR_OPTIMAL.beta:g} by default, otherwise 1."
         ),
     ] = BehaviorConfig.tempering
     horizon: Annotated[int | None, Option(help="How many actions agents look ahead, if limited.")] = (
