@@ -19,9 +19,6 @@ from sidestep.inference.mrf import BinaryMRF
 from sidestep.inference.prior_chains import sample_prior
 from sidestep.tabular.grid import Cell
 
-_SAMPLES, _SWEEPS_APART = 200, 10
-"""The number of samples of the prior, and the sweeps between them."""
-
 
 def information(
     posterior: Float[np.ndarray, "*shape"], prior: Float[np.ndarray, "*shape"]
@@ -52,7 +49,9 @@ def information(
     return np.maximum(rel_entr(posterior, prior) + rel_entr(1 - posterior, 1 - prior), 0.0)
 
 
-def prior_closed(prior: BinaryMRF, known: Int[np.ndarray, " barriers"], *, seed: int = 0) -> Float[np.ndarray, " _"]:
+def prior_closed(
+    prior: BinaryMRF, known: Int[np.ndarray, " barriers"], *, count: int = 2_000, seed: int = 0
+) -> Float[np.ndarray, " _"]:
     """Return P(closed) of each barrier before demonstrations.
 
     Without shape terms it is σ(η). With them it is (n + ½)/(N + 1), where a barrier is closed in n of N samples.
@@ -60,6 +59,7 @@ def prior_closed(prior: BinaryMRF, known: Int[np.ndarray, " barriers"], *, seed:
     Args:
         prior: The prior.
         known: The `Cell` value of each barrier; known ones have 0 or 1.
+        count: The number of samples, each a sweep after the one before.
         seed: The seed of the samples.
 
     Example:
@@ -67,7 +67,7 @@ def prior_closed(prior: BinaryMRF, known: Int[np.ndarray, " barriers"], *, seed:
         [0.5, 0.0, 1.0]
     """
     if prior.weights.any():
-        samples = sample_prior(prior, known, _SAMPLES, apart=_SWEEPS_APART, seed=seed)
+        samples = sample_prior(prior, known, count, apart=1, seed=seed)
         closed = (samples.sum(axis=0) + 0.5) / (len(samples) + 1)
     else:
         closed = expit(prior.field)

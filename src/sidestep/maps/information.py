@@ -1,8 +1,8 @@
 """What walks and sensors say of each cell of a map, in nats (`sidestep.inference.cell_information`).
 
-Samples of the posterior are compared with samples of the prior at the density that was learned, so that what walks say
-of the density does not count for every cell. Cells that no walk crossed are compared given those that walks crossed:
-which these are follows from starts and goals, and only choices say what is beside them.
+Samples of the posterior are compared with samples of the prior at densities and strengths that were sampled along, so
+that what walks say of these does not count for every cell. Cells that no walk crossed are compared given those that
+walks crossed: which these are follows from starts and goals, and only choices say what is beside them.
 
 A fit has an approximation, with more than one optimum, and on large maps it ends early. So it is compared with itself
 without evidence:
@@ -33,6 +33,8 @@ from sidestep.maps.fit import MapPosterior, prior_of_fit, sampled_prior
 from sidestep.tabular.grid import Cell
 from sidestep.tabular.models import ObstacleGrid
 
+_DENSITIES, _SAMPLES = 5, 2_000
+"""The number of sampled densities and strengths at which the prior is sampled, and its samples in all."""
 _SURE_LOGIT = 6.0
 """The largest logit at which a fit without evidence begins: beyond, the gradient of a mean field vanishes."""
 _NO_GRADIENT = 1e-3
@@ -83,14 +85,21 @@ def map_information(posterior: MapPosterior, config: MapConfig) -> Float[np.ndar
 def _prior_of_samples(
     posterior: BarrierPosterior[ObstacleGrid], config: MapConfig
 ) -> Float[np.ndarray, "rows columns"]:
-    """Return P(blocked) of each cell before walks and sensors, at the posterior mean of the density and strength."""
+    """Return P(blocked) of each cell before walks and sensors, with the posterior of the density and strength."""
     known = np.asarray(posterior.model.known)
     prior = sampled_prior(config.prior, known)
     if isinstance(prior, HierarchicalMRF):
-        prior = prior.at(*posterior.densities.mean(axis=(0, 1)).tolist())
+        drawn = posterior.densities.reshape(-1, 2)
+        at = np.linspace(0, len(drawn) - 1, _DENSITIES).round().astype(int)
+        priors = [prior.at(log_odds, strength) for log_odds, strength in drawn[at].tolist()]
+    else:
+        priors = [prior]
     visited = np.where(known == Cell.OCCUPIED, Cell.OCCUPIED, Cell.FREE).ravel()
     conditions = np.where(posterior.sampled, known.ravel(), visited), known.ravel()
-    before = (prior_closed(prior, cells, seed=config.seed) for cells in conditions)
+    before = [
+        np.mean([prior_closed(each, cells, count=_SAMPLES // len(priors), seed=config.seed) for each in priors], axis=0)
+        for cells in conditions
+    ]
     return np.where(posterior.sampled, *before).reshape(known.shape)
 
 
