@@ -107,7 +107,7 @@ def test_learn_writes_a_summary(office, learned):
     assert result["seconds"] > 0
     assert result["peak_memory_bytes"] > 10_000_000
     assert result["connectivity"] == 4
-    assert result["settings"] == json.loads(json.dumps(asdict(MapConfig())))
+    assert result["settings"] == json.loads(json.dumps(asdict(MapConfig().completed())))
 
 
 def test_evaluate_adds_scores_to_the_summary(office, learned, tmp_path, capsys):

@@ -51,7 +51,7 @@ def test_import_loads_no_library_before_it_is_needed(program, arguments, expecte
 @pytest.fixture
 def folder(tmp_path):
     """A folder with a learned map."""
-    blocked, visited = np.array([[0.1, 0.9, 0.1], [0.1, 0.1, 0.1]]), np.zeros((0, 2), dtype=int)
+    blocked, visited = np.array([[0.01, 0.9, 0.01], [0.01, 0.01, 0.01]]), np.zeros((0, 2), dtype=int)
     LearnedMap(Grid.unknown(2, 3), blocked, visited, Reward()).save(tmp_path / "learned", command="learn")
     return tmp_path
 

@@ -150,7 +150,7 @@ def inferred(config: MapConfig, **settings: Any) -> Any:
 @pytest.mark.slow
 @pytest.mark.parametrize(("method", "kind"), [("sample", BarrierPosterior), ("mean_field", Fit)])
 def test_infer_map_has_the_method_of_the_configuration(method, kind):
-    result = inferred(MapConfig(posterior=PosteriorConfig(method, sweeps=15)))
+    result = inferred(MapConfig(behavior=BehaviorConfig(beta=7.0), posterior=PosteriorConfig(method, sweeps=15)))
     assert isinstance(result, kind)
     visited = room_walks().visited_state_goals()[:, 0]
     blocked = np.asarray(result.model.blocked).ravel()
@@ -172,7 +172,8 @@ def test_infer_map_sampled_with_a_horizon_raises():
 def test_infer_map_passes_settings_on_to_the_sampler():
     reports: list[Any] = []
     prior = PriorConfig(log_odds=LOG_ODDS)  # of known density, so that only the chains depend on the seed
-    config = MapConfig(prior=prior, posterior=PosteriorConfig("sample", sweeps=15, chains=3), seed=5)
+    posterior = PosteriorConfig("sample", sweeps=15, chains=3)
+    config = MapConfig(behavior=BehaviorConfig(beta=7.0), prior=prior, posterior=posterior, seed=5)
     result = inferred(config, callback=reports.append)
     assert result.samples.shape[:2] == (3, 10)
     assert len(reports) == 15
