@@ -26,9 +26,7 @@ class DemoConfig:
     rows: int = 14
     columns: int = 24
     agents: SimulationConfig = field(default_factory=lambda: SimulationConfig(walks=400, goals=12))
-    learning: ss.MapConfig = field(
-        default_factory=lambda: ss.MapConfig(ss.Reward(discount=0.97), ss.BehaviorConfig(beta=20.0))
-    )
+    learning: ss.MapConfig = field(default_factory=ss.MapConfig)
     new_places: int = 4
 
 
