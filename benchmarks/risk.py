@@ -106,7 +106,7 @@ def plans(learned: LearnedMap, truth: Grid, ends: Sequence[tuple[int, int]], max
 
 
 def scores(records: Sequence[Record]) -> Record:
-    """Return the scores of some plans; they are all None of none."""
+    """Return the scores of some plans; of none, only their number."""
     if not records:
         return {"plans": 0, "offices": 0}
     predicted = np.array([record["open_probability"] for record in records])

@@ -9,7 +9,7 @@ from sidestep.baselines import BASELINES, METHODS
 from sidestep.baselines.behavior_aware import behavior_aware, transitions_only, visit_counts
 from sidestep.baselines.behavior_cloning import behavior_cloning
 from sidestep.baselines.constraint_inference import constraint_inference
-from sidestep.baselines.interface import BaselineResult, model_result
+from sidestep.baselines.interface import BaselineResult, model_result, with_normal_prior
 from sidestep.baselines.maxent_irl import CostlyReward, joint_estimation, maxent_irl
 from sidestep.evaluation.study import mean_log_likelihood
 from sidestep.maps.config import BehaviorConfig, MapConfig, PriorConfig
@@ -222,3 +222,9 @@ def test_constraint_inference_on_a_map_with_known_outer_walls():
     known[1:-1, 1:-1] = Cell.UNKNOWN
     demos = gather([Trajectory(np.array([7, 8, 9, 10]), np.array([3, 3, 3]), 0)], [reach(Grid(known), 10)])
     assert np.isfinite(constraint_inference(Grid(known), demos, MapConfig()).ranking).all()
+
+
+def test_with_normal_prior_keeps_the_agents():
+    config = with_normal_prior(MapConfig())
+    assert config.prior.kind == "normal"
+    assert config.agents == MapConfig().agents

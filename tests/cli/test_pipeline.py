@@ -177,7 +177,7 @@ def test_plan_warns_of_a_doubtful_goal_and_of_a_risk_that_no_path_has(tmp_path, 
     assert call(*plan, "3.5,0.5", "--max-risk", 0.05) == 0
     printed = capsys.readouterr()
     assert "open with probability 0.896 in maps from the posterior, given that start and goal are free" in printed.out
-    assert "note: the goal itself is blocked with probability 0.500" in printed.err
+    assert "note: the goal itself is blocked with probability 0.5;" in printed.err
     assert "warning: no path has a risk of at most 0.05; this one has the least, 0.1" in printed.err
     result = summary(tmp_path / "plan")
     assert (result["goal_probability_blocked"], result["open_probability"]) == (0.5, pytest.approx(90.5 / 101))

@@ -128,6 +128,11 @@ def test_thinned_takes_as_many_samples_of_each_chain_up_to_the_last():
         thinned(posterior, 22)
 
 
+def test_calibration_config_refuses_actions_of_another_weight():
+    with pytest.raises(InputError, match="tempering"):
+        CalibrationConfig(behavior=ss.BehaviorConfig())
+
+
 @pytest.mark.parametrize("sizes", [{"maps": 0}, {"rows": 2}, {"walks": 1}, {"moves": 0}, {"sweeps": 11}, {"draws": 9}])
 def test_calibration_config_refuses_sizes_out_of_range(sizes):
     with pytest.raises(InputError, match=next(iter(sizes))):

@@ -27,12 +27,12 @@ def log_sums(prior: HierarchicalMRF, maps: np.ndarray) -> np.ndarray:
     return np.logaddexp.reduce([prior.log_densities(closed) - prior.log_prior for closed in maps])
 
 
-def small_prior(crossed: float = 3.0) -> HierarchicalMRF:
+def small_prior(most_crossed: float = 3.0) -> HierarchicalMRF:
     shapes = BinaryMRF(np.full(12, -0.5), (3, 4), lines=1.0, blocks=-1.5, isolated=-0.5)
     log_odds, strengths = np.array([-2.0, -0.5, 1.0]), np.linspace(0, 1.5, 7)
     varied = np.arange(12) > 1
     field = np.where(varied, 0.0, 0.7)
-    return HierarchicalMRF(shapes, field, varied, log_odds, strengths, np.zeros((3, 7)), crossed)
+    return HierarchicalMRF(shapes, field, varied, log_odds, strengths, np.zeros((3, 7)), most_crossed)
 
 
 def test_log_normalizers_of_all_cells_equal_sums_over_maps():
@@ -59,7 +59,7 @@ def test_evidence_normalizers_count_crossed_cells_by_their_weight():
     """Of 4 crossed cells, 2 count in full: log Z lies (2/4)² of the way to that of all unknown cells."""
     known = np.full(12, int(Cell.UNKNOWN))
     free = np.arange(4, 12)
-    found = evidence_normalizers(small_prior(crossed=2.0), known, free, seed=0)
+    found = evidence_normalizers(small_prior(most_crossed=2.0), known, free, seed=0)
     given = log_sums(small_prior(), MAPS[~MAPS[:, :4].any(axis=1)])
     np.testing.assert_allclose(found, 0.75 * given + 0.25 * log_sums(small_prior(), MAPS), atol=0.2)
 
@@ -105,7 +105,7 @@ def test_sample_barriers_with_unknown_density_has_the_exact_probabilities():
         ({"log_odds": np.array([0.0, 1.0, np.nan])}, "log_odds"),
         ({"log_prior": np.full((3, 7), np.inf)}, "log_prior"),
         ({"field": np.full(12, np.nan)}, "field"),
-        ({"crossed": -1.0}, "crossed"),
+        ({"most_crossed": -1.0}, "most_crossed"),
         ({"strengths": np.ones(1), "log_prior": np.zeros((3, 1))}, "strengths"),
     ],
 )

@@ -26,7 +26,7 @@ from sidestep.inference.checkpoints import Checkpoint
 from sidestep.inference.enumeration import enumerate_barriers
 from sidestep.inference.maximize import Status
 from sidestep.inference.mrf import BinaryMRF
-from sidestep.inference.sampler import BarrierPosterior, heat, heated_sweeps, sample_barriers, stages
+from sidestep.inference.sampler import BarrierPosterior, dropped_sweeps, heat, rounds, sample_barriers
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax, LogSumExp
 from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.grid import Cell, Grid
@@ -153,11 +153,11 @@ def test_sample_barriers_that_cannot_mix_says_so():
 def test_sample_barriers_continues_until_chains_have_mixed(name):
     """The sweeps of a shorter run, and as many more as the check asks for."""
     one = WORLDS[name]
-    ended = [sampled(one, sweeps=12, most_sweeps=most) for most in stages(12, 400)]
+    ended = [sampled(one, sweeps=12, most_sweeps=most) for most in rounds(12, 400)]
     last = ended[-1]
     assert last.status is Status.MIXED
     assert len(last.history) in {len(each.history) for each in ended}
-    assert last.samples.shape[1] == len(last.history) - heated_sweeps(len(last.history))
+    assert last.samples.shape[1] == len(last.history) - dropped_sweeps(len(last.history))
     for each in ended:
         mixed = each.status is Status.MIXED
         assert (len(each.history) == len(last.history)) is mixed
@@ -177,8 +177,8 @@ def test_sample_barriers_that_cannot_mix_stops_at_the_most_sweeps():
     (200, 400, [200, 400]),
     (200, 1000, [200, 400, 800, 1000]),
 ])  # fmt: skip
-def test_stages_double_up_to_the_most(sweeps, most, expected):
-    assert stages(sweeps, most) == expected
+def test_rounds_double_up_to_the_most(sweeps, most, expected):
+    assert rounds(sweeps, most) == expected
 
 
 # What a result says
@@ -232,7 +232,7 @@ def test_summary_and_history_say_what_was_sampled():
 
 
 def test_heat_falls_from_4_to_1_over_the_first_third():
-    assert [heated_sweeps(count) for count in (12, 13, 300)] == [4, 5, 100]
+    assert [dropped_sweeps(count) for count in (12, 13, 300)] == [4, 5, 100]
     heats = [heat(number, 300) for number in range(300)]
     assert heats[0] == 4
     assert heats[50] == pytest.approx(2)

@@ -12,8 +12,9 @@ from sidestep.io.demonstrations import walks_from_trajectories
 from sidestep.io.maps import write_map
 from sidestep.io.walks import table_from_walks, write_walks
 from sidestep.maps.annotations import WalkAnnotations
+from sidestep.maps.config import NEAR_OPTIMAL, SOFT, Agents, BehaviorConfig, MapConfig
 from sidestep.maps.goal_candidates import GoalCandidates
-from sidestep.maps.learn import learn_map
+from sidestep.maps.learn import learn_map, with_annotations
 from sidestep.tabular.demonstrations import Trajectory
 
 pytestmark = pytest.mark.slow
@@ -82,7 +83,22 @@ def test_learn_with_a_person_column_estimates_beta_of_each_person(office, tmp_pa
     persons = result["behavior"]["persons"]
     assert list(persons) == ["Ada", "Bo"]
     assert persons["Ada"] > 2 * persons["Bo"]
-    assert result["settings"]["behavior"]["learn"] == ["beta"]
+    behavior = result["settings"]["behavior"]
+    assert behavior["learn"] == ["beta"]
+    assert Agents(*(behavior[name] for name in Agents._fields)) == SOFT
+
+
+@pytest.mark.parametrize(("annotations", "agents"), [
+    (WalkAnnotations(), NEAR_OPTIMAL),
+    (WalkAnnotations("person"), SOFT),
+    (WalkAnnotations(goal_candidates=GoalCandidates(np.zeros((2, 2)))), SOFT),
+])  # fmt: skip
+def test_with_annotations_has_the_numbers_of_the_agents(annotations, agents):
+    config = with_annotations(MapConfig(), annotations)
+    assert Agents(*(getattr(config.behavior, name) for name in Agents._fields)) == agents
+    assert with_annotations(config, annotations) == config
+    own = MapConfig(behavior=BehaviorConfig(beta=3.0, lapse=0.1))
+    assert with_annotations(own, annotations).agents == (3.0, 0.1, 1.0)
 
 
 CANDIDATES = {

@@ -16,7 +16,7 @@ from sidestep.io.walks import Walks
 from sidestep.maps.annotations import NO_ANNOTATIONS, WalkAnnotations, persons_of
 from sidestep.maps.config import MapConfig
 from sidestep.maps.fit import behavior_of, demonstrations_of
-from sidestep.maps.learn import Learning, learn_map, sample_walks
+from sidestep.maps.learn import Learning, learn_map, sample_walks, with_annotations
 from sidestep.maps.learned_map import LearnedMap
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Grid
@@ -100,7 +100,7 @@ def compare_methods(
         failure = str(error)
     learning = learned.learning if learned else None
     moves = learning.goals.moves if learning and learning.goals else grid_walks(annotations.without_goals(train), grid)
-    config = learning.config if learning else config
+    config = with_annotations(config, annotations)
     demonstrations, heldout = demonstrations_of(moves, grid, config), None
     if len(test):
         heldout_moves = grid_walks(annotations.without_goals(test), grid)

@@ -52,7 +52,8 @@ class LearnOptions:
         float | None,
         Option(
             help=f"The inverse temperature β, in units of one over reward; by default {NEAR_OPTIMAL.beta:g}, but "
-            f"{SOFT.beta:g} with --lapse, --tempering, --learn or the normal prior."
+            f"{SOFT.beta:g} with the normal prior and with --lapse, --tempering, --learn, --person-column, "
+            "--goal-candidates."
         ),
     ] = BehaviorConfig.beta
     lapse: Annotated[

@@ -18,7 +18,10 @@ def plan(
     out: Annotated[Path | None, typer.Option("--out", help="The folder to write to (DIR/plan).", metavar="DIR")] = None,
     bump_cost: BumpCost = BUMP_COST,
     max_risk: Annotated[
-        float | None, typer.Option(help="The largest probability that the path is not open.", metavar="P")
+        float | None,
+        typer.Option(
+            help="The largest probability that the path is not open, given that start and goal are free.", metavar="P"
+        ),
     ] = None,
 ) -> None:
     """Plan a path in a learned map: path.csv, path.png, summary.json."""
@@ -47,14 +50,14 @@ def plan(
     alternatives = [
         {"length_metres": other.length, "open_probability": other.open_probability} for other in path.alternatives
     ]
-    risk = {
+    of_path = {
         "max_probability_blocked": likeliest,
         "open_probability": path.open_probability,
         "goal_probability_blocked": path.goal_blocked,
         "expected_length_metres": path.expected_length,
         "alternatives": alternatives,
     }
-    summary = {**settings, "moves": moves, "length_metres": path.length, **risk}
+    summary = {**settings, "moves": moves, "length_metres": path.length, **of_path}
     add_to_summary(folder, out, "plan", summary)
     picture.result()
     print_lines(f"{moves} moves, {path.length:g} m; the likeliest obstacle on the way has P(blocked) = {likeliest:.3f}")
@@ -66,7 +69,7 @@ def plan(
         print_lines(f"alternative: {other.length:g} m, open with probability {other.open_probability:.3f}")
     if path.goal_blocked > (_DOUBTFUL if max_risk is None else max_risk):
         print_notes(
-            f"note: the goal itself is blocked with probability {path.goal_blocked:.3f}; this is not counted above"
+            f"note: the goal itself is blocked with probability {path.goal_blocked:.2g}; this is not counted above"
         )
     if max_risk is not None and not path.within(max_risk):
         risk = 1 - path.open_probability

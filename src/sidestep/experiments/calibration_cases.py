@@ -71,6 +71,8 @@ class CalibrationConfig:
         for name, number in least.items():
             check_count(getattr(self, name), number, name)
         check(self.draws % 2 == 0, f"expected an even number, found {self.draws}", field="draws")
+        tempering = self.learning("sample").agents.tempering
+        check(tempering == 1, f"actions are drawn with weight 1: expected 1, found {tempering}", field="tempering")
 
     @property
     def places(self) -> Int[np.ndarray, " places"]:

@@ -41,7 +41,7 @@ _LOG_ODDS_PRIOR, _STRENGTH_PRIOR = (-0.3, 0.3), (0.75, 0.6)
 """The means and standard deviations of δ and λ, normal and cut off at the ends of the grid."""
 _STRENGTH_COST = 2.25
 """The log-odds that a closed cell loses for each unit of strength, so that walls of any strength are equally dense."""
-_CROSSED = 42.0
+_MOST_CROSSED = 42.0
 """c, the most crossed barriers that count in full as evidence of the density."""
 _SWEEPS, _PROPOSALS, _CELLS = 40, 10_000, 2_000_000
 """The fewest sweeps at each δ and λ on the way up and down; the proposals from which more are not made, and the most
@@ -59,7 +59,7 @@ class HierarchicalMRF:
         log_odds: The values of δ.
         strengths: The values of λ, ascending from 0; any single value where δ has a single one too.
         log_prior: log p(δ, λ), up to a constant.
-        crossed: c, the number of crossed barriers up to which all count in full; at least 0.
+        most_crossed: c, the number of crossed barriers up to which all count in full; at least 0.
 
     Raises:
         InputError: For numbers that do not fit these ranges.
@@ -76,7 +76,7 @@ class HierarchicalMRF:
     log_odds: Float[np.ndarray, " densities"]
     strengths: Float[np.ndarray, " strengths"]
     log_prior: Float[np.ndarray, "densities strengths"]
-    crossed: float = _CROSSED
+    most_crossed: float = _MOST_CROSSED
 
     def __post_init__(self) -> None:
         check(np.isfinite(self.field).all(), "expected finite numbers", field="field")
@@ -91,8 +91,8 @@ class HierarchicalMRF:
         for name in ("field", "varied"):
             size = len(getattr(self, name))
             check(size == barriers, f"expected {barriers} barriers, found {size}", field=name)
-        message = f"expected a number of at least 0, found {self.crossed}"
-        check(self.crossed >= 0, message, field="crossed")
+        message = f"expected a number of at least 0, found {self.most_crossed}"
+        check(self.most_crossed >= 0, message, field="most_crossed")
 
     def at(self, log_odds: float, strength: float) -> BinaryMRF:
         """Return the prior at one δ and λ.
@@ -225,7 +225,7 @@ def evidence_normalizers(
     unknown, closed = np.flatnonzero(known == Cell.UNKNOWN), known == Cell.OCCUPIED
     crossed = len(unknown) - len(free)
     result = log_normalizers(prior, free, closed, seed)
-    if crossed == 0 or prior.crossed == 0:
+    if crossed == 0 or prior.most_crossed == 0:
         return result
-    weight = min(1.0, (prior.crossed / crossed) ** 2)
+    weight = min(1.0, (prior.most_crossed / crossed) ** 2)
     return (1 - weight) * result + weight * log_normalizers(prior, unknown, closed, seed)

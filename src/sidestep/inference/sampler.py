@@ -16,11 +16,11 @@ The chain is that of Metropolis et al. (1953), *Equation of state calculations b
    Detailed balance holds in each stage, so also together.
 3. Values follow a proposal by local value iteration (`chain_kernels`) up to a tolerance. Every ten sweeps all states
    are solved again, from the values at hand, to a hundredth of it. So the chain is exact up to the tolerance.
-4. In the first third of the sweeps the posterior is heated: log p/T, with T falling from 4 to 1. These are dropped.
+4. In the first third of the first round's sweeps the posterior is heated: log p/T, with T falling from 4 to 1. The
+   first third of all sweeps is dropped.
 5. Several chains start from few and from many closed barriers. Split-R̂ and effective sample sizes
    (`diagnostics`) compare them.
-6. Chains that have not mixed are continued: twice as many sweeps in all, again and again up to a limit. The first third
-   of all sweeps is dropped.
+6. Chains that have not mixed at the end of a round are continued: twice as many sweeps in all, up to a limit.
 
 Barriers that walks crossed are open and stay so. The density and strength of a hierarchical prior are drawn before each
 sweep, given the map (`hierarchical`); while the chain is heated they are at their mode.
@@ -57,8 +57,8 @@ from sidestep.tabular.solvers.native import run_batch
 
 Model = TypeVar("Model", bound=TransitionModel)
 
-_HEAT, _HEATED = 4.0, 1 / 3
-"""The first heat, and the fraction of the sweeps that are heated and dropped."""
+_HEAT, _DROPPED = 4.0, 1 / 3
+"""The first heat, and the fraction of the sweeps that are dropped."""
 _FEWEST, _MOST = 0.05, 0.5
 """The fractions of closed barriers from which the first and the last chain start."""
 MIN_SWEEPS = 12
@@ -74,7 +74,7 @@ class SweepProgress(NamedTuple):
 
     Attributes:
         iteration: The number of sweeps so far.
-        total: The number of all sweeps.
+        total: The most sweeps that there may be; in a history the number of all sweeps.
         objective: log L(z) + log p(z), in nats, up to a constant.
         actions, transitions, prior: Its parts.
         accepted: The fraction of accepted proposals.
@@ -290,14 +290,14 @@ def sample_barriers(
     done = _load(saver, states) if resume else 0
     free = max(1, len(problem.free))
     status, total, samples, rhat = Status.NOT_MIXED, 0, np.zeros((0, 0, 0), bool), np.zeros(0)
-    for total in stages(sweeps, most):
+    for total in rounds(sweeps, most):
         for number in range(done, total):
             run_sweep(problem, states, number, heat(number, sweeps))
             if report is not None:
-                report(_progress(states, number, total, free))
+                report(_progress(states, number, most, free))
             saver.save([_saved(state) for state in states], [[number + 1]])
         done = max(done, total)
-        samples = np.stack([state.samples[heated_sweeps(total) : total] for state in states])
+        samples = np.stack([state.samples[dropped_sweeps(total) : total] for state in states])
         rhat = split_rhat(samples)
         if not len(problem.free) or (rhat[problem.free] <= MIXED_RHAT).mean() >= _MIXED_FRACTION:
             status = Status.MIXED
@@ -309,11 +309,11 @@ def sample_barriers(
     learned = with_closed(model, np.clip(closed, _SURE, 1 - _SURE))
     sampled = np.isin(np.arange(len(closed)), problem.free)
     sizes = effective_sizes(samples)
-    densities = np.stack([state.densities[heated_sweeps(total) : total] for state in states])
+    densities = np.stack([state.densities[dropped_sweeps(total) : total] for state in states])
     return BarrierPosterior(learned, agents, densities, sampled, samples, closed, rhat, sizes, history, status)
 
 
-def stages(sweeps: int, most_sweeps: int) -> list[int]:
+def rounds(sweeps: int, most_sweeps: int) -> list[int]:
     """Return the numbers of sweeps after which it is checked whether the chains have mixed, ascending.
 
     Args:
@@ -321,29 +321,32 @@ def stages(sweeps: int, most_sweeps: int) -> list[int]:
         most_sweeps: The last of them; each of the others is twice the one before.
 
     Example:
-        >>> stages(200, 500)
+        >>> rounds(200, 500)
         [200, 400, 500]
     """
-    return [*takewhile(lambda total: total < most_sweeps, (sweeps * 2**stage for stage in count())), most_sweeps]
+    return [
+        *takewhile(lambda total: total < most_sweeps, (sweeps * 2**doublings for doublings in count())),
+        most_sweeps,
+    ]
 
 
-def heated_sweeps(sweeps: int) -> int:
-    """Return the number of sweeps that are heated and dropped.
+def dropped_sweeps(sweeps: int) -> int:
+    """Return the number of sweeps that are dropped; of the first round, these are heated.
 
     Args:
         sweeps: The number of all sweeps.
     """
-    return math.ceil(sweeps * _HEATED)
+    return math.ceil(sweeps * _DROPPED)
 
 
 def heat(number: int, sweeps: int) -> float:
-    """Return the heat of a sweep: from 4 to 1 over the first third, 1 from then on.
+    """Return the heat of a sweep: from 4 to 1 over the first third of the first round, 1 from then on.
 
     Args:
         number: The number of the sweep, from 0.
-        sweeps: The number of all sweeps.
+        sweeps: The number of sweeps of the first round.
     """
-    heated = heated_sweeps(sweeps)
+    heated = dropped_sweeps(sweeps)
     return 1.0 if number >= heated else _HEAT ** (1 - number / heated)
 
 

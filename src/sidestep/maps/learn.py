@@ -158,7 +158,7 @@ def learn_map(
     started = time.monotonic()
     config = config or MapConfig()
     annotations.check(config.behavior, resume)
-    config = _completed(config, annotations)
+    config = with_annotations(config, annotations)
     walks = annotations.without_goals(sample_walks(walks, config))
     moves = grid_walks(walks, grid)
     resumed = resume and checkpoint is not None and Path(checkpoint).exists()
@@ -246,10 +246,15 @@ def _counts(grid: Grid, moves: Moves, demonstrations: Demonstrations, sensor: Se
     )
 
 
-def _completed(config: MapConfig, annotations: WalkAnnotations) -> MapConfig:
+def with_annotations(config: MapConfig, annotations: WalkAnnotations) -> MapConfig:
     """Return the configuration with the numbers of its agents.
 
-    The β of persons is learned. The actions of walks with unknown goals count in full.
+    The β of persons is learned, and the actions of walks with unknown goals count in full. So both have the agents
+    `SOFT` where nothing else is set.
+
+    Args:
+        config: The configuration.
+        annotations: What walks tell beside positions.
     """
     behavior = config.behavior
     if annotations.goal_candidates is not None:
