@@ -22,7 +22,6 @@ import sidestep as ss
 from benchmarks import Record, groups, note, option, print_table
 from sidestep.inference.chains import PASSING, crossed_barriers
 from sidestep.inference.enumeration import enumerate_barriers
-from sidestep.inference.mean_field import MeanField
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.inference.sampler import sample_barriers
 from sidestep.tabular.arrays import to_jax
@@ -131,19 +130,15 @@ def measure(options: Options) -> Iterator[Record]:
 
 def _of_world(seed: int, world: World, options: Options) -> Iterator[Record]:
     """Yield a record for each method."""
-    problem = world.model, with_all_moves(world.demonstrations, world.model.graph), world.behavior
     started = time.perf_counter()
     settings = {"prior": world.prior, "sweeps": options.sweeps, "chains": options.chains, "seed": seed}
     sampled = sample_barriers(world.model, world.demonstrations, world.behavior, **settings)
     ended = {"status": sampled.status.value, "seconds": time.perf_counter() - started}
     yield _record(seed, world, "sample", sampled.closed) | ended
     started = time.perf_counter()
-    known = to_jax(barriers_of(world.model).known)
-    shaped = known if world.prior.shape is None else known.reshape(world.prior.shape)
-    fit = ss.fit(*problem, prior=MeanField(world.prior, shaped))
-    closed = np.asarray(jax.nn.sigmoid(fit.model.parameters))
-    ended = {"status": fit.status.value, "seconds": time.perf_counter() - started}
-    yield _record(seed, world, "mean field", closed) | ended
+    field = ss.mean_field_barriers(world.model, world.demonstrations, world.behavior, prior=world.prior, seed=seed)
+    ended = {"status": field.status.value, "seconds": time.perf_counter() - started}
+    yield _record(seed, world, "mean field", field.closed) | ended
 
 
 def _record(seed: int, world: World, method: str, closed: np.ndarray) -> Record:

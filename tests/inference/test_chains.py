@@ -93,7 +93,7 @@ def test_refresh_of_a_chain_makes_values_exact():
     (state, _) = sampled_chains(problem, sweeps=19)
     state.chain.values[:] += np.where(problem.evidence.solved, 0.01, 0.0)
     state.chain.totals[:] = 0
-    problem.refresh(state)
+    problem.refresh(state.chain, state.work)
     expected = values_of(one, state.chain.closed, [one.behavior] * 2)
     np.testing.assert_allclose(state.chain.values, expected, atol=1e-4)
     likelihood = log_likelihood(exact_model(one.model, state.chain.closed), one.demonstrations, one.behavior)

@@ -9,7 +9,7 @@ from PIL import Image
 
 from helpers.drawn import grid_of, walk_along
 from sidestep.errors import InputError
-from sidestep.maps.config import FitConfig, MapConfig, PosteriorConfig, PriorConfig
+from sidestep.maps.config import BehaviorConfig, FitConfig, MapConfig, PosteriorConfig, PriorConfig
 from sidestep.maps.information import LinearEvidence
 from sidestep.maps.learn import learn_map
 from sidestep.maps.learned_map import LearnedMap
@@ -75,7 +75,8 @@ def test_map_information_of_a_fit_in_a_room_without_a_door_is_none(name):
 @pytest.mark.slow
 def test_map_information_of_a_fit_that_ended_early_is_none_in_the_room():
     """A fit of a large map begins with blocked cells: after one iteration the room is as blocked as at first."""
-    learned = learned_room(replace(CONFIGS["mean_field"], fit=FitConfig(large_map=1, max_iterations=1)))
+    early = FitConfig(large_map=1, max_iterations=1)
+    learned = learned_room(replace(CONFIGS["mean_field"], fit=early, behavior=BehaviorConfig(horizon=40)))
     assert learned.blocked[INSIDE].min() > 0.9
     assert learned.information is not None
     inside = learned.information[INSIDE].max()

@@ -13,7 +13,9 @@ from helpers.office import BLANK, simulated
 from helpers.walled import BLANK as ROOM
 from helpers.walled import walks as room_walks
 from sidestep.errors import InputError
+from sidestep.inference.coordinate_ascent import BarrierMeanField
 from sidestep.inference.fit import Fit
+from sidestep.inference.maximize import Status
 from sidestep.inference.mrf import SHAPE_TERMS
 from sidestep.inference.sampler import BarrierPosterior
 from sidestep.maps.config import (
@@ -148,14 +150,27 @@ def inferred(config: MapConfig, **settings: Any) -> Any:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("method", "kind"), [("sample", BarrierPosterior), ("mean_field", Fit)])
+@pytest.mark.parametrize(("method", "kind"), [("sample", BarrierPosterior), ("mean_field", BarrierMeanField)])
 def test_infer_map_has_the_method_of_the_configuration(method, kind):
-    result = inferred(MapConfig(behavior=BehaviorConfig(beta=7.0), posterior=PosteriorConfig(method, sweeps=15)))
+    result = inferred(MapConfig(behavior=BehaviorConfig(beta=7.0), posterior=PosteriorConfig(method, sweeps=60)))
     assert isinstance(result, kind)
     visited = room_walks().visited_state_goals()[:, 0]
     blocked = np.asarray(result.model.blocked).ravel()
     wall = np.array([2, 7, 12, 17])
     assert blocked[wall].min() > 0.5 > 0.3 > blocked[visited].max()
+
+
+@pytest.mark.slow
+def test_infer_map_mean_field_with_a_horizon_is_a_fit():
+    config = MapConfig(behavior=BehaviorConfig(horizon=9), posterior=PosteriorConfig("mean_field"))
+    assert isinstance(inferred(config), Fit)
+
+
+def test_infer_map_mean_field_stops_at_max_iterations():
+    config = MapConfig(posterior=PosteriorConfig("mean_field"), fit=FitConfig(max_iterations=1))
+    result = inferred(config)
+    assert len(result.history) == 1
+    assert result.status is Status.MAX_ITERATIONS
 
 
 @pytest.mark.slow

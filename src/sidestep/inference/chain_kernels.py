@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sidestep.inference.prior_kernels import flip_prior, propose
+from sidestep.inference.prior_kernels import closing_prior, flip_prior, propose
 from sidestep.tabular.solvers.native import NativeBackup, NativeFunction, compiled, part
 from sidestep.tabular.solvers.value_kernels import Scratch, own_root
 
@@ -76,6 +76,7 @@ class Chain(NamedTuple):
 
     Attributes:
         closed: z, whether each barrier is closed (0 or 1).
+        passing: The probability that each barrier lets an agent pass: o(i), or its mean in a mean field.
         probs: The probability of each attempt's success.
         values: V of each task.
         row_log_likelihood: The log-likelihood of the choices in each row.
@@ -83,6 +84,7 @@ class Chain(NamedTuple):
     """
 
     closed: np.ndarray
+    passing: np.ndarray
     probs: np.ndarray
     values: np.ndarray
     row_log_likelihood: np.ndarray
@@ -116,6 +118,20 @@ class Workspace(NamedTuple):
     log_row_value: np.ndarray
     changed: np.ndarray
     counters: np.ndarray
+
+
+class ChainKernels(NamedTuple):
+    """The native code of a chain.
+
+    Attributes:
+        refresh: Compute everything from the barriers.
+        sweep: Make proposals, and accept or reject each.
+        ascend: Update the P(closed) of a mean field (`mean_field`).
+    """
+
+    refresh: NativeFunction
+    sweep: NativeFunction
+    ascend: NativeFunction
 
 
 PROPOSAL, LOGGED, LOGGED_ROWS, SOURCES, BACKUPS = range(5)
@@ -160,8 +176,8 @@ def _choice_log_likelihood(actions, lapse, beta, counts, advantages):  # pragma:
 
 
 @cache
-def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunction]:
-    """Return the native code that computes everything in a chain from its barriers, and that which makes proposals."""
+def chain_kernels(actions: int, width: int) -> ChainKernels:
+    """Return the native code for worlds with a number of actions, and of attempts at each."""
 
     @part(fastmath=_FAST)
     def fill(task, s, world, evidence, chain, neg_inf, scratch):  # pragma: no cover
@@ -235,7 +251,7 @@ def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunct
                 for n in range(world.needed.shape[3]):
                     i = world.needed[s, a, k, n]
                     if i >= 0:
-                        success *= world.passing[i, chain.closed[i]]
+                        success *= chain.passing[i]
                 chain.probs[s, a, k] = success
 
     @compiled()
@@ -307,11 +323,21 @@ def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunct
                 change += chain.row_log_likelihood[row] - old
         return change
 
+    @part(fastmath=_FAST)
+    def change(count, world, evidence, chain, work, kind, tie, neg_inf, scratch):  # pragma: no cover
+        """Follow the change of `count` barriers; return how the log-likelihoods of choices and transitions change."""
+        work.counters[PROPOSAL] += 1
+        work.counters[LOGGED] = 0
+        work.counters[LOGGED_ROWS] = 0
+        of_transitions = change_transitions(count, world, evidence, chain, work)
+        of_choices = 0.0
+        for task in range(chain.values.shape[0]):
+            of_choices += change_choices(task, world, evidence, chain, work, kind, tie, neg_inf, scratch)
+        return of_choices, of_transitions
+
     @part()
-    def undo(count, world, chain, work):  # pragma: no cover
-        """Restore what a proposal has changed."""
-        for n in range(count):
-            chain.closed[work.changed[n]] = 1 - chain.closed[work.changed[n]]
+    def undo(world, chain, work):  # pragma: no cover
+        """Restore what followed the last change of barriers; these are already as they were."""
         for n in range(work.counters[SOURCES]):
             refresh_probs(work.sources[n], world, chain)
         for at in range(work.counters[LOGGED]):
@@ -325,7 +351,7 @@ def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunct
     ):  # pragma: no cover
         """Make proposals and accept or reject each; return the number that were accepted."""
         scratch = Scratch(np.empty(actions), np.empty(actions), np.empty(actions))
-        tasks, accepted = chain.values.shape[0], 0
+        accepted = 0
         for _ in range(proposals):
             count = propose(rng, free, is_free, chain.closed, prior, kinds, work.changed)
             if count == 0:
@@ -337,20 +363,45 @@ def chain_kernels(actions: int, width: int) -> tuple[NativeFunction, NativeFunct
                 for n in range(count):
                     chain.closed[work.changed[n]] = 1 - chain.closed[work.changed[n]]
                 continue
-            work.counters[PROPOSAL] += 1
-            work.counters[LOGGED] = 0
-            work.counters[LOGGED_ROWS] = 0
             threshold = np.log(rng.random()) * heat
-            of_transitions = change_transitions(count, world, evidence, chain, work)
-            of_choices = 0.0
-            for task in range(tasks):
-                of_choices += change_choices(task, world, evidence, chain, work, kind, tie, neg_inf, scratch)
+            for n in range(count):
+                i = work.changed[n]
+                chain.passing[i] = world.passing[i, chain.closed[i]]
+            of_choices, of_transitions = change(count, world, evidence, chain, work, kind, tie, neg_inf, scratch)
             if of_transitions + of_choices >= threshold:
                 chain.totals[0] += of_choices
                 chain.totals[1] += of_transitions
                 accepted += 1
             else:
-                undo(count, world, chain, work)
+                for n in range(count):
+                    i = work.changed[n]
+                    chain.closed[i] = 1 - chain.closed[i]
+                    chain.passing[i] = world.passing[i, chain.closed[i]]
+                undo(world, chain, work)
         return accepted
 
-    return refresh, sweep
+    @compiled()
+    def ascend(order, step, world, evidence, prior, means, chain, work, kind, tie, neg_inf):  # pragma: no cover
+        """Move P(closed) of each barrier towards that which the others at their means imply; return the largest gap."""
+        scratch = Scratch(np.empty(actions), np.empty(actions), np.empty(actions))
+        largest = 0.0
+        for i in order:
+            old, old_passing = means[i], chain.passing[i]
+            gain = closing_prior(means, i, prior)
+            work.changed[0] = i
+            for closed in range(2):
+                chain.passing[i] = world.passing[i, closed]
+                of_choices, of_transitions = change(1, world, evidence, chain, work, kind, tie, neg_inf, scratch)
+                gain += (2 * closed - 1) * (of_choices + of_transitions)
+                chain.passing[i] = old_passing
+                undo(world, chain, work)
+            implied = 1 / (1 + np.exp(min(-gain, 700.0)))
+            largest = max(largest, abs(implied - old))
+            means[i] = old + step * (implied - old)
+            chain.passing[i] = (1 - means[i]) * world.passing[i, 0] + means[i] * world.passing[i, 1]
+            of_choices, of_transitions = change(1, world, evidence, chain, work, kind, tie, neg_inf, scratch)
+            chain.totals[0] += of_choices
+            chain.totals[1] += of_transitions
+        return largest
+
+    return ChainKernels(refresh, sweep, ascend)

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from sidestep.errors import InputError, NotConverged, check
-from sidestep.inference.chain_kernels import Chain, Evidence, Workspace, World, chain_kernels
+from sidestep.inference.chain_kernels import Chain, ChainKernels, Evidence, Workspace, World, chain_kernels
 from sidestep.inference.hierarchical import HierarchicalMRF, as_hierarchical, evidence_normalizers
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.inference.prior_chains import KINDS, is_free_of, native_terms
@@ -32,7 +32,8 @@ PASSING = (0.997, 0.003)
 """The probability that an open barrier, and a closed one, lets an agent pass."""
 _FRESH_SWEEPS = 10
 """The number of sweeps after which all states are solved again, from the values at hand."""
-_NEG_INF = neg_inf(jnp.dtype(float))
+NEG_INF = neg_inf(jnp.dtype(float))
+"""The value of states from which a task cannot end."""
 _TOLERANCE = 7e-4
 """The change of β V that is passed on (nats)."""
 _FINER = 0.01
@@ -91,6 +92,11 @@ class BarrierProblem:
     terminal: Bool[np.ndarray, "tasks states"]
     terminal_reward: Float[np.ndarray, "tasks #states"]
 
+    @property
+    def kernels(self) -> ChainKernels:
+        """Return the native code."""
+        return chain_kernels(*self.barriers.successors.shape[1:])
+
     def start(self, closed: Bool[np.ndarray, " barriers"], sweeps: int, random: np.random.Generator) -> ChainState:
         """Return a chain that starts from a map.
 
@@ -99,12 +105,31 @@ class BarrierProblem:
             sweeps: The number of sweeps that it will make.
             random: The generator of its proposals.
         """
-        states, actions, attempts = self.barriers.successors.shape
-        tasks, rows = len(self.terminal), len(self.evidence.choices)
         z = np.where(self.barriers.known == Cell.OCCUPIED, 1, 0).astype(np.uint8)
         z[self.free] = closed[self.free]
+        chain, work = self.allocate(z)
+        return ChainState(
+            chain,
+            work,
+            random,
+            samples=np.zeros((sweeps, len(z)), bool),
+            log_likelihoods=np.zeros((sweeps, 2)),
+            log_priors=np.zeros(sweeps),
+            accepted=np.zeros(sweeps, np.int64),
+            densities=np.zeros((sweeps, 2)),
+        )
+
+    def allocate(self, closed: UInt8[np.ndarray, " barriers"]) -> tuple[Chain, Workspace]:
+        """Return the arrays of a chain at a map, before anything is solved.
+
+        Args:
+            closed: Whether each barrier is closed.
+        """
+        states, actions, attempts = self.barriers.successors.shape
+        tasks, rows = len(self.terminal), len(self.evidence.choices)
         values = np.zeros((tasks, states))
-        chain = Chain(z, np.empty((states, actions, attempts)), values, np.zeros(rows), np.zeros(2))
+        passing = self.world.passing[np.arange(len(closed)), closed]
+        chain = Chain(closed, passing, np.empty((states, actions, attempts)), values, np.zeros(rows), np.zeros(2))
         size = tasks * states
         work = Workspace(
             queue=np.zeros(states, np.int32),
@@ -120,44 +145,35 @@ class BarrierProblem:
             changed=np.zeros(MAX_CHANGED, np.int32),
             counters=np.zeros(5, np.int64),
         )
-        return ChainState(
-            chain,
-            work,
-            random,
-            samples=np.zeros((sweeps, len(z)), bool),
-            log_likelihoods=np.zeros((sweeps, 2)),
-            log_priors=np.zeros(sweeps),
-            accepted=np.zeros(sweeps, np.int64),
-            densities=np.zeros((sweeps, 2)),
-        )
+        return chain, work
 
-    def solve(self, state: ChainState) -> None:
+    def solve(self, chain: Chain) -> None:
         """Solve all tasks of a chain from nothing.
 
         Args:
-            state: The chain, changed in place.
+            chain: The chain, changed in place.
 
         Raises:
             NotConverged: Where values do not converge.
         """
-        successors, probabilities = _outcomes(self.barriers, self.world, state.chain.closed)
+        successors, probabilities = _outcomes(self.barriers, self.world, chain.passing)
         kind, tie = self.backup
-        for task, values in enumerate(state.chain.values):
+        for task, values in enumerate(chain.values):
             reward, discount = self.evidence.reward[task], np.float64(self.evidence.discount[task])
             ends, pays = self.terminal[task], self.terminal_reward[task]
             backup = NativeBackup(kind, np.float64(self.evidence.beta[task]), np.float64(tie))
             process = HostProcess(successors, probabilities, reward, pays, ends, discount)
             values[:] = _solved(NativeEquation(process, backup, np.float64(_EXACT)))
 
-    def refresh(self, state: ChainState) -> None:
+    def refresh(self, chain: Chain, work: Workspace) -> None:
         """Solve all tasks of a chain from the values that it has, and compute its likelihood anew.
 
         Args:
-            state: The chain, changed in place.
+            chain: The chain, changed in place.
+            work: Its memory.
         """
-        refresh, _ = chain_kernels(*self.barriers.successors.shape[1:])
         exact = self.evidence._replace(tolerance=_FINER * self.evidence.tolerance)
-        refresh(self.world, exact, state.chain, state.work, *self.backup, _NEG_INF)
+        self.kernels.refresh(self.world, exact, chain, work, *self.backup, NEG_INF)
 
     def sweep(self, state: ChainState, number: int, heat: float) -> None:
         """Make as many proposals as there are free barriers.
@@ -168,16 +184,16 @@ class BarrierProblem:
             heat: T, where the chain samples the posterior to the power 1/T.
         """
         if number == 0:
-            self.solve(state)
+            self.solve(state.chain)
         if number % _FRESH_SWEEPS == 0:
-            self.refresh(state)
-        _, sweep = chain_kernels(*self.barriers.successors.shape[1:])
+            self.refresh(state.chain, state.work)
         place = self._draw_density(state, heat)
         density = float(self.prior.log_odds[place[0]]), float(self.prior.strengths[place[1]])
         free = self.free, is_free_of(self.free, len(state.chain.closed))
         terms = native_terms(self.prior.at(*density))
         arguments = (*free, self.world, self.evidence, terms, KINDS, state.chain, state.work)
-        state.accepted[number] = sweep(state.random, len(self.free), heat, *arguments, *self.backup, _NEG_INF)
+        sweep = self.kernels.sweep
+        state.accepted[number] = sweep(state.random, len(self.free), heat, *arguments, *self.backup, NEG_INF)
         state.samples[number] = state.chain.closed
         state.log_likelihoods[number] = state.chain.totals
         state.log_priors[number] = self._log_priors(state)[place]
@@ -282,10 +298,9 @@ def check_prior(barriers: Barriers, prior: BinaryMRF | HierarchicalMRF) -> None:
     check(prior.shape is None or prior.shape == barriers.shape, message, field="prior")
 
 
-def _outcomes(barriers: Barriers, world: World, closed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _outcomes(barriers: Barriers, world: World, passing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return successors and probabilities with staying as the last outcome."""
-    passing = np.append(world.passing[np.arange(len(closed)), closed], 1.0)
-    success = barriers.attempts * passing[barriers.needed].prod(axis=-1)
+    success = barriers.attempts * np.append(passing, 1.0)[barriers.needed].prod(axis=-1)
     stay = np.broadcast_to(np.arange(len(success))[:, None, None], (*success.shape[:2], 1))
     successors = np.concatenate([world.successors, stay], axis=-1).astype(np.int32)
     return successors, np.concatenate([success, 1 - success.sum(axis=-1, keepdims=True)], axis=-1)
@@ -296,9 +311,9 @@ def _solved(equation: NativeEquation) -> Float[np.ndarray, " states"]:
     process, states = equation.process, len(equation.process.terminal)
     worst = np.broadcast_to(process.reward.max(axis=-1), states)[~process.terminal].min(initial=0.0)
     # as `base.lower_bound`
-    bound = np.float64(worst / (1 - process.discount) if process.discount < 1 else _NEG_INF)
+    bound = np.float64(worst / (1 - process.discount) if process.discount < 1 else NEG_INF)
     arrays: Any = np.empty(states), np.empty(states, np.int32), *(np.empty((), kind) for kind in (int, float, bool))
-    start: Any = np.full(states, _NEG_INF), np.zeros(0), np.full(states, -1, np.int32)
+    start: Any = np.full(states, NEG_INF), np.zeros(0), np.full(states, -1, np.int32)
     result = SolveResult(*arrays)
     solve_values(_MAX_SWEEPS, result, equation, bound, WarmStart(*start), np.ones(states, bool))
     if not result.converged:

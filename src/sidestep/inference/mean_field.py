@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sidestep.inference.mrf import BinaryMRF
+from sidestep.inference.mrf import BinaryMRF, expected_shapes
 from sidestep.inference.priors import Prior
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.grid import Cell
@@ -62,16 +62,5 @@ class MeanField(Prior):
         independent = jnp.sum(jnp.where(unknown, self.field.astype(logits.dtype) * closed + entropy, 0.0))
         if self.known.ndim != 2:
             return independent
-        return independent + self.weights.astype(logits.dtype) @ _expected_shapes(closed.reshape(self.known.shape))
-
-
-def _expected_shapes(closed: Float[Array, "rows columns"]) -> Float[Array, " 4"]:
-    """Return the expected numbers of lines, pairs, blocks and isolated cells of independent cells."""
-    padded = jnp.pad(closed, 1)
-    inner, up, down = padded[1:-1, 1:-1], padded[:-2, 1:-1], padded[2:, 1:-1]
-    left, right = padded[1:-1, :-2], padded[1:-1, 2:]
-    lines = jnp.sum(inner * (1 - (1 - left * right) * (1 - up * down)))
-    pairs = jnp.sum(inner * right) + jnp.sum(inner * down)
-    blocks = jnp.sum(closed[:-1, :-1] * closed[:-1, 1:] * closed[1:, :-1] * closed[1:, 1:])
-    isolated = jnp.sum(inner * (1 - up) * (1 - down) * (1 - left) * (1 - right))
-    return jnp.stack([lines, pairs, blocks, isolated])
+        shapes = jnp.stack(expected_shapes(jnp.pad(closed.reshape(self.known.shape), 1)))
+        return independent + self.weights.astype(logits.dtype) @ shapes

@@ -18,6 +18,7 @@ every cell is closed.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
@@ -99,3 +100,24 @@ def shape_counts(closed: Bool[np.ndarray, "*maps rows columns"]) -> Int[np.ndarr
     blocks = inner & right & down & padded[..., 2:, 2:]
     pairs = (inner & right).sum((-1, -2)) + (inner & down).sum((-1, -2))
     return np.stack([lines.sum((-1, -2)), pairs, blocks.sum((-1, -2)), isolated.sum((-1, -2))], axis=-1)
+
+
+def expected_shapes(padded: Any) -> list[Any]:
+    """Return the mean numbers of lines, pairs, blocks and isolated cells of a map of independent cells.
+
+    Each shape is a product of different cells, so the means are exact.
+
+    Args:
+        padded: P(closed) of each cell with a border of zeros around; an array of NumPy or JAX.
+
+    Example:
+        >>> expected_shapes(np.pad(np.array([[1.0, 0.5, 1.0]]), 1))
+        [0.5, 1.0, 0.0, 1.0]
+    """
+    inner, up, down = padded[1:-1, 1:-1], padded[:-2, 1:-1], padded[2:, 1:-1]
+    left, right = padded[1:-1, :-2], padded[1:-1, 2:]
+    lines = inner * (1 - (1 - left * right) * (1 - up * down))
+    pairs = inner * (right + down)
+    blocks = inner * right * down * padded[2:, 2:]
+    isolated = inner * (1 - up) * (1 - down) * (1 - left) * (1 - right)
+    return [lines.sum(), pairs.sum(), blocks.sum(), isolated.sum()]

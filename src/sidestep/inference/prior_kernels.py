@@ -40,28 +40,28 @@ def _at(closed, row, column, rows, columns):  # pragma: no cover
 
 @part(fastmath=_FAST)
 def _shape_terms(closed, row, column, rows, columns, weights):  # pragma: no cover
-    """Return the terms of log p(z) that depend on a cell beside its neighbors: lines, pairs, blocks, isolated."""
+    """Return the terms of log p(z) that depend on a cell beside its neighbors: lines, pairs, blocks, isolated.
+
+    Of independent cells with P(closed) in `closed`, these are means, as each term is a product of different cells.
+    """
     total = 0.0
     for k in range(5):
         r, c = row + (k == 1) - (k == 2), column + (k == 3) - (k == 4)
-        if _at(closed, r, c, rows, columns):
+        here = _at(closed, r, c, rows, columns)
+        if here > 0:
             left, right = _at(closed, r, c - 1, rows, columns), _at(closed, r, c + 1, rows, columns)
             up, down = _at(closed, r - 1, c, rows, columns), _at(closed, r + 1, c, rows, columns)
-            total += weights[0] * (1 - (1 - left * right) * (1 - up * down))
-            if left + right + up + down == 0:
-                total += weights[3]
+            total += weights[0] * here * (1 - (1 - left * right) * (1 - up * down))
+            total += weights[3] * here * (1 - left) * (1 - right) * (1 - up) * (1 - down)
             if k == 0:
-                total += weights[1] * (left + right + up + down)
+                total += weights[1] * here * (left + right + up + down)
     for i in range(2):
         for j in range(2):
             r, c = row - i, column - j
-            if (
-                _at(closed, r, c, rows, columns)
-                and _at(closed, r, c + 1, rows, columns)
-                and _at(closed, r + 1, c, rows, columns)
-                and _at(closed, r + 1, c + 1, rows, columns)
-            ):
-                total += weights[2]
+            upper = _at(closed, r, c, rows, columns) * _at(closed, r, c + 1, rows, columns)
+            if upper > 0:
+                lower = _at(closed, r + 1, c, rows, columns) * _at(closed, r + 1, c + 1, rows, columns)
+                total += weights[2] * upper * lower
     return total
 
 
@@ -77,6 +77,20 @@ def flip_prior(closed, i, prior):  # pragma: no cover
         change += _shape_terms(closed, row, column, prior.rows, prior.columns, prior.weights)
     else:
         closed[i] = 1 - closed[i]
+    return change
+
+
+@part(fastmath=_FAST)
+def closing_prior(means, i, prior):  # pragma: no cover
+    """Return the mean change of log p(z) from a barrier being open to closed; the others have P(closed) in `means`."""
+    change = prior.field[i]
+    if prior.rows > 0:
+        row, column, old = i // prior.columns, i % prior.columns, means[i]
+        means[i] = 1.0
+        change += _shape_terms(means, row, column, prior.rows, prior.columns, prior.weights)
+        means[i] = 0.0
+        change -= _shape_terms(means, row, column, prior.rows, prior.columns, prior.weights)
+        means[i] = old
     return change
 
 
@@ -136,3 +150,15 @@ def sweep_prior(rng, sweeps, free, is_free, prior, kinds, closed, changed, sampl
                 for n in range(count):
                     closed[changed[n]] = 1 - closed[changed[n]]
         samples[number] = closed
+
+
+@compiled()
+def ascend_prior(order, step, prior, means):  # pragma: no cover
+    """Move P(closed) of each barrier towards what the others imply, by the prior alone; return the largest gap."""
+    largest = 0.0
+    for i in order:
+        old = means[i]
+        implied = 1 / (1 + np.exp(min(-closing_prior(means, i, prior), 700.0)))
+        largest = max(largest, abs(implied - old))
+        means[i] = old + step * (implied - old)
+    return largest

@@ -27,7 +27,7 @@ SHAPE_WEIGHTS = {
     "mean_field": {"lines": 0.5, "pairs": 1.5, "blocks": -3.0, "isolated": -1.0},
 }
 """The default weights of the shape terms by the method: a mean field cannot follow strong ones."""
-MAX_SAMPLED = 60_000
+MAX_SAMPLED = 400_000
 """The number of unknown cells × goals up to which maps are sampled."""
 
 

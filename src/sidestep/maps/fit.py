@@ -1,10 +1,11 @@
 """The posterior of an obstacle grid after demonstrations, as a `MapConfig` describes it.
 
-Maps of up to `MAX_SAMPLED` unknown cells × goals are sampled (`sample_barriers`). Larger ones, and those with the
-paper's normal prior, are fitted: the posterior of `sidestep.inference.fit` with the prior of the mean field, or with
-the normal one and `WallPrior`. The first cell of every walk counts as evidence that it is free (`FreeCellEvidence`).
-The fit starts where the transitions alone lead. On large maps every unvisited unknown cell is then almost surely
-blocked. Parameters of the behavior are learned by a fit; maps are sampled with these.
+Maps of up to `MAX_SAMPLED` unknown cells × goals are sampled (`sample_barriers`), or have a mean field by coordinate
+ascent (`mean_field_barriers`). Larger ones, and those with the paper's normal prior, are fitted: the posterior of
+`sidestep.inference.fit` with the prior of the mean field, or with the normal one and `WallPrior`. In a fit, the first
+cell of every walk counts as evidence that it is free (`FreeCellEvidence`). A fit starts where the transitions alone
+lead. On large maps every unvisited unknown cell is then almost surely blocked. Parameters of the behavior are learned
+by a fit; maps are sampled with these.
 """
 
 from collections.abc import Callable
@@ -17,6 +18,7 @@ import numpy as np
 from jaxtyping import Int
 
 from sidestep.errors import check
+from sidestep.inference.coordinate_ascent import BarrierMeanField, mean_field_barriers
 from sidestep.inference.fit import Fit, fit
 from sidestep.inference.hierarchical import HierarchicalMRF, hierarchical_mrf
 from sidestep.inference.maximize import Progress
@@ -45,13 +47,15 @@ from sidestep.tabular.likelihood import ALL_TERMS
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.solve import SolveOptions
 
-MapPosterior = Fit[ObstacleGrid] | BarrierPosterior[ObstacleGrid]
-"""What is learned of a map: a fit, or samples."""
+MapPosterior = Fit[ObstacleGrid] | BarrierMeanField[ObstacleGrid] | BarrierPosterior[ObstacleGrid]
+"""What is learned of a map: a fit, a mean field, or samples."""
 
 _PROPOSALS, _FEWEST_SWEEPS, _MOST_SWEEPS = 12_000_000, 150, 800
 """Chains are continued up to this number over unknown cells × goals sweeps, within these bounds."""
 _FIRST_SWEEPS = 200
 """The number of sweeps after which it is first checked whether chains have mixed."""
+_STARTS, _SEVERAL_STARTS = 4, 20_000
+"""The most starts of a mean field, and about the most that they may be times unknown cells × goals."""
 _BLOCKED_LOGIT = 8.0
 """The first logit of an unvisited cell of a large map: some 3,000 tries, longer than most detours."""
 _TOLERANCE_PER_MOVE = 1e-3
@@ -138,6 +142,20 @@ def sweeps_for(config: MapConfig, unknown: int, goals: int) -> tuple[int, int]:
     return min(_FIRST_SWEEPS, most), most
 
 
+def starts_for(unknown: int, goals: int) -> int:
+    """Return the number of starts of a mean field, by the size of the map.
+
+    Args:
+        unknown: The number of unknown cells.
+        goals: The number of tasks.
+
+    Example:
+        >>> starts_for(100, 10), starts_for(2400, 12)
+        (4, 1)
+    """
+    return max(1, min(_STARTS, _SEVERAL_STARTS // max(1, unknown * goals)))
+
+
 def barrier_prior(
     config: PriorConfig,
     known: Int[np.ndarray, "rows columns"],
@@ -214,8 +232,10 @@ def infer_map(
     """
     behavior, known = behavior or behavior_model_of(config), np.asarray(model.known)
     size = int((known == Cell.UNKNOWN).sum()), len(demonstrations.tasks.terminal)
-    method, run = posterior_method(config, *size), {"checkpoint": checkpoint, "resume": resume}
-    if method != "sample":
+    method = posterior_method(config, *size)
+    run: dict[str, Any] = {"checkpoint": checkpoint, "resume": resume}
+    exact = config.behavior.horizon is None and config.fit.gradient == "exact"
+    if method == "mode" or (method == "mean_field" and not (exact and size[0] * size[1] <= MAX_SAMPLED)):
         return fit_map(model, demonstrations, config, sensor=sensor, behavior=behavior, callback=callback, **run)
     message = "maps are sampled without a horizon: expected none, or the posterior mean_field"
     check(config.behavior.horizon is None, message, field="horizon")
@@ -224,21 +244,17 @@ def infer_map(
     learned: Fit[ObstacleGrid] | None = None
     if any(leaf is not None for leaf in behavior.parameters):
         learned = fit_map(model, demonstrations, config, sensor=sensor, behavior=behavior, callback=callback)
-    sweeps, most_sweeps = sweeps_for(config, *size)
-    posterior = sample_barriers(
-        model,
-        demonstrations,
-        learned.behavior if learned else behavior,
-        prior=sampled_prior(config.prior, known, sensor),
-        tempering=config.agents.tempering,
-        terms=ALL_TERMS if config.fit.terms == "both" else (config.fit.terms,),
-        sweeps=sweeps,
-        most_sweeps=most_sweeps,
-        chains=config.posterior.chains,
-        seed=config.seed,
-        report=callback,
-        **run,
-    )
+    agents = learned.behavior if learned else behavior
+    run |= {"tempering": config.agents.tempering, "seed": config.seed, "report": callback}
+    run |= {"terms": ALL_TERMS if config.fit.terms == "both" else (config.fit.terms,)}
+    if method == "mean_field":
+        prior, starts = barrier_prior(config.prior, known, method, sensor), starts_for(*size)
+        limit = {} if config.fit.max_iterations is None else {"max_sweeps": config.fit.max_iterations}
+        posterior = mean_field_barriers(model, demonstrations, agents, prior=prior, starts=starts, **limit, **run)
+    else:
+        prior, (sweeps, most) = sampled_prior(config.prior, known, sensor), sweeps_for(config, *size)
+        settings = {"sweeps": sweeps, "most_sweeps": most, "chains": config.posterior.chains}
+        posterior = sample_barriers(model, demonstrations, agents, prior=prior, **settings, **run)
     return replace(posterior, learned_behavior=learned.learned_behavior) if learned else posterior
 
 

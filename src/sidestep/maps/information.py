@@ -18,10 +18,11 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sidestep._programs import keep_program
 from sidestep.inference.cell_information import information, prior_closed
+from sidestep.inference.coordinate_ascent import BarrierMeanField, prior_mean_field
 from sidestep.inference.fit import Fit, fit
 from sidestep.inference.hierarchical import HierarchicalMRF
 from sidestep.inference.objective import Parameters
@@ -29,7 +30,7 @@ from sidestep.inference.priors import Prior
 from sidestep.inference.sampler import BarrierPosterior
 from sidestep.inference.tabular_information import TabularInformation
 from sidestep.maps.config import MapConfig
-from sidestep.maps.fit import MapPosterior, prior_of_fit, sampled_prior
+from sidestep.maps.fit import MapPosterior, barrier_prior, prior_of_fit, sampled_prior
 from sidestep.tabular.grid import Cell
 from sidestep.tabular.models import ObstacleGrid
 
@@ -74,6 +75,10 @@ def map_information(posterior: MapPosterior, config: MapConfig) -> Float[np.ndar
     if isinstance(posterior, BarrierPosterior):
         before = _prior_of_samples(posterior, config)
         return information(np.asarray(posterior.model.blocked, np.float64), before)
+    if isinstance(posterior, BarrierMeanField):
+        return information(
+            posterior.closed.reshape(posterior.model.known.shape), _prior_of_mean_field(posterior, config)
+        )
     prior = prior_of_fit(config.prior, posterior.model)
     slopes = _slopes(posterior, prior)
     after = _maximum(posterior, LinearEvidence(prior, slopes), posterior.model)
@@ -94,13 +99,29 @@ def _prior_of_samples(
         priors = [prior.at(log_odds, strength) for log_odds, strength in drawn[at].tolist()]
     else:
         priors = [prior]
-    visited = np.where(known == Cell.OCCUPIED, Cell.OCCUPIED, Cell.FREE).ravel()
-    conditions = np.where(posterior.sampled, known.ravel(), visited), known.ravel()
     before = [
         np.mean([prior_closed(each, cells, count=_SAMPLES // len(priors), seed=config.seed) for each in priors], axis=0)
-        for cells in conditions
+        for cells in _conditions(posterior.sampled, known)
     ]
     return np.where(posterior.sampled, *before).reshape(known.shape)
+
+
+def _prior_of_mean_field(
+    posterior: BarrierMeanField[ObstacleGrid], config: MapConfig
+) -> Float[np.ndarray, "rows columns"]:
+    """Return P(blocked) of each cell in the mean field of the prior alone, beginning at the posterior's best part."""
+    known = np.asarray(posterior.model.known)
+    prior, start = barrier_prior(config.prior, known, "mean_field"), posterior.parts[0]
+    before = [prior_mean_field(prior, cells, start) for cells in _conditions(posterior.inferred, known)]
+    return np.where(posterior.inferred, *before).reshape(known.shape)
+
+
+def _conditions(
+    inferred: Bool[np.ndarray, " cells"], known: Int[np.ndarray, "rows columns"]
+) -> tuple[Int[np.ndarray, " cells"], Int[np.ndarray, " cells"]]:
+    """Return what is known of each cell given the cells that walks crossed, and without walks."""
+    visited = np.where(known == Cell.OCCUPIED, Cell.OCCUPIED, Cell.FREE).ravel()
+    return np.where(inferred, known.ravel(), visited), known.ravel()
 
 
 def _slopes(posterior: Fit[ObstacleGrid], prior: Prior) -> Float[Array, " cells"]:
