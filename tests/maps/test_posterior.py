@@ -30,7 +30,7 @@ from sidestep.maps.config import (
     PosteriorConfig,
     PriorConfig,
 )
-from sidestep.maps.fit import barrier_prior, infer_map, posterior_method, sweeps_for
+from sidestep.maps.fit import MapSize, barrier_prior, infer_map, posterior_method, sweeps_for
 from sidestep.maps.learn import learn_map
 from sidestep.maps.learned_map import LearnedMap, load_map
 from sidestep.maps.sensors import SensorMap, cell_field, first_logits
@@ -51,30 +51,30 @@ def test_behavior_config_refuses_unknown_parameters():
 
 def test_posterior_method_by_prior_size_and_horizon():
     config = MapConfig()
-    assert posterior_method(config, MAX_SAMPLED // 5, 5) == "sample"
-    assert posterior_method(config, MAX_SAMPLED // 5 + 1, 5) == "mean_field"
+    assert posterior_method(config, MapSize(MAX_SAMPLED // 500, 100, 5)) == "sample"
+    assert posterior_method(config, MapSize(MAX_SAMPLED // 500 + 1, 100, 5)) == "mean_field"
     ahead = MapConfig(behavior=BehaviorConfig(horizon=3))
-    assert posterior_method(ahead, 10, 1) == "mean_field"
-    assert posterior_method(MapConfig(prior=NORMAL), 10, 1) == "mode"
+    assert posterior_method(ahead, MapSize(10, 10, 1)) == "mean_field"
+    assert posterior_method(MapConfig(prior=NORMAL), MapSize(10, 10, 1)) == "mode"
 
 
 @pytest.mark.parametrize("method", ["sample", "mean_field"])
 def test_posterior_method_configured_does_not_depend_on_the_size(method):
     config = MapConfig(posterior=PosteriorConfig(method))
-    assert {posterior_method(config, unknown, 7) for unknown in (0, 10, 10**7)} == {method}
+    assert {posterior_method(config, MapSize(unknown, 10**7, 7)) for unknown in (0, 10, 10**7)} == {method}
 
 
 def test_sweeps_for_fall_with_the_size_between_bounds():
     sizes = [0, 1, 100, 1_000, 6_000, 30_000, 10**5]
-    fewest, most = zip(*(sweeps_for(MapConfig(), size, 5) for size in sizes), strict=True)
+    fewest, most = zip(*(sweeps_for(MapConfig(), MapSize(size, size, 5)) for size in sizes), strict=True)
     for sweeps in (fewest, most):
         assert list(sweeps) == sorted(sweeps, reverse=True)
         assert sweeps[0] == sweeps[2] > sweeps[-1] == sweeps[-2] >= 12
     assert all(first <= last for first, last in zip(fewest, most, strict=True))
     assert fewest[0] < most[0]
     # what counts is the product
-    assert sweeps_for(MapConfig(), 3_000, 5) == sweeps_for(MapConfig(), 5, 3_000)
-    assert sweeps_for(MapConfig(posterior=PosteriorConfig(sweeps=77)), 10**5, 5) == (77, 77)
+    assert sweeps_for(MapConfig(), MapSize(3_000, 3_000, 5)) == sweeps_for(MapConfig(), MapSize(5, 9_000, 3_000))
+    assert sweeps_for(MapConfig(posterior=PosteriorConfig(sweeps=77)), MapSize(10**5, 10**5, 5)) == (77, 77)
 
 
 @pytest.mark.parametrize(("make", "field"), [

@@ -12,7 +12,8 @@ falling, and Z(δ, 0) = Π_i (1 + exp(f_i + u_i δ)).
 
 Agents are in open cells because they have to be. A place has halls where they walk and walls between, and one density
 does not describe both: with each crossed cell as evidence of the density, the walls of an office vanish. So barriers
-that walks crossed enter with a weight α = min(1, c / crossed). Together they count as c of them at most:
+that walks crossed enter with a weight α = min(1, c / crossed): together they count as c of them at most, with c = 25 or
+a 36th of the unknown barriers, whichever is more.
 
     log Z = (1 − α) log Z(barriers that were not crossed, given the others) + α log Z(all unknown barriers)
 
@@ -40,8 +41,8 @@ _LOG_ODDS_PRIOR, _STRENGTH_PRIOR = (-0.3, 0.3), (1.0, 0.4)
 """The means and standard deviations of δ and λ, normal and cut off at the ends of the grid."""
 _STRENGTH_COST = 2.25
 """The log-odds that a closed cell loses for each unit of strength, so that walls of any strength are equally dense."""
-_MOST_CROSSED = 25.0
-"""c, the most crossed barriers that count as evidence of the density."""
+_MOST_CROSSED, _CROSSED_PART = 25.0, 1 / 36
+"""The most crossed barriers that count as evidence of the density: this number, or this part of the unknown ones."""
 _SWEEPS, _PROPOSALS, _CELLS = 40, 10_000, 2_000_000
 """The fewest sweeps at each δ and λ on the way up and down; the proposals from which more are not made, and the most
 barriers that more may store."""
@@ -58,7 +59,8 @@ class HierarchicalMRF:
         log_odds: The values of δ.
         strengths: The values of λ, ascending from 0; any single value where δ has a single one too.
         log_prior: log p(δ, λ), up to a constant.
-        most_crossed: c, the most crossed barriers that count as evidence of the density, at least 0.
+        most_crossed: The most crossed barriers that count as evidence of the density, at least 0; a 36th of the unknown
+            barriers where that is more. With 0 none count.
 
     Raises:
         InputError: For numbers that do not fit these ranges.
@@ -226,5 +228,5 @@ def evidence_normalizers(
     result = log_normalizers(prior, free, closed, seed)
     if crossed == 0 or prior.most_crossed == 0:
         return result
-    weight = min(1.0, prior.most_crossed / crossed)
+    weight = min(1.0, max(prior.most_crossed, _CROSSED_PART * len(unknown)) / crossed)
     return (1 - weight) * result + weight * log_normalizers(prior, unknown, closed, seed)

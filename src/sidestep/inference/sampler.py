@@ -105,7 +105,7 @@ class BarrierPosterior(Generic[Model]):
     Attributes:
         model: The transition model with the posterior's P(closed).
         behavior: The behavior model; it is not sampled.
-        densities: δ and λ of the prior in each sweep that counts (`HierarchicalMRF`); 0 and 1 where they are known.
+        densities: δ and λ of the prior in each sweep that counts (`HierarchicalMRF`); of no sweep where they are known.
         sampled: Whether each barrier was sampled; the others are known, or walks crossed them.
         samples: Whether each barrier is closed, after each sweep that counts, for each chain.
         closed: P(closed) of each barrier: (n + ½)/(N + 1) of n samples in N; exactly 0 or 1 where it is known.
@@ -127,7 +127,7 @@ class BarrierPosterior(Generic[Model]):
 
     model: Model
     behavior: BehaviorModel
-    densities: Float[np.ndarray, "chains draws 2"]
+    densities: Float[np.ndarray, "chains densities 2"]
     sampled: Bool[np.ndarray, " barriers"]
     samples: Bool[np.ndarray, "chains draws barriers"]
     closed: Float[np.ndarray, " barriers"]
@@ -223,7 +223,7 @@ class BarrierPosterior(Generic[Model]):
 
     def _density_summary(self) -> dict[str, dict[str, float]]:
         """Return the means and standard deviations of δ and λ; nothing where they are known."""
-        if not np.ptp(self.densities, axis=(0, 1)).any():
+        if not self.densities.size:
             return {}
         means, deviations = self.densities.mean(axis=(0, 1)), self.densities.std(axis=(0, 1))
         pairs = zip(("prior_density", "prior_strength"), means, deviations, strict=True)
@@ -309,7 +309,8 @@ def sample_barriers(
     learned = with_closed(model, np.clip(closed, _SURE, 1 - _SURE))
     sampled = np.isin(np.arange(len(closed)), problem.free)
     sizes = effective_sizes(samples)
-    densities = np.stack([state.densities[dropped_sweeps(total) : total] for state in states])
+    counts = slice(dropped_sweeps(total) if problem.prior.log_prior.size > 1 else total, total)
+    densities = np.stack([state.densities[counts] for state in states])
     return BarrierPosterior(learned, agents, densities, sampled, samples, closed, rhat, sizes, history, status)
 
 

@@ -27,8 +27,8 @@ SHAPE_WEIGHTS = {
     "mean_field": {"lines": 0.5, "pairs": 1.5, "blocks": -3.0, "isolated": -1.0},
 }
 """The default weights of the shape terms by the method: a mean field cannot follow strong ones."""
-MAX_SAMPLED = 400_000
-"""The number of unknown cells × goals up to which maps are sampled."""
+MAX_SAMPLED = 4_000_000_000
+"""The number of unknown cells × cells × goals up to which maps are sampled: values of all cells may follow a change."""
 
 
 class Agents(NamedTuple):
@@ -145,7 +145,7 @@ class PosteriorConfig:
     Attributes:
         method: "sample" draws maps, "mean_field" treats cells as independent, "mode" maximizes the posterior of the
             normal prior. None is "mode" for the normal prior, and for the binary one "sample" on maps up to
-            `MAX_SAMPLED` unknown cells × goals and "mean_field" beyond.
+            `MAX_SAMPLED` unknown cells × cells × goals and "mean_field" beyond.
         sweeps: The number of sweeps of each chain, at least 12. None continues chains until they have mixed, up to a
             number by the size of the map.
         chains: The number of chains, at least 2.

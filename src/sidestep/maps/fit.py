@@ -1,17 +1,17 @@
 """The posterior of an obstacle grid after demonstrations, as a `MapConfig` describes it.
 
-Maps of up to `MAX_SAMPLED` unknown cells × goals are sampled (`sample_barriers`), or have a mean field by coordinate
-ascent (`mean_field_barriers`). Larger ones, and those with the paper's normal prior, are fitted: the posterior of
-`sidestep.inference.fit` with the prior of the mean field, or with the normal one and `WallPrior`. In a fit, the first
-cell of every walk counts as evidence that it is free (`FreeCellEvidence`). A fit starts where the transitions alone
-lead. On large maps every unvisited unknown cell is then almost surely blocked. Parameters of the behavior are learned
-by a fit; maps are sampled with these.
+Maps of up to `MAX_SAMPLED` unknown cells × cells × goals are sampled (`sample_barriers`), or have a mean field by
+coordinate ascent (`mean_field_barriers`). Larger ones, and those with the paper's normal prior, are fitted: the
+posterior of `sidestep.inference.fit` with the prior of the mean field, or with the normal one and `WallPrior`. In a
+fit, the first cell of every walk counts as evidence that it is free (`FreeCellEvidence`). A fit starts where the
+transitions alone lead. On large maps every unvisited unknown cell is then almost surely blocked. Parameters of the
+behavior are learned by a fit; maps are sampled with these.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -56,8 +56,9 @@ _FIRST_SWEEPS = 200
 """The number of sweeps after which it is first checked whether chains have mixed."""
 _STARTS, _SEVERAL_STARTS = 4, 20_000
 """The most starts of a mean field, and about the most that they may be times unknown cells × goals."""
-_BLOCKED_LOGIT = 8.0
-"""The first logit of an unvisited cell of a large map: some 3,000 tries, longer than most detours."""
+_BLOCKED_LOGIT = {"normal": 8.0, "binary": 5.0}
+"""The first logit of an unvisited cell of a large map by its prior: some 3,000 or 150 tries, longer than most detours.
+The gradient of a mean field has a factor p (1 − p), and so vanishes where a cell is more surely blocked."""
 _TOLERANCE_PER_MOVE = 1e-3
 """A large map is learned when the next step promises less than this for each move of the walks (nats)."""
 
@@ -100,20 +101,46 @@ def behavior_model_of(config: MapConfig, person: Int[np.ndarray, " tasks"] | Non
     return behavior_model(behavior_of(config), learn, discount=discount, person=person)
 
 
-def posterior_method(config: MapConfig, unknown: int, goals: int) -> PosteriorMethod:
+class MapSize(NamedTuple):
+    """The size of what is learned of a map.
+
+    Attributes:
+        unknown: The number of unknown cells.
+        cells: The number of all cells.
+        goals: The number of tasks.
+
+    Example:
+        >>> MapSize(unknown=10_000, cells=10_000, goals=40).sampled, MapSize(6_000, 200_000, 40).sampled
+        (True, False)
+    """
+
+    unknown: int
+    cells: int
+    goals: int
+
+    @property
+    def sampled(self) -> bool:
+        """Whether a map of this size is sampled by default."""
+        return self.unknown * self.cells * self.goals <= MAX_SAMPLED
+
+
+def posterior_method(config: MapConfig, size: MapSize) -> PosteriorMethod:
     """Return how the posterior of a map is found: the configured way, or one by the prior and the size.
 
     Args:
         config: The configuration.
-        unknown: The number of unknown cells.
-        goals: The number of tasks.
+        size: The size of the map.
     """
     if config.posterior.method is not None:
         return config.posterior.method
     if config.prior.kind == "normal":
         return "mode"
-    samples = config.behavior.horizon is None and config.fit.gradient == "exact" and unknown * goals <= MAX_SAMPLED
-    return "sample" if samples else "mean_field"
+    return "sample" if _has_exact_values(config) and size.sampled else "mean_field"
+
+
+def _has_exact_values(config: MapConfig) -> bool:
+    """Return whether maps are evaluated with the agents' values: without a horizon and another gradient."""
+    return config.behavior.horizon is None and config.fit.gradient == "exact"
 
 
 def method_of(posterior: MapPosterior, config: MapConfig) -> PosteriorMethod:
@@ -128,32 +155,30 @@ def method_of(posterior: MapPosterior, config: MapConfig) -> PosteriorMethod:
     return "mean_field" if config.prior.kind == "binary" else "mode"
 
 
-def sweeps_for(config: MapConfig, unknown: int, goals: int) -> tuple[int, int]:
+def sweeps_for(config: MapConfig, size: MapSize) -> tuple[int, int]:
     """Return the fewest and the most sweeps: the configured number for both, or numbers by the size.
 
     Args:
         config: The configuration.
-        unknown: The number of unknown cells.
-        goals: The number of tasks.
+        size: The size of the map.
     """
     if config.posterior.sweeps is not None:
         return config.posterior.sweeps, config.posterior.sweeps
-    most = max(_FEWEST_SWEEPS, min(_MOST_SWEEPS, _PROPOSALS // max(1, unknown * goals)))
+    most = max(_FEWEST_SWEEPS, min(_MOST_SWEEPS, _PROPOSALS // max(1, size.unknown * size.goals)))
     return min(_FIRST_SWEEPS, most), most
 
 
-def starts_for(unknown: int, goals: int) -> int:
-    """Return the number of starts of a mean field, by the size of the map.
+def starts_for(size: MapSize) -> int:
+    """Return the number of starts of a mean field.
 
     Args:
-        unknown: The number of unknown cells.
-        goals: The number of tasks.
+        size: The size of the map.
 
     Example:
-        >>> starts_for(100, 10), starts_for(2400, 12)
+        >>> starts_for(MapSize(100, 100, 10)), starts_for(MapSize(2400, 2400, 12))
         (4, 1)
     """
-    return max(1, min(_STARTS, _SEVERAL_STARTS // max(1, unknown * goals)))
+    return max(1, min(_STARTS, _SEVERAL_STARTS // max(1, size.unknown * size.goals)))
 
 
 def barrier_prior(
@@ -231,11 +256,10 @@ def infer_map(
         InputError: For settings or demonstrations that do not fit, as `sidestep.fit` and `sample_barriers` do.
     """
     behavior, known = behavior or behavior_model_of(config), np.asarray(model.known)
-    size = int((known == Cell.UNKNOWN).sum()), len(demonstrations.tasks.terminal)
-    method = posterior_method(config, *size)
+    size = MapSize(int((known == Cell.UNKNOWN).sum()), known.size, len(demonstrations.tasks.terminal))
+    method = posterior_method(config, size)
     run: dict[str, Any] = {"checkpoint": checkpoint, "resume": resume}
-    exact = config.behavior.horizon is None and config.fit.gradient == "exact"
-    if method == "mode" or (method == "mean_field" and not (exact and size[0] * size[1] <= MAX_SAMPLED)):
+    if method == "mode" or (method == "mean_field" and not (_has_exact_values(config) and size.sampled)):
         return fit_map(model, demonstrations, config, sensor=sensor, behavior=behavior, callback=callback, **run)
     message = "maps are sampled without a horizon: expected none, or the posterior mean_field"
     check(config.behavior.horizon is None, message, field="horizon")
@@ -248,11 +272,11 @@ def infer_map(
     run |= {"tempering": config.agents.tempering, "seed": config.seed, "report": callback}
     run |= {"terms": ALL_TERMS if config.fit.terms == "both" else (config.fit.terms,)}
     if method == "mean_field":
-        prior, starts = barrier_prior(config.prior, known, method, sensor), starts_for(*size)
+        prior, starts = barrier_prior(config.prior, known, method, sensor), starts_for(size)
         limit = {} if config.fit.max_iterations is None else {"max_sweeps": config.fit.max_iterations}
         posterior = mean_field_barriers(model, demonstrations, agents, prior=prior, starts=starts, **limit, **run)
     else:
-        prior, (sweeps, most) = sampled_prior(config.prior, known, sensor), sweeps_for(config, *size)
+        prior, (sweeps, most) = sampled_prior(config.prior, known, sensor), sweeps_for(config, size)
         settings = {"sweeps": sweeps, "most_sweeps": most, "chains": config.posterior.chains}
         posterior = sample_barriers(model, demonstrations, agents, prior=prior, **settings, **run)
     return replace(posterior, learned_behavior=learned.learned_behavior) if learned else posterior
@@ -307,7 +331,8 @@ def fit_map(
         visited = np.zeros(model.graph.states, dtype=bool)
         for states in (demonstrations.states, demonstrations.next_states):
             visited[np.asarray(states)[weights > 0]] = True
-        model = model.with_parameters(jnp.where(jnp.asarray(~visited & unknown), _BLOCKED_LOGIT, model.parameters))
+        blocked = _BLOCKED_LOGIT[config.prior.kind]
+        model = model.with_parameters(jnp.where(jnp.asarray(~visited & unknown), blocked, model.parameters))
     return fit(
         model,
         demonstrations,
