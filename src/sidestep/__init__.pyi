@@ -84,7 +84,6 @@ from .inference.coordinate_ascent import (
     AscentProgress as AscentProgress,
     BarrierMeanField as BarrierMeanField,
     mean_field_barriers as mean_field_barriers,
-    prior_mean_field as prior_mean_field,
 )
 from .inference.diagnostics import effective_sizes as effective_sizes, split_rhat as split_rhat
 from .inference.enumeration import ExactPosterior as ExactPosterior, enumerate_barriers as enumerate_barriers

@@ -130,6 +130,11 @@ def test_prior_mean_field_satisfies_its_equation(start):
         assert means[i] == pytest.approx(expit(objective(shut) - objective(opened)), abs=2e-3), i
 
 
+def test_prior_mean_field_of_another_size_raises():
+    with pytest.raises(InputError, match=r"'known'.*expected 3 barriers, found 4"):
+        prior_mean_field(BinaryMRF(np.zeros(3)), np.full(4, -1), np.zeros(4))
+
+
 # Runs
 
 
@@ -157,10 +162,17 @@ def test_mean_field_barriers_resumed_is_the_same_to_the_bit(tmp_path):
         ascended(one, checkpoint=file, resume=True, seed=1)
 
 
+def test_mean_field_barriers_stopped_at_max_sweeps_continues(tmp_path):
+    one, file = world(), Checkpoint(tmp_path / "ascent", min_interval=0.0, max_fraction=1.0)
+    ascended(one, checkpoint=file, max_sweeps=2)
+    assert_equal(ascended(one, checkpoint=file, resume=True), ascended(one))
+
+
 def test_mean_field_barriers_reports_each_sweep():
     reports = []
-    result = ascended(world(), report=reports.append)
-    assert tuple(reports) == result.history
+    result = ascended(world(), starts=1, report=reports.append)
+    assert [each._replace(total=0) for each in reports] == [each._replace(total=0) for each in result.history]
+    assert reports[0].total == 100
     assert result.final.gap <= 1e-3 < result.history[0].gap
     assert f"{len(reports)} sweeps" in result.description
 
@@ -170,6 +182,22 @@ def test_mean_field_barriers_at_max_sweeps_has_not_converged():
     assert result.status is Status.MAX_ITERATIONS
     assert not result.converged
     assert not result.summary()["converged"]
+
+
+def test_mean_field_barriers_tempered_by_actions_alone_is_near_the_exact_probabilities():
+    one = world("borders", beta=9.0)
+    settings: dict[str, Any] = {"tempering": 0.3, "terms": ("actions",)}
+    part, whole = (enumerate_barriers(*one.problem, one.prior, **each).closed for each in (settings, {}))
+    assert np.abs(ascended(one, **settings).closed - part).mean() < 0.06
+    assert np.abs(part - whole).max() > 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["slips", "turns"])
+def test_mean_field_barriers_of_other_models_is_near_the_exact_probabilities(kind):
+    one = world(kind)
+    exact = enumerate_barriers(*one.problem, one.prior).closed
+    assert np.abs(ascended(one).closed - exact).mean() < 0.06
 
 
 def test_mean_field_barriers_of_a_known_map_is_the_map():

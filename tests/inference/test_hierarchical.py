@@ -55,13 +55,14 @@ def test_log_normalizers_without_shapes_are_those_of_independent_barriers():
     np.testing.assert_allclose(found[:, 0], expected, rtol=1e-12)
 
 
-def test_evidence_normalizers_count_crossed_cells_by_their_weight():
-    """Of 4 crossed cells, 2 count: log Z lies half of the way to that of all unknown cells."""
+@pytest.mark.parametrize(("most_crossed", "part"), [(2.0, 2 / 4), (0.1, 12 / 36 / 4)])
+def test_evidence_normalizers_count_crossed_cells_by_their_weight(most_crossed, part):
+    """Of 4 crossed cells, 2 or a 36th of the 12 count: log Z is between that of cells not crossed and that of all."""
     known = np.full(12, int(Cell.UNKNOWN))
     free = np.arange(4, 12)
-    found = evidence_normalizers(small_prior(most_crossed=2.0), known, free, seed=0)
+    found = evidence_normalizers(small_prior(most_crossed), known, free, seed=0)
     given = log_sums(small_prior(), MAPS[~MAPS[:, :4].any(axis=1)])
-    np.testing.assert_allclose(found, 0.5 * given + 0.5 * log_sums(small_prior(), MAPS), atol=0.2)
+    np.testing.assert_allclose(found, (1 - part) * given + part * log_sums(small_prior(), MAPS), atol=0.2)
 
 
 def test_as_hierarchical_has_the_density_of_the_prior():

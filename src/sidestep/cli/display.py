@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
+    from sidestep.inference.coordinate_ascent import AscentProgress
     from sidestep.inference.maximize import Progress as FitProgress
     from sidestep.inference.sampler import SweepProgress
 
-    FitCallback = Callable[[FitProgress | SweepProgress], None]
+    FitCallback = Callable[[FitProgress | AscentProgress | SweepProgress], None]
 
 _HEADINGS = {
     "auc": "AUC",
@@ -117,7 +118,7 @@ def fit_progress(iterations: int) -> "Iterator[FitCallback]":
     with _bar("at most", left="left; {task.fields[state]}") as bar:
         task = bar.add_task("learning", total=iterations, state="compiling")
 
-        def report(progress: "FitProgress | SweepProgress") -> None:
+        def report(progress: "FitProgress | AscentProgress | SweepProgress") -> None:
             bar.update(task, completed=progress.iteration, total=progress.total, state=progress.description)
 
         yield report

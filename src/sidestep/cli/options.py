@@ -88,7 +88,7 @@ class LearnOptions:
     ] = None
     posterior: Annotated[
         Literal["sample", "mean-field", "mode"] | None,
-        Option(help="Samples of maps, or a fit; by default by the prior and the size."),
+        Option(help="Samples of maps, independent cells, or a mode; by default by the prior and the size."),
     ] = None
     sweeps: Annotated[
         int | None,
@@ -114,7 +114,9 @@ class LearnOptions:
     gradient: Annotated[
         Literal["exact", "fixed-policy"], Option(help="exact (L-BFGS), or the paper's approximation (Adam).")
     ] = "exact"
-    max_iterations: Annotated[int | None, Option(help="The most iterations.")] = FitConfig.max_iterations
+    max_iterations: Annotated[int | None, Option(help="The most iterations of a fit or a mean field.")] = (
+        FitConfig.max_iterations
+    )
     memory: Annotated[float, Option(help="About how many GiB the fit may take.", metavar="GIB")] = FitConfig.memory
     max_walks: Annotated[int | None, Option(help="Learn from this many walks only, drawn by the seed.")] = None
     unknown_below: Annotated[

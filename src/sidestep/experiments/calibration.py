@@ -45,8 +45,8 @@ from sidestep.experiments.calibration_cases import (
     quantities_of,
 )
 from sidestep.experiments.output import Notify, Summary, quiet, write_results
+from sidestep.inference.coordinate_ascent import BarrierMeanField
 from sidestep.inference.diagnostics import effective_sizes
-from sidestep.inference.fit import Fit
 from sidestep.inference.sampler import BarrierPosterior
 from sidestep.maps.fit import infer_map
 from sidestep.plotting.ranks import figure_ranks
@@ -62,7 +62,7 @@ class CaseResult(NamedTuple):
         mean_field: The same among draws of the mean field.
         effective_sizes: How many independent draws the sampler's draws of each quantity are worth.
         mixed: Whether the sampler's chains have mixed.
-        converged: Whether the mean field's fit has converged.
+        converged: Whether the mean field has converged.
     """
 
     sampler: Int[np.ndarray, " quantities"]
@@ -121,10 +121,10 @@ def case_result(config: CalibrationConfig, case: Case, random: np.random.Generat
     """
     model = ss.ObstacleGrid(config.grid)
     posterior = infer_map(model, case.walks, config.learning("sample", draw_seed(random)))
-    fit = infer_map(model, case.walks, config.learning("mean_field"))
+    mean_field = infer_map(model, case.walks, config.learning("mean_field"))
     assert isinstance(posterior, BarrierPosterior)
-    assert isinstance(fit, Fit)
-    closed = np.where(posterior.sampled, np.asarray(fit.model.blocked, np.float64).ravel(), 0.0)
+    assert isinstance(mean_field, BarrierMeanField)
+    closed = mean_field.closed
     sampled, independent = thinned(posterior, config.draws), random.random((config.draws, len(closed))) < closed
     truth, of_sampled, of_independent = (
         quantities_of(config, case.walks, maps) for maps in (case.closed[None], sampled, independent)
@@ -132,7 +132,7 @@ def case_result(config: CalibrationConfig, case: Case, random: np.random.Generat
     # no path is longer than there are cells, but an infinite length would have no variance
     by_chain = np.minimum(of_sampled, len(closed)).reshape(len(posterior.samples), -1, len(QUANTITIES))
     by_sampler, by_mean_field = (ranks_of(truth[0], draws, random) for draws in (of_sampled, of_independent))
-    return CaseResult(by_sampler, by_mean_field, effective_sizes(by_chain), posterior.converged, fit.converged)
+    return CaseResult(by_sampler, by_mean_field, effective_sizes(by_chain), posterior.converged, mean_field.converged)
 
 
 def thinned(posterior: BarrierPosterior[Any], count: int) -> Draws:

@@ -9,6 +9,8 @@
 2. **The likelihood.** The log-probabilities of the choices in solved states are computed anew, and the probabilities
    of the transitions out of changed states.
 3. **Undoing.** The old values are kept until the proposal is accepted, and restored otherwise.
+
+A mean field follows changes of probabilities by the same steps (`ascend`; see `coordinate_ascent`).
 """
 
 from functools import cache
@@ -126,7 +128,7 @@ class ChainKernels(NamedTuple):
     Attributes:
         refresh: Compute everything from the barriers.
         sweep: Make proposals, and accept or reject each.
-        ascend: Update the P(closed) of a mean field (`mean_field`).
+        ascend: Update P(closed) of each barrier of a mean field (`coordinate_ascent`).
     """
 
     refresh: NativeFunction

@@ -56,6 +56,9 @@ Model = TypeVar("Model", bound=TransitionModel)
 
 _TOLERANCE = 1e-3
 """The largest gap between P(closed) and what the other barriers imply at which the mean field has converged."""
+Sweep = Float[np.ndarray, "starts 4"]
+"""Of each start after a sweep, the largest gap and the parts of the objective: of actions, transitions, the prior."""
+
 _WHOLE_SWEEPS = 4
 """The number of first sweeps with whole steps."""
 _NEARLY = (0.02, 0.98)
@@ -71,26 +74,23 @@ class AscentProgress(NamedTuple):
 
     Attributes:
         iteration: The number of sweeps so far.
+        total: The most sweeps that there may be.
         objective: log L + E[log p(z)] + H(q) in nats up to a constant, with L at the means; that of the best start.
         actions, transitions, prior: Its parts.
         gap: The largest difference between P(closed) and what the other barriers implied in the sweep, of all starts.
 
     Example:
-        >>> AscentProgress(1, objective=-3.0, actions=-2.0, transitions=-0.5, prior=-0.5, gap=0.2).total is None
-        True
+        >>> AscentProgress(1, 100, objective=-3.0, actions=-2.0, transitions=-0.5, prior=-0.5, gap=0.2).gap
+        0.2
     """
 
     iteration: int
+    total: int
     objective: float
     actions: float
     transitions: float
     prior: float
     gap: float
-
-    @property
-    def total(self) -> None:
-        """Return the number of all sweeps: it is not known."""
-        return None
 
     @property
     def description(self) -> str:
@@ -248,22 +248,24 @@ def mean_field_barriers(
     check_prior(barriers, prior)
     check_proper(demonstrations.tasks, agents.behavior_of(), model.graph.actions)
     problem = barrier_problem(barriers, demonstrations, agents, prior, tempering=tempering, terms=terms)
-    states = _starts(problem, prior, starts, max_sweeps, seed)
-    saver = Saver(checkpoint, fingerprint((astuple(problem), starts, max_sweeps, seed)))
-    done = _load(saver, states) if resume else 0
-    while done < max_sweeps and not (done and all(_settled(state.gaps[:done]) for state in states)):
-        places = [(at, done) for at in range(starts)]
-        run_batch(lambda place: _sweep(problem, prior, states[place[0]], place[1]), places)
-        done += 1
+    states, history = _starts(problem, prior, starts, seed), list[Sweep]()
+    saver = Saver(checkpoint, fingerprint((astuple(problem), starts, seed)))
+    if resume:
+        history = _load(saver, states)
+    while len(history) < max_sweeps and not (history and (history[-1][:, 0] <= _TOLERANCE).all()):
+        after = np.zeros((starts, 4)) if not history else history[-1].copy()
+        _sweep_all(problem, prior, states, len(history), after)
+        history.append(after)
         if report is not None:
-            report(_progress(states, done))
-        saver.save(states, [[done]])
-    parts, weights = _mixture(states, done, problem.free)
+            report(_progress(after, len(history), max_sweeps))
+        saver.save([_saved(state) for state in states], [each.ravel().tolist() for each in history])
+    kept = _different(states, history[-1], problem.free)
+    parts, weights = np.stack([states[at].means for at in kept]), softmax(history[-1][kept, 1:].sum(axis=1))
     learned = with_closed(model, np.clip(weights @ parts, _SURE, 1 - _SURE))
     inferred = np.isin(np.arange(parts.shape[1]), problem.free)
-    history = tuple(_progress(states, number) for number in range(1, done + 1))
-    status = Status.CONVERGED if history[-1].gap <= _TOLERANCE else Status.MAX_ITERATIONS
-    return BarrierMeanField(learned, agents, inferred, parts, weights, history, status)
+    progress = tuple(_progress(each[kept], number, len(history)) for number, each in enumerate(history, 1))
+    status = Status.CONVERGED if progress[-1].gap <= _TOLERANCE else Status.MAX_ITERATIONS
+    return BarrierMeanField(learned, agents, inferred, parts, weights, progress, status)
 
 
 def prior_mean_field(
@@ -279,33 +281,35 @@ def prior_mean_field(
         prior: The prior.
         known: The `Cell` value of each barrier; known ones have 0 or 1.
         start: P(closed) at which the ascent begins; strong shape terms have several mean fields.
-        max_sweeps: The most sweeps.
+        max_sweeps: The most sweeps; it ends earlier where no P(closed) changes by more than 1e-3.
+
+    Raises:
+        InputError: For another number of barriers.
 
     Example:
         >>> prior_mean_field(BinaryMRF(np.zeros(3)), np.array([-1, 0, 1]), np.zeros(3)).tolist()
         [0.5, 0.0, 1.0]
     """
-    free, terms, gaps = np.flatnonzero(known == Cell.UNKNOWN), native_terms(prior), list[float]()
-    means = np.where(known == Cell.UNKNOWN, start, known == Cell.OCCUPIED)
-    while len(gaps) < max_sweeps and not _settled(gaps):
-        gaps.append(float(ascend_prior(_order(free, len(gaps)), _step(len(gaps)), terms, means)))
+    for name, values in (("known", known), ("start", start)):
+        size = len(prior.field)
+        check(len(values) == size, f"expected {size} barriers, found {len(values)}", field=name)
+    free, terms = np.flatnonzero(known == Cell.UNKNOWN), native_terms(prior)
+    means = np.where(known == Cell.UNKNOWN, start, known == Cell.OCCUPIED).astype(np.float64)
+    for number in range(max_sweeps):
+        if ascend_prior(_order(free, number), _step(number), terms, means) <= _TOLERANCE:
+            break
     return means
 
 
 class _State(NamedTuple):
-    """The state of an ascent, changed in place: a chain with mean probabilities, its memory, P(closed), its history.
-
-    `objectives` are the parts of the objective, of actions, transitions and the prior, after each sweep.
-    """
+    """The state of an ascent, changed in place: a chain with mean probabilities, its memory, and P(closed)."""
 
     chain: Chain
     work: Workspace
     means: Float[np.ndarray, " barriers"]
-    gaps: Float[np.ndarray, " sweeps"]
-    objectives: Float[np.ndarray, "sweeps 3"]
 
 
-def _starts(problem: BarrierProblem, prior: BinaryMRF, starts: int, max_sweeps: int, seed: int) -> list[_State]:
+def _starts(problem: BarrierProblem, prior: BinaryMRF, starts: int, seed: int) -> list[_State]:
     """Return the mean field of the prior without shape terms, and barriers that are open or closed at random."""
     random, free = np.random.default_rng(seed), problem.free
     occupied = problem.barriers.known == Cell.OCCUPIED
@@ -316,24 +320,30 @@ def _starts(problem: BarrierProblem, prior: BinaryMRF, starts: int, max_sweeps: 
         chain, work = problem.allocate(occupied.astype(np.uint8))
         open_, closed = problem.world.passing[free].T
         chain.passing[free] = (1 - means[free]) * open_ + means[free] * closed
-        states.append(_State(chain, work, means, np.zeros(max_sweeps), np.zeros((max_sweeps, 3))))
+        states.append(_State(chain, work, means))
     return states
 
 
-def _sweep(problem: BarrierProblem, prior: BinaryMRF, state: _State, number: int) -> None:
-    """Set P(closed) of each barrier in turn, unless the ascent has converged."""
-    gaps = state.gaps[:number]
-    if _settled(gaps):
-        state.gaps[number], state.objectives[number] = state.gaps[number - 1], state.objectives[number - 1]
-        return
+def _sweep_all(problem: BarrierProblem, prior: BinaryMRF, states: Sequence[_State], number: int, after: Sweep) -> None:
+    """Make a sweep from every start that has not converged; fill in its gap and objective."""
+
+    def sweep(place: tuple[int, ...]) -> None:
+        (at,) = place
+        after[at] = _sweep(problem, prior, states[at], number)
+
+    run_batch(sweep, [(at,) for at in range(len(states)) if number == 0 or after[at, 0] > _TOLERANCE])
+
+
+def _sweep(problem: BarrierProblem, prior: BinaryMRF, state: _State, number: int) -> tuple[float, ...]:
+    """Set P(closed) of each barrier in turn; return the largest gap and the parts of the objective."""
     if number == 0:
         problem.solve(state.chain)
         problem.refresh(state.chain, state.work)
     arguments = problem.world, problem.evidence, native_terms(prior), state.means, state.chain, state.work
     ascend, order = problem.kernels.ascend, _order(problem.free, number)
-    state.gaps[number] = ascend(order, _step(number), *arguments, *problem.backup, NEG_INF)
+    gap = ascend(order, _step(number), *arguments, *problem.backup, NEG_INF)
     problem.refresh(state.chain, state.work)
-    state.objectives[number] = *state.chain.totals, _mean_log_density(prior, state.means)
+    return gap, *state.chain.totals.tolist(), _mean_log_density(prior, state.means)
 
 
 def _order(free: Int[np.ndarray, " free"], number: int) -> Int[np.ndarray, " free"]:
@@ -345,10 +355,6 @@ def _step(number: int) -> float:
     return 1.0 if number < _WHOLE_SWEEPS else 0.5
 
 
-def _settled(gaps: Sequence[float] | Float[np.ndarray, " sweeps"]) -> bool:
-    return len(gaps) > 0 and bool(gaps[-1] <= _TOLERANCE)
-
-
 def _mean_log_density(prior: BinaryMRF, closed: Float[np.ndarray, " barriers"]) -> float:
     """Return E[log p(z)] + H(q), up to a constant."""
     total = prior.field @ closed + entr(closed).sum() + entr(1 - closed).sum()
@@ -357,30 +363,32 @@ def _mean_log_density(prior: BinaryMRF, closed: Float[np.ndarray, " barriers"]) 
     return float(total)
 
 
-def _mixture(
-    states: Sequence[_State], done: int, free: Int[np.ndarray, " free"]
-) -> tuple[Float[np.ndarray, "parts barriers"], Float[np.ndarray, " parts"]]:
-    """Return the mean fields that differ, the best first, and their weights."""
-    scores = np.array([state.objectives[done - 1].sum() for state in states])
+def _different(states: Sequence[_State], last: Sweep, free: Int[np.ndarray, " free"]) -> list[int]:
+    """Return the starts with mean fields that differ, the best first."""
     kept: list[int] = []
-    for at in np.argsort(-scores, kind="stable").tolist():
+    for at in np.argsort(-last[:, 1:].sum(axis=1), kind="stable").tolist():
         gaps = [np.abs(states[at].means - states[other].means)[free].max(initial=0.0) for other in kept]
         if min(gaps, default=1.0) > _DIFFERENT:
             kept.append(at)
-    return np.stack([states[at].means for at in kept]), softmax(scores[kept])
+    return kept
 
 
-def _progress(states: Sequence[_State], done: int) -> AscentProgress:
-    """Return the progress after a number of sweeps."""
-    best = max((state.objectives[done - 1] for state in states), key=np.sum)
-    actions, transitions, prior = best.tolist()
-    gap = max(float(state.gaps[done - 1]) for state in states)
-    return AscentProgress(done, actions + transitions + prior, actions, transitions, prior, gap)
+def _progress(sweep: Sweep, number: int, total: int) -> AscentProgress:
+    """Return the progress after a sweep."""
+    actions, transitions, prior = max(sweep[:, 1:].tolist(), key=sum)
+    gap = float(sweep[:, 0].max())
+    return AscentProgress(number, total, actions + transitions + prior, actions, transitions, prior, gap)
 
 
-def _load(saver: Saver, states: list[_State]) -> int:
-    """Fill in the states from a checkpoint; return the number of sweeps that they have made."""
-    saved, history, _ = saver.load(states)
-    for into, array in zip(jax.tree.leaves(states), jax.tree.leaves(saved), strict=True):
-        into[...] = array
-    return int(history[0][0]) if history else 0
+def _saved(state: _State) -> tuple[np.ndarray, ...]:
+    """Return the arrays on which the future of an ascent depends."""
+    return *state.chain, state.work.counters, state.means
+
+
+def _load(saver: Saver, states: Sequence[_State]) -> list[Sweep]:
+    """Fill in the states from a checkpoint; return the sweeps that they have made."""
+    saved, history, _ = saver.load([_saved(state) for state in states])
+    for state, arrays in zip(states, saved, strict=True):
+        for into, array in zip(_saved(state), arrays, strict=True):
+            into[...] = array
+    return [np.array(row, np.float64).reshape(len(states), 4) for row in history]

@@ -63,7 +63,7 @@ class Status(enum.Enum):
 
     Example:
         >>> Status.MAX_ITERATIONS.advice
-        'a larger max_iterations of the optimizer lets it continue'
+        'a larger max_iterations lets it continue'
     """
 
     CONVERGED = "converged"
@@ -81,7 +81,7 @@ class Status(enum.Enum):
 
 _ADVICE = {
     Status.NOT_MIXED: "more sweeps let the chains agree",
-    Status.MAX_ITERATIONS: "a larger max_iterations of the optimizer lets it continue",
+    Status.MAX_ITERATIONS: "a larger max_iterations lets it continue",
     Status.NO_ASCENT_STEP: (
         "the objective has a kink here (as with HardMax), or the solver's tolerance does not resolve smaller changes"
     ),

@@ -10,7 +10,8 @@ sums over q are exact, because every shape term is a product of different barrie
 `fit(..., prior=MeanField(prior, known))` finds θ, and its P(closed) is σ(θ).
 
 Strong shape terms have several optima, and where one of several barriers explains a detour, one is chosen or all are
-half closed. `sample_barriers` has neither fault.
+half closed. `sample_barriers` has neither fault. `coordinate_ascent` has the difference of log L between closed and
+open instead of its slope, and is nearer the posterior; this module is for sizes and agents that it does not take.
 """
 
 import jax

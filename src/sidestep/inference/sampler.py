@@ -105,7 +105,7 @@ class BarrierPosterior(Generic[Model]):
     Attributes:
         model: The transition model with the posterior's P(closed).
         behavior: The behavior model; it is not sampled.
-        densities: δ and λ of the prior in each sweep that counts (`HierarchicalMRF`); of no sweep where they are known.
+        densities: δ and λ of the prior in each sweep that counts (`HierarchicalMRF`); empty where they are known.
         sampled: Whether each barrier was sampled; the others are known, or walks crossed them.
         samples: Whether each barrier is closed, after each sweep that counts, for each chain.
         closed: P(closed) of each barrier: (n + ½)/(N + 1) of n samples in N; exactly 0 or 1 where it is known.

@@ -177,7 +177,7 @@ class FitConfig:
     Attributes:
         terms: The parts of the likelihood that count.
         gradient: "exact" (L-BFGS, on large maps Rprop) or the paper's "fixed_policy" (Adam).
-        max_iterations: The most iterations, at least 1; None for the optimizer's own limit.
+        max_iterations: The most iterations of a fit, or sweeps of a mean field, at least 1; None for their own limits.
         memory: About how many GiB the arrays of the fit may take, above 0.
         large_map: The number of cells from which a map counts as large.
 

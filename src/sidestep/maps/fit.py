@@ -54,8 +54,6 @@ _PROPOSALS, _FEWEST_SWEEPS, _MOST_SWEEPS = 12_000_000, 150, 800
 """Chains are continued up to this number over unknown cells × goals sweeps, within these bounds."""
 _FIRST_SWEEPS = 200
 """The number of sweeps after which it is first checked whether chains have mixed."""
-_STARTS, _SEVERAL_STARTS = 4, 20_000
-"""The most starts of a mean field, and about the most that they may be times unknown cells × goals."""
 _BLOCKED_LOGIT = {"normal": 8.0, "binary": 5.0}
 """The first logit of an unvisited cell of a large map by its prior: some 3,000 or 150 tries, longer than most detours.
 The gradient of a mean field has a factor p (1 − p), and so vanishes where a cell is more surely blocked."""
@@ -168,19 +166,6 @@ def sweeps_for(config: MapConfig, size: MapSize) -> tuple[int, int]:
     return min(_FIRST_SWEEPS, most), most
 
 
-def starts_for(size: MapSize) -> int:
-    """Return the number of starts of a mean field.
-
-    Args:
-        size: The size of the map.
-
-    Example:
-        >>> starts_for(MapSize(100, 100, 10)), starts_for(MapSize(2400, 2400, 12))
-        (4, 1)
-    """
-    return max(1, min(_STARTS, _SEVERAL_STARTS // max(1, size.unknown * size.goals)))
-
-
 def barrier_prior(
     config: PriorConfig,
     known: Int[np.ndarray, "rows columns"],
@@ -237,7 +222,7 @@ def infer_map(
     checkpoint: str | Path | None = None,
     resume: bool = False,
 ) -> MapPosterior:
-    """Find the posterior of an obstacle grid after demonstrations: samples of maps, or a fit.
+    """Find the posterior of an obstacle grid after demonstrations: samples of maps, a mean field, or a fit.
 
     Args:
         model: The grid; its parameters are where a fit starts.
@@ -250,7 +235,7 @@ def infer_map(
         resume: Continue from the checkpoint.
 
     Returns:
-        Samples or a fit, by `posterior_method`.
+        Samples, a mean field or a fit, by `posterior_method` and the size.
 
     Raises:
         InputError: For settings or demonstrations that do not fit, as `sidestep.fit` and `sample_barriers` do.
@@ -272,9 +257,10 @@ def infer_map(
     run |= {"tempering": config.agents.tempering, "seed": config.seed, "report": callback}
     run |= {"terms": ALL_TERMS if config.fit.terms == "both" else (config.fit.terms,)}
     if method == "mean_field":
-        prior, starts = barrier_prior(config.prior, known, method, sensor), starts_for(size)
+        # one start: random maps lead to phases of the prior in which floors without walks are full of walls
+        prior = barrier_prior(config.prior, known, method, sensor)
         limit = {} if config.fit.max_iterations is None else {"max_sweeps": config.fit.max_iterations}
-        posterior = mean_field_barriers(model, demonstrations, agents, prior=prior, starts=starts, **limit, **run)
+        posterior = mean_field_barriers(model, demonstrations, agents, prior=prior, starts=1, **limit, **run)
     else:
         prior, (sweeps, most) = sampled_prior(config.prior, known, sensor), sweeps_for(config, size)
         settings = {"sweeps": sweeps, "most_sweeps": most, "chains": config.posterior.chains}

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from sidestep.errors import check
+from sidestep.inference.coordinate_ascent import AscentProgress
 from sidestep.inference.maximize import Progress
 from sidestep.inference.sampler import BarrierPosterior, SweepProgress
 from sidestep.io.gridding import Moves, grid_walks
@@ -62,7 +63,7 @@ class Learning:
 
     Attributes:
         config: The configuration; with persons, β is learned.
-        fit: The posterior, as samples or a fit: model, behavior, history, convergence.
+        fit: The posterior, as samples, a mean field or a fit: model, behavior, history, convergence.
         demonstrations: The moves that counted.
         data: Their numbers.
         persons: β of each person, where persons were named.
@@ -120,7 +121,7 @@ def learn_map(
     *,
     sensor: SensorMap | None = None,
     annotations: WalkAnnotations = NO_ANNOTATIONS,
-    callback: Callable[[Progress | SweepProgress], None] | None = None,
+    callback: Callable[[Progress | AscentProgress | SweepProgress], None] | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
 ) -> LearnedMap:
