@@ -111,7 +111,7 @@ def expected_shapes(padded: Any) -> list[Any]:
         padded: P(closed) of each cell with a border of zeros around; an array of NumPy or JAX.
 
     Example:
-        >>> expected_shapes(np.pad(np.array([[1.0, 0.5, 1.0]]), 1))
+        >>> [float(mean) for mean in expected_shapes(np.pad(np.array([[1.0, 0.5, 1.0]]), 1))]
         [0.5, 1.0, 0.0, 1.0]
     """
     inner, up, down = padded[1:-1, 1:-1], padded[:-2, 1:-1], padded[2:, 1:-1]
