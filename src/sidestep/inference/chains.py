@@ -17,12 +17,14 @@ from sidestep.inference.hierarchical import HierarchicalMRF, as_hierarchical, ev
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.inference.prior_chains import KINDS, is_free_of, native_terms
 from sidestep.inference.prior_kernels import MAX_CHANGED
-from sidestep.tabular.backups import HardMax
-from sidestep.tabular.behavior_model import BehaviorModel
+from sidestep.tabular.backups import Behavior, HardMax
+from sidestep.tabular.behavior_model import BehaviorModel, behavior_model
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Cell
 from sidestep.tabular.likelihood import ALL_TERMS, Terms
-from sidestep.tabular.models.barriers import NO_BARRIER, Barriers
+from sidestep.tabular.models import TransitionModel
+from sidestep.tabular.models.barriers import NO_BARRIER, Barriers, barriers_of
+from sidestep.tabular.solve import check_proper
 from sidestep.tabular.solvers.base import SolveResult, WarmStart, neg_inf
 from sidestep.tabular.solvers.gauss_seidel import KERNELS
 from sidestep.tabular.solvers.native import HostProcess, NativeBackup, NativeEquation
@@ -212,6 +214,38 @@ class BarrierProblem:
             scores = self._log_priors(state) + state.random.gumbel(size=scores.shape)
         row, column = np.unravel_index(scores.argmax(), scores.shape)
         return int(row), int(column)
+
+
+def problem_of(
+    model: TransitionModel,
+    demonstrations: Demonstrations,
+    behavior: Behavior | BehaviorModel,
+    prior: BinaryMRF | HierarchicalMRF,
+    *,
+    seed: int = 0,
+    tempering: float = 1.0,
+    terms: Terms = ALL_TERMS,
+) -> tuple[BarrierProblem, BehaviorModel]:
+    """Check what is to be inferred of a model; return it with the model of the agents.
+
+    Args:
+        model: A model of barriers (`barriers_of`).
+        demonstrations: The moves and tasks.
+        behavior: The behavior of the agents, or a fitted model of it.
+        prior: The prior of the barriers.
+        seed, tempering, terms: As for `barrier_problem`.
+
+    Raises:
+        InputError: For a model without barriers, a prior of another size, and a weight out of range.
+        ImproperTask: For tasks without finite values.
+    """
+    check(0 < tempering <= 1, f"expected a number in (0, 1], found {tempering}", field="tempering")
+    agents = behavior if isinstance(behavior, BehaviorModel) else behavior_model(behavior)
+    barriers = barriers_of(model)
+    check_prior(barriers, prior)
+    check_proper(demonstrations.tasks, agents.behavior_of(), model.graph.actions)
+    run: Any = {"seed": seed, "tempering": tempering, "terms": terms}
+    return barrier_problem(barriers, demonstrations, agents, prior, **run), agents
 
 
 def barrier_problem(

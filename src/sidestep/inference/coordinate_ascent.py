@@ -35,7 +35,7 @@ from scipy.special import entr, expit, softmax
 
 from sidestep.errors import check, check_count
 from sidestep.inference.chain_kernels import Chain, Workspace
-from sidestep.inference.chains import NEG_INF, BarrierProblem, barrier_problem, check_prior
+from sidestep.inference.chains import NEG_INF, BarrierProblem, problem_of
 from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
 from sidestep.inference.fit import Estimate
 from sidestep.inference.maximize import Status
@@ -43,13 +43,12 @@ from sidestep.inference.mrf import BinaryMRF, expected_shapes
 from sidestep.inference.prior_chains import native_terms
 from sidestep.inference.prior_kernels import ascend_prior
 from sidestep.tabular.backups import Behavior
-from sidestep.tabular.behavior_model import BehaviorModel, behavior_model
+from sidestep.tabular.behavior_model import BehaviorModel
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Cell
 from sidestep.tabular.likelihood import ALL_TERMS, Terms
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.models.barriers import barriers_of, with_closed
-from sidestep.tabular.solve import check_proper
+from sidestep.tabular.models.barriers import with_closed
 from sidestep.tabular.solvers.native import run_batch
 
 Model = TypeVar("Model", bound=TransitionModel)
@@ -242,12 +241,7 @@ def mean_field_barriers(
     """
     check_count(starts, 1, "starts")
     check_count(max_sweeps, 1, "max_sweeps")
-    check(0 < tempering <= 1, f"expected a number in (0, 1], found {tempering}", field="tempering")
-    agents = behavior if isinstance(behavior, BehaviorModel) else behavior_model(behavior)
-    barriers = barriers_of(model)
-    check_prior(barriers, prior)
-    check_proper(demonstrations.tasks, agents.behavior_of(), model.graph.actions)
-    problem = barrier_problem(barriers, demonstrations, agents, prior, tempering=tempering, terms=terms)
+    problem, agents = problem_of(model, demonstrations, behavior, prior, tempering=tempering, terms=terms)
     states, history = _starts(problem, prior, starts, seed), list[Sweep]()
     saver = Saver(checkpoint, fingerprint((astuple(problem), starts, seed)))
     if resume:

@@ -37,8 +37,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
-from sidestep.errors import check, check_count
-from sidestep.inference.chains import BarrierProblem, ChainState, barrier_problem, check_prior
+from sidestep.errors import check_count
+from sidestep.inference.chains import BarrierProblem, ChainState, problem_of
 from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
 from sidestep.inference.diagnostics import effective_sizes, split_rhat
 from sidestep.inference.fit import Estimate
@@ -46,13 +46,12 @@ from sidestep.inference.hierarchical import HierarchicalMRF
 from sidestep.inference.maximize import Status
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.tabular.backups import Behavior
-from sidestep.tabular.behavior_model import BehaviorModel, behavior_model
+from sidestep.tabular.behavior_model import BehaviorModel
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Cell
 from sidestep.tabular.likelihood import ALL_TERMS, Terms
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.models.barriers import barriers_of, with_closed
-from sidestep.tabular.solve import check_proper
+from sidestep.tabular.models.barriers import with_closed
 from sidestep.tabular.solvers.native import run_batch
 
 Model = TypeVar("Model", bound=TransitionModel)
@@ -279,12 +278,8 @@ def sample_barriers(
     most = sweeps if most_sweeps is None else most_sweeps
     check_count(most, sweeps, "most_sweeps")
     check_count(chains, 2, "chains")
-    check(0 < tempering <= 1, f"expected a number in (0, 1], found {tempering}", field="tempering")
-    agents = behavior if isinstance(behavior, BehaviorModel) else behavior_model(behavior)
-    barriers = barriers_of(model)
-    check_prior(barriers, prior)
-    check_proper(demonstrations.tasks, agents.behavior_of(), model.graph.actions)
-    problem = barrier_problem(barriers, demonstrations, agents, prior, seed=seed, tempering=tempering, terms=terms)
+    problem, agents = problem_of(model, demonstrations, behavior, prior, seed=seed, tempering=tempering, terms=terms)
+    barriers = problem.barriers
     states = start_chains(problem, most, chains, seed)
     saver = Saver(checkpoint, fingerprint((astuple(problem), sweeps, most, chains, seed)))
     done = _load(saver, states) if resume else 0
