@@ -19,7 +19,8 @@ from sidestep.continuous.tasks import ContinuousTask, batch_tasks, check_tasks, 
 from sidestep.errors import NotConverged, check, check_count
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory
-from sidestep.tabular.solve import SolveOptions, check_proper, solve
+from sidestep.tabular.proper import check_proper
+from sidestep.tabular.solve import SolveOptions, solve
 
 
 def simulate_trajectories(
@@ -72,7 +73,7 @@ def simulate_trajectories(
         fits = np.isfinite(own).all() and np.shape(own)[1:] == real.noise.shape
         check(fits, f"expected rows of {len(real.noise)} finite numbers", source=f"starts of task {index}")
         table = agent.tabular_task(task)
-        check_proper(table, agent.behavior, len(actions))
+        check_proper(table, agent.behavior, model.graph)
         solution = solve(model, table, agent.behavior, options=options)
         if not solution.converged:
             raise NotConverged(f"values did not converge for task {index}: a finer lattice or a smaller β may help")

@@ -29,7 +29,8 @@ from sidestep.tabular.behavior_model import BehaviorModel, behavior_model
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import ALL_TERMS, Terms
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.solve import SolveOptions, check_proper
+from sidestep.tabular.proper import check_proper
+from sidestep.tabular.solve import SolveOptions
 
 if TYPE_CHECKING:
     from sidestep.inference.information import Information
@@ -253,4 +254,4 @@ def _check_problem(problem: Problem, optimizer: Optimizer) -> None:
     persons = tasks if behavior.person is None else len(behavior.person)
     message = f"expected the person of each of the {tasks} tasks (see split_by_person), found {persons} persons"
     check(persons == tasks, message, field="person")
-    check_proper(behavior.tasks_of(demos.tasks), behavior.behavior_of(), graph.actions, options.horizon)
+    check_proper(behavior.tasks_of(demos.tasks), behavior.behavior_of(), graph, options.horizon)

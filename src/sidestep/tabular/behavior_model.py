@@ -13,6 +13,7 @@ pooling pulls a person with few moves towards the others.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -134,7 +135,7 @@ class BehaviorModel(eqx.Module):
             reward = reward + self.features @ self.parameters.reward_weights
         if self.parameters.logit_discount is not None:
             discount = jnp.broadcast_to(jax.nn.sigmoid(self.parameters.logit_discount), discount.shape)
-        return Task(reward, tasks.terminal_reward, tasks.terminal, discount)
+        return replace(tasks, reward=reward, discount=discount)
 
     def log_density(self) -> Float[Array, ""]:
         """Return the logarithm of the prior density of the parameters, in nats, without its constant."""

@@ -141,9 +141,10 @@ def _log_policies(
     model: TransitionModel, demonstrations: Demonstrations, behavior: Behavior, options: SolveOptions
 ) -> Float[Array, " moves"]:
     solution = solve(model, demonstrations.tasks, behavior, options=options)
-    q = visited_action_values(model, demonstrations, solution.values)
+    q = visited_action_values(model, demonstrations, solution.values_after)
     # a factor, so that the gradient is NaN too
-    return _log_policy(behavior, q, demonstrations.actions) * jnp.where(solution.converged.all(), 1.0, jnp.nan)
+    each = _log_policy(model, behavior, q, demonstrations.states, demonstrations.actions)
+    return each * jnp.where(solution.converged.all(), 1.0, jnp.nan)
 
 
 class Choices(NamedTuple):
@@ -188,7 +189,9 @@ def choice_log_likelihood(
     """
     solution = solve(model, task, behavior, options=options, start=start, visited=choices.states, region=region)
     q = solution.action_values
-    total = jnp.sum(choices.counts.astype(q.dtype) * _log_policy(behavior, q, choices.actions))
+    each = _log_policy(model, behavior, q, choices.states, choices.actions)
+    # those that do not count may be impossible
+    total = jnp.sum(jnp.where(choices.counts > 0, choices.counts.astype(q.dtype) * each, 0))
     return total * jnp.where(solution.converged, 1.0, jnp.nan), solution
 
 
@@ -265,13 +268,18 @@ def visited_action_values(
     Args:
         model: The transition model.
         demonstrations: Moves and tasks.
-        values: V of each task.
+        values: V of each task after an action (`Solution.values_after`).
     """
     tasks, task, states = demonstrations.tasks, demonstrations.task, demonstrations.states
     after = values[task[:, None, None], model.graph.successors[states]]
+    probabilities, available = model.probabilities()[states], model.graph.available
     reward = tasks.reward[task, states if tasks.reward.shape[1] > 1 else 0].astype(values.dtype)
+    if tasks.outcome_reward is not None:
+        of_outcomes = tasks.outcome_reward[task, states if tasks.outcome_reward.shape[1] > 1 else 0]
+        reward = reward + jnp.sum(probabilities * of_outcomes.astype(values.dtype), axis=-1)
+    mask = available[states if len(available) > 1 else jnp.zeros_like(states)]
     discount = tasks.discount[task, None].astype(values.dtype)
-    return action_values(values[task, states], after, model.probabilities()[states], reward, discount)
+    return action_values(values[task, states], after, probabilities, reward, mask, discount)
 
 
 def transition_probabilities(model: TransitionModel, moves: Demonstrations) -> Float[Array, " moves"]:
@@ -296,9 +304,15 @@ def _transition_probabilities(model: TransitionModel, moves: Arrivals) -> Float[
 
 
 def _log_policy(
-    behavior: Behavior, q: Float[Array, "visits actions"], actions: Int[Array, " visits"]
+    model: TransitionModel,
+    behavior: Behavior,
+    q: Float[Array, "visits actions"],
+    states: Int[Array, " visits"],
+    actions: Int[Array, " visits"],
 ) -> Float[Array, " visits"]:
-    return jnp.take_along_axis(behavior.log_policy(q), actions[:, None], axis=-1)[:, 0]
+    available = model.graph.available
+    mask = available[states] if len(available) > 1 else None
+    return jnp.take_along_axis(behavior.log_policy(q, mask), actions[:, None], axis=-1)[:, 0]
 
 
 def _first(each: Float[Array, " padded"], count: int) -> Float[Array, " moves"]:

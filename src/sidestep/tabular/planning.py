@@ -14,9 +14,10 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sidestep._programs import keep_program
 from sidestep.errors import NotConverged, check
-from sidestep.tabular.backups import Behavior, HardMax
+from sidestep.tabular.backups import Behavior, HardMax, tied_where_lost
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.solve import Solution, SolveOptions, check_proper, solve
+from sidestep.tabular.proper import check_proper
+from sidestep.tabular.solve import Solution, SolveOptions, solve
 from sidestep.tabular.solvers.base import is_reachable
 from sidestep.tabular.tasks import Task
 
@@ -120,7 +121,7 @@ def plan(
         [0, 1, 2, 3]
     """
     options, agent = options or SolveOptions(), behavior or Behavior(HardMax())
-    check_proper(task, agent, model.graph.actions, options.horizon)
+    check_proper(task, agent, model.graph, options.horizon)
     made = _plan(model, task, agent, behavior is None, options)
     solution = made.solution
     if not bool(solution.converged):
@@ -134,8 +135,13 @@ def plan(
 @keep_program
 def _plan(model: TransitionModel, task: Task, behavior: Behavior, optimal: bool, options: SolveOptions) -> Plan:
     solution = solve(model, task, behavior, options=options)
-    q = solution.action_values
-    policy = behavior.backup.fixed_policy_weights(q, behavior.beta) if optimal else jnp.exp(behavior.log_policy(q))
+    available = jnp.broadcast_to(model.graph.available, solution.action_values.shape)
+    q = tied_where_lost(solution.action_values, available)
+    policy = (
+        behavior.backup.fixed_policy_weights(q, behavior.beta)
+        if optimal
+        else jnp.exp(behavior.log_policy(q, available))
+    )
     states = jnp.arange(model.graph.states)
     best = jnp.argmax(policy, axis=-1)
     outcomes = model.graph.successors[states, best]

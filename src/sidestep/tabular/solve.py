@@ -17,11 +17,10 @@ from typing import cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.errors import ImproperTask, check, check_count
-from sidestep.tabular.backups import Backup, Behavior, Gradient, LogSumExp
+from sidestep.errors import check, check_count
+from sidestep.tabular.backups import Backup, Behavior, Gradient
 from sidestep.tabular.implicit import fixed_point
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solvers import base
@@ -86,8 +85,11 @@ class Solution(eqx.Module):
     """The values of a task under a model, with a leading `tasks` axis for several tasks; made by `solve`.
 
     Attributes:
-        values: V(s); at discount 1, near `solvers.base.neg_inf` (for −∞) where no terminal state can be reached.
-        action_values: Q(s, a) of all states, or of the `visited` ones.
+        values: V(s); at discount 1, −∞ where no policy surely reaches a terminal state.
+        values_after: V of the states that an action leads to, where Q = R + γ Σ T V: `values`, or with a horizon those
+            of acting once less.
+        action_values: Q(s, a) of all states, or of the `visited` ones; −∞ for actions that are not available, and at
+            discount 1 for those that may lead to a state of value −∞.
         sweeps: The number of times that each state was solved, on average; the horizon where it is finite.
         residual: The largest relative change in the last sweep; 0 for a finite horizon.
         converged: Whether the residual is within the solver's tolerance.
@@ -104,6 +106,7 @@ class Solution(eqx.Module):
     """
 
     values: Float[Array, "*tasks states"]
+    values_after: Float[Array, "*tasks states"]
     action_values: Float[Array, "*tasks visited actions"]
     sweeps: Int[Array, "*tasks"]
     residual: Float[Array, "*tasks"]
@@ -173,22 +176,26 @@ def solve(
             equation = base.BellmanEquation(process, behavior.backup, beta)
             inputs, fixed = equation.inputs, jax.lax.stop_gradient((equation.inputs, start))
             result = solver.values(equation.at(fixed[0]), fixed[1], region)
-            constants = (process.successors, process.terminal, solver, result.order, region, some)
+            structure = process.successors, process.terminal, process.available
+            constants = (*structure, solver, result.order, region, some)
             solved = fixed_point(behavior.backup, options.gradient, constants, inputs, result.values, start.adjoint)
             values, rows = cast(tuple[Array, Array], solved)
+            after = values
         else:
-            values = base.finite_horizon(process, behavior.backup, beta, options.horizon, options.gradient)
+            values, after = base.finite_horizon(process, behavior.backup, beta, options.horizon, options.gradient)
             sweeps, residual = jnp.asarray(options.horizon), jnp.asarray(0, values.dtype)
             result = base.SolveResult(values, start.order, sweeps, residual, jnp.isfinite(values).all())
             rows = probabilities[some]
         if visited is None:
-            q = process.action_values(values)
+            q = process.action_values(after)
         else:
-            reward = process.reward[visited] if len(process.reward) > 1 else process.reward
-            after = values[process.successors[visited]]
-            q = base.action_values(values[visited], after, rows, reward, process.discount)
+            reward, available = (
+                part[visited] if len(part) > 1 else part for part in (process.reward, process.available)
+            )
+            leads_to = after[process.successors[visited]]
+            q = base.action_values(after[visited], leads_to, rows, reward, available, process.discount)
         next_start = base.WarmStart(jax.lax.stop_gradient(values), start.adjoint, result.order)
-        return Solution(values, q, result.sweeps, result.residual, result.converged, next_start)
+        return Solution(values, after, q, result.sweeps, result.residual, result.converged, next_start)
 
     return (jax.vmap(one) if task.terminal.ndim == 2 else one)(task, begin, visited, everywhere)
 
@@ -198,6 +205,8 @@ def decision_process(
 ) -> base.DecisionProcess:
     """Return one task under a model with these probabilities, in numbers of their dtype.
 
+    Its rewards are the expected ones, R(s, a) + Σ_s′ T(s, a, s′) R(s, a, s′), with the gradient by the probabilities.
+
     Args:
         model: The transition model.
         probabilities: Its probabilities.
@@ -205,51 +214,7 @@ def decision_process(
     """
     cast = (leaf.astype(probabilities.dtype) for leaf in (task.reward, task.terminal_reward, task.discount))
     reward, terminal_reward, discount = cast
-    return base.DecisionProcess(model.graph.successors, probabilities, reward, terminal_reward, task.terminal, discount)
-
-
-def check_proper(task: Task, behavior: Behavior, actions: int, horizon: int | None = None) -> None:
-    """Check that the values of every task are finite and unique.
-
-    Tasks with a finite horizon or a discount below 1 are proper. At discount 1 a task needs a terminal state and every
-    action must have a cost; with the log-sum-exp backup one above log(actions)/β, the entropy bonus of an action, as
-    agents otherwise gain by never arriving.
-
-    Args:
-        task: One task or a stack.
-        behavior: Of the agents.
-        actions: The number of actions.
-        horizon: As in `SolveOptions`.
-
-    Raises:
-        InputError: For a task or behavior of another type.
-        ImproperTask: Where values are infinite or not unique.
-
-    Example:
-        >>> from sidestep.tabular.grid import Grid
-        >>> from sidestep.tabular.tasks import reach
-        >>> goal = reach(Grid.unknown(2, 2), 0, discount=1.0, step_cost=1.0)
-        >>> check_proper(goal, Behavior(LogSumExp(), beta=10.0), actions=4)
-    """
-    check(isinstance(task, Task), f"expected a Task, found {type(task).__name__}", field="task")
-    check(isinstance(behavior, Behavior), f"expected a Behavior, found {type(behavior).__name__}", field="behavior")
-    endless = np.atleast_1d(np.asarray(task.discount)) == 1
-    if horizon is not None or not endless.any():
-        return
-    terminal = np.atleast_2d(np.asarray(task.terminal))
-    reward = np.asarray(task.reward).reshape(-1, *task.reward.shape[-2:]).max(axis=-1)
-    acting = np.where(terminal, -np.inf, np.broadcast_to(reward, terminal.shape)).max(axis=-1)
-    if (endless & ~terminal.any(axis=-1)).any():
-        raise ImproperTask("a task with discount 1 needs a terminal state: expected one, or a discount below 1")
-    if (endless & (acting >= 0)).any():
-        raise ImproperTask(
-            "at discount 1 every action must cost something: expected rewards below 0, a discount below 1 (.99, say), "
-            "or for tasks of few actions `SolveOptions(horizon=…)`"
-        )
-    bonus = np.log(actions) / float(behavior.beta)
-    if isinstance(behavior.backup, LogSumExp) and (endless & (acting >= -bonus)).any():
-        raise ImproperTask(
-            f"at discount 1 a log-sum-exp agent with β = {float(behavior.beta):g} and {actions} actions gains "
-            f"log(actions)/β = {bonus:.4g} with every action, so an endless path is worth more than one to the goal: "
-            "expected a step cost above that, a larger β, a discount below 1 or another backup"
-        )
+    if task.outcome_reward is not None:
+        reward = reward + jnp.sum(probabilities * task.outcome_reward.astype(probabilities.dtype), axis=-1)
+    structure = task.terminal, model.graph.available
+    return base.DecisionProcess(model.graph.successors, probabilities, reward, terminal_reward, *structure, discount)
