@@ -63,7 +63,7 @@ from sidestep.errors import NotConverged
 from sidestep.tabular.forward_gradients import forward_gradient
 from sidestep.tabular.models import TabularModel
 from sidestep.tabular.solve import SolveOptions, decision_process, solve
-from sidestep.tabular.solvers.base import DecisionProcess, action_values, at_fixed_policy
+from sidestep.tabular.solvers.base import DecisionProcess, advantages, at_fixed_policy
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 
 __all__ = ["Options", "draw", "measure", "show"]
@@ -130,7 +130,7 @@ def log_likelihood(problem: Problem, parameters: Array, values: Array) -> Array:
     states, task = demos.states, jax.tree.map(lambda leaf: leaf[0], demos.tasks)
     after = values[model.graph.successors[states]]
     rest = task.reward, model.graph.available, task.discount
-    q = action_values(values[states], after, model.probabilities()[states], *rest)
+    q = advantages(values[states], after, model.probabilities()[states], *rest)
     return jnp.sum(jnp.take_along_axis(problem.behavior.log_policy(q), demos.actions[:, None], axis=-1))
 
 

@@ -25,9 +25,10 @@ from sidestep.inference.objective import Objective, Parameters, Problem, SolveSu
 from sidestep.inference.optimizers import LBFGS, Adam, Optimizer
 from sidestep.inference.priors import Normal, Prior
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
-from sidestep.tabular.behavior_model import BehaviorModel, behavior_model
+from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
+from sidestep.tabular.checks import check_behavior, check_demonstrations, check_model, check_persons
 from sidestep.tabular.demonstrations import Demonstrations
-from sidestep.tabular.likelihood import ALL_TERMS, Terms
+from sidestep.tabular.likelihood import ALL_TERMS, Terms, check_terms
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.proper import check_proper
 from sidestep.tabular.solve import SolveOptions
@@ -216,7 +217,10 @@ def fit(
         Equations 1 and 6 of the behavior-aware modeling paper.
     """
     optimizer, options = optimizer or LBFGS(), options or SolveOptions()
-    behavior = behavior_model(behavior) if isinstance(behavior, Behavior) else behavior
+    check_model(model)
+    check_behavior(behavior, learned=True)
+    check_demonstrations(demonstrations, model.graph)
+    behavior = as_behavior_model(behavior)
     solver = options.solver_for(behavior.behavior.backup, model.graph.states)
     options = SolveOptions(options.gradient, options.horizon, solver)
     problem = Problem(model, behavior, demonstrations, prior or Normal(), terms, options, tempering)
@@ -242,16 +246,10 @@ def _of_all_tasks(batches: list[SolveSummary], tasks: int) -> list[Array]:
 def _check_problem(problem: Problem, optimizer: Optimizer) -> None:
     terms, tempering, options, behavior = problem.terms, float(problem.tempering), problem.options, problem.behavior
     graph, demos = problem.model.graph, problem.demonstrations
-    check(terms and set(terms) <= set(ALL_TERMS), f"expected one or both of {ALL_TERMS}, found {terms}", field="terms")
+    check_terms(terms)
     check(0 < tempering <= 1, f"expected a number above 0 and at most 1, found {tempering}", field="tempering")
     has_objective = options.gradient == "exact" or not isinstance(behavior.behavior.backup, BoltzmannAverage)
     message = "the fixed-policy gradient of the Boltzmann average belongs to no objective: expected Adam(), or 'exact'"
     check(has_objective or isinstance(optimizer, Adam), message, field="gradient")
-    (tasks, states), actions = demos.tasks.terminal.shape, int(np.asarray(demos.actions).max())
-    message = f"expected the model's {graph.states} states and {graph.actions} actions, found {states} states and "
-    valid = states == graph.states and actions < graph.actions
-    check(valid, f"{message}actions up to {actions}", field="demonstrations")
-    persons = tasks if behavior.person is None else len(behavior.person)
-    message = f"expected the person of each of the {tasks} tasks (see split_by_person), found {persons} persons"
-    check(persons == tasks, message, field="person")
+    check_persons(behavior, len(demos.tasks.terminal))
     check_proper(behavior.tasks_of(demos.tasks), behavior.behavior_of(), graph, options.horizon)

@@ -136,19 +136,30 @@ def plan(
 def _plan(model: TransitionModel, task: Task, behavior: Behavior, optimal: bool, options: SolveOptions) -> Plan:
     solution = solve(model, task, behavior, options=options)
     available = jnp.broadcast_to(model.graph.available, solution.action_values.shape)
-    q = tied_where_lost(solution.action_values, available)
+    q, advantages = (tied_where_lost(each, available) for each in (solution.action_values, solution.advantages))
     policy = (
         behavior.backup.fixed_policy_weights(q, behavior.beta)
         if optimal
-        else jnp.exp(behavior.log_policy(q, available))
+        else jnp.exp(behavior.log_policy(advantages, available))
     )
     states = jnp.arange(model.graph.states)
-    best = jnp.argmax(policy, axis=-1)
+    best = _first_best(policy, advantages)
     outcomes = model.graph.successors[states, best]
     elsewhere = jnp.where(outcomes == states[:, None], 0, model.probabilities()[states, best])
     most_probable = jnp.take_along_axis(outcomes, jnp.argmax(elsewhere, axis=-1)[:, None], axis=-1)[:, 0]
     intended = jnp.where(elsewhere.max(axis=-1) > 0, most_probable, states)
     return Plan(policy, intended.astype(jnp.int32), task.terminal, solution)
+
+
+def _first_best(
+    policy: Float[Array, "states actions"], advantages: Float[Array, "states actions"]
+) -> Int[Array, " states"]:
+    """Return the first of the most probable actions; of ties by the precision of Q, the best by its advantage."""
+    tied = policy >= policy.max(axis=-1, keepdims=True)
+    among = jnp.where(tied, advantages, -jnp.inf)
+    largest = among.max(axis=-1, keepdims=True)
+    size = jnp.where(jnp.isneginf(advantages), 0, jnp.abs(advantages)).max(axis=-1, keepdims=True)
+    return jnp.argmax(among >= largest - 64 * jnp.finfo(advantages.dtype).eps * size, axis=-1)
 
 
 class RollOuts(NamedTuple):

@@ -9,8 +9,9 @@ is sufficient, not necessary, and the entropy bonus of a log-sum-exp agent count
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sidestep.errors import ImproperTask, check
+from sidestep.errors import ImproperTask
 from sidestep.tabular.backups import Behavior, LogSumExp
+from sidestep.tabular.checks import check_behavior, check_task
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.tasks import Task
 
@@ -40,7 +41,8 @@ def check_proper(task: Task, behavior: Behavior, world: Graph, horizon: int | No
         >>> goal = reach(grid, 0, discount=1.0, step_cost=1.0)
         >>> check_proper(goal, Behavior("logsumexp", beta=10.0), grid_graph(grid))
     """
-    check_fits(task, behavior, world)
+    check_task(task, world)
+    check_behavior(behavior)
     endless = np.atleast_1d(np.asarray(task.discount)) == 1
     if horizon is not None or not endless.any():
         return
@@ -65,31 +67,6 @@ def check_proper(task: Task, behavior: Behavior, world: Graph, horizon: int | No
                 f"every action, so an endless path is worth more than one to the goal: {_place(gains, bonus)} costs "
                 "less; expected a step cost above that, a larger β, a discount below 1 or another backup"
             )
-
-
-def check_fits(task: Task, behavior: Behavior, world: Graph) -> None:
-    """Raise `InputError` unless a task is one of a graph's world and a behavior is one.
-
-    Args:
-        task: One task or a stack.
-        behavior: Of the agents.
-        world: The graph.
-    """
-    check(isinstance(task, Task), f"expected a Task, found {type(task).__name__}", field="task")
-    kind = type(behavior).__name__
-    message = f"expected a Behavior, found {kind}; a BehaviorModel has one of each person: `behavior_of(person)`"
-    check(isinstance(behavior, Behavior), message, field="behavior")
-    check(isinstance(world, Graph), f"expected the Graph of a model, found {type(world).__name__}", field="world")
-    states, actions, own_states = world.states, world.actions, task.terminal.shape[-1]
-    message = f"expected a task of the model's {states} states, found one of {own_states}"
-    check(own_states == states, message, field="task")
-    shape, own = (states, actions), task.reward.shape[-2:]
-    fits = all(each in (1, size) for each, size in zip(own, shape, strict=True))
-    check(fits, f"expected rewards of shape {shape}, or 1 for all states or actions, found {own}", field="task")
-    if task.outcome_reward is not None:
-        shape, own = world.successors.shape, task.outcome_reward.shape[-3:]
-        fits = all(each in (1, size) for each, size in zip(own, shape, strict=True))
-        check(fits, f"expected rewards of outcomes of shape {shape}, found {own}", field="task")
 
 
 def _largest_rewards(

@@ -21,8 +21,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sidestep.errors import check, check_count
 from sidestep.tabular.backups import Backup, Behavior, Gradient
+from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
+from sidestep.tabular.checks import check_behavior, check_model, check_persons, check_task, is_traced
 from sidestep.tabular.implicit import fixed_point
 from sidestep.tabular.models import TransitionModel
+from sidestep.tabular.proper import check_proper
 from sidestep.tabular.solvers import base
 from sidestep.tabular.solvers.gauss_seidel import KERNELS, GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
@@ -90,6 +93,8 @@ class Solution(eqx.Module):
             of acting once less.
         action_values: Q(s, a) of all states, or of the `visited` ones; −∞ for actions that are not available, and at
             discount 1 for those that may lead to a state of value −∞.
+        advantages: Q(s, a) − V(s), with V from `values_after`, of the same states; summed as differences, they are exact
+            where values are far larger than their differences. Policies depend on these.
         sweeps: The number of times that each state was solved, on average; the horizon where it is finite.
         residual: The largest relative change in the last sweep; 0 for a finite horizon.
         converged: Whether the residual is within the solver's tolerance.
@@ -108,18 +113,17 @@ class Solution(eqx.Module):
     values: Float[Array, "*tasks states"]
     values_after: Float[Array, "*tasks states"]
     action_values: Float[Array, "*tasks visited actions"]
+    advantages: Float[Array, "*tasks visited actions"]
     sweeps: Int[Array, "*tasks"]
     residual: Float[Array, "*tasks"]
     converged: Bool[Array, "*tasks"]
     start: base.WarmStart
 
 
-# Compiled as a whole: otherwise every call would compile the loops of a solver again.
-@eqx.filter_jit
 def solve(
     model: TransitionModel,
     task: Task,
-    behavior: Behavior,
+    behavior: Behavior | BehaviorModel,
     *,
     options: SolveOptions | None = None,
     start: base.WarmStart | None = None,
@@ -133,7 +137,8 @@ def solve(
     Args:
         model: The transition model.
         task: One task, or several by `stack_tasks`.
-        behavior: The backup that agents value states with, and their β.
+        behavior: The backup that agents value states with, and their β; a `BehaviorModel` also has a discount, reward
+            weights, costs and the β of each task's person.
         options: How the values are computed; by default `SolveOptions()`.
         start: The `start` of an earlier solution of the same task or tasks; by default a cold start. Within the
             region, the solution does not depend on it beyond the tolerance. The gradient with respect to
@@ -146,7 +151,11 @@ def solve(
             use this only where the result is checked later, such as in a line search.
 
     Returns:
-        The solution. Check `converged` before use; `check_proper` tells in advance whether values exist.
+        The solution. Check `converged` before use.
+
+    Raises:
+        InputError: For a task of another world, and parameters that are not finite.
+        ImproperTask: For a task without values (see `check_proper`). Under `jit` this is not checked.
 
     Example:
         >>> from sidestep.tabular.backups import HardMax
@@ -162,14 +171,38 @@ def solve(
         points: Christianson, "Reverse accumulation and attractive fixed points" (1994).
     """
     options = options or SolveOptions()
+    check_behavior(behavior, learned=True)
+    agents = as_behavior_model(behavior)
+    check_model(model)
+    check_task(task, model.graph)
+    if task.terminal.ndim == 2:
+        check_persons(behavior, len(task.terminal))
+    if not is_traced(model, task, behavior):
+        check_proper(agents.tasks_of(task), agents.behavior_of(), model.graph, options.horizon)
+    return _solve(model, task, agents, options, start, visited, region)
+
+
+# Compiled as a whole: otherwise every call would compile the loops of a solver again.
+@eqx.filter_jit
+def _solve(
+    model: TransitionModel,
+    task: Task,
+    agents: BehaviorModel,
+    options: SolveOptions,
+    start: base.WarmStart | None,
+    visited: Int[Array, "*tasks visited"] | None,
+    region: Bool[Array, "*tasks states"] | None,
+) -> Solution:
+    task, behavior = agents.tasks_of(task), agents.behavior_of()
     solver = options.solver_for(behavior.backup, model.graph.states)
     probabilities = model.probabilities()
-    dtype, beta = probabilities.dtype, behavior.beta.astype(probabilities.dtype)
+    dtype = probabilities.dtype
     cold, tasks = solver.cold_start(model.graph.states, dtype), task.terminal.shape[:-1]
     begin = start or jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*tasks, *leaf.shape)), cold)
     everywhere = jnp.ones(task.terminal.shape, dtype=bool) if region is None else region
+    betas = agents.betas(*tasks).astype(dtype) if tasks else behavior.beta.astype(dtype)
 
-    def one(task: Task, start: base.WarmStart, visited: Array | None, region: Array) -> Solution:
+    def one(task: Task, start: base.WarmStart, visited: Array | None, region: Array, beta: Array) -> Solution:
         process = decision_process(model, probabilities, task)
         some = jnp.zeros(0, jnp.int32) if visited is None else visited
         if options.horizon is None:
@@ -187,17 +220,18 @@ def solve(
             result = base.SolveResult(values, start.order, sweeps, residual, jnp.isfinite(values).all())
             rows = probabilities[some]
         if visited is None:
-            q = process.action_values(after)
+            here, advantages = after, process.advantages(after)
         else:
-            reward, available = (
-                part[visited] if len(part) > 1 else part for part in (process.reward, process.available)
-            )
-            leads_to = after[process.successors[visited]]
-            q = base.action_values(after[visited], leads_to, rows, reward, available, process.discount)
+            parts = process.reward, process.available
+            reward, available = (part[visited] if len(part) > 1 else part for part in parts)
+            here, leads_to = after[visited], after[process.successors[visited]]
+            advantages = base.advantages(here, leads_to, rows, reward, available, process.discount)
+        q = base.finite_or_zero(here)[:, None] + advantages
         next_start = base.WarmStart(jax.lax.stop_gradient(values), start.adjoint, result.order)
-        return Solution(values, after, q, result.sweeps, result.residual, result.converged, next_start)
+        info = result.sweeps, result.residual, result.converged
+        return Solution(values, after, q, advantages, *info, next_start)
 
-    return (jax.vmap(one) if task.terminal.ndim == 2 else one)(task, begin, visited, everywhere)
+    return (jax.vmap(one) if tasks else one)(task, begin, visited, everywhere, betas)
 
 
 def decision_process(

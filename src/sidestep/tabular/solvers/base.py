@@ -71,9 +71,13 @@ class DecisionProcess(eqx.Module):
     discount: Float[Array, ""]
 
     def action_values(self, values: Float[Array, " states"]) -> Float[Array, "states actions"]:
-        """Return Q(s, a) of all states; see `action_values`."""
+        """Return Q(s, a) = R(s, a) + γ Σ T V (eq. 4) of all states."""
+        return finite_or_zero(values)[:, None] + self.advantages(values)
+
+    def advantages(self, values: Float[Array, " states"]) -> Float[Array, "states actions"]:
+        """Return Q(s, a) − V(s) of all states; see `advantages`."""
         after = values[self.successors]
-        return action_values(values, after, self.probabilities, self.reward, self.available, self.discount)
+        return advantages(values, after, self.probabilities, self.reward, self.available, self.discount)
 
     def available_actions(self) -> Bool[Array, "states actions"] | None:
         """Return which actions are available; None where all are."""
@@ -85,7 +89,7 @@ class DecisionProcess(eqx.Module):
         return jnp.where(self.terminal, self.terminal_reward, values)
 
 
-def action_values(
+def advantages(
     values: Float[Array, " some"],
     values_after: Float[Array, "some actions outcomes"],
     probabilities: Float[Array, "some actions outcomes"],
@@ -93,17 +97,22 @@ def action_values(
     available: Bool[Array, "#some #actions"],
     discount: Float[Array, "*#some"],
 ) -> Float[Array, "some actions"]:
-    """Return Q(s, a) = R(s, a) + γ Σ T V (eq. 4) of some states, from their values and those of their successors.
+    """Return A(s, a) = Q(s, a) − V(s) of some states, from their values and those of their successors.
 
     Summed as differences from V(s), so that the rounding of probabilities that are nearly 1 does not meet values that
-    are large: where actions mostly fail it would exceed the gradient. Q is −∞ for actions that are not available or may
+    are large: where actions mostly fail it would exceed the gradient. A is −∞ for actions that are not available or may
     lead to a state of value −∞.
     """
-    here, is_lost = jnp.where(jnp.isneginf(values), 0, values)[:, None], jnp.isneginf(values_after)
+    here, is_lost = finite_or_zero(values)[:, None], jnp.isneginf(values_after)
     differences = jnp.where(is_lost, 0, values_after - here[..., None])
-    q = reward + discount * (here + jnp.sum(probabilities * differences, axis=-1))
+    gained = reward + discount * jnp.sum(probabilities * differences, axis=-1) - (1 - discount) * here
     never = ~available | jnp.any(is_lost & (probabilities > 0), axis=-1)
-    return jnp.where(never, -jnp.inf, q)
+    return jnp.where(never, -jnp.inf, gained)
+
+
+def finite_or_zero(values: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return values, and 0 instead of −∞."""
+    return jnp.where(jnp.isneginf(values), 0, values)
 
 
 class WarmStart(NamedTuple):
@@ -268,7 +277,7 @@ def at_fixed_policy(
 ) -> Float[Array, " states"]:
     """Return the backup's value with the gradient of the average under its policy, held fixed (eqs. 9 and 10)."""
     weights, value = jax.lax.stop_gradient((backup.fixed_policy_weights(q, beta), backup.value(q, beta, available)))
-    finite = jnp.where(jnp.isneginf(q), 0, q)
+    finite = finite_or_zero(q)
     return value + jnp.sum(weights * (finite - jax.lax.stop_gradient(finite)), axis=-1)
 
 
