@@ -110,7 +110,7 @@ def gather_trajectories(trajectories: Sequence[Trajectory], tasks: Sequence[Cont
     check(trajectories, "expected at least one trajectory", field="trajectories")
     for row, trajectory in enumerate(trajectories, start=1):
         _check_trajectory(trajectory, trajectories[0], len(tasks), row)
-    states, actions, task = zip(*trajectories, strict=True)
+    states, actions, task, _ = zip(*trajectories, strict=True)
     parts = [each[:-1] for each in states], actions, [each[1:] for each in states]
     moves = (to_jax(np.concatenate(part)) for part in parts)
     lengths = [len(each) for each in actions]

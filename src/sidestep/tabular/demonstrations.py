@@ -28,6 +28,7 @@ class Trajectory(NamedTuple):
         states: s₁ … s_{τ+1}; integers in discrete worlds, vectors in continuous ones.
         actions: a₁ … a_τ; indices where there are finitely many actions, vectors otherwise.
         task: The index of the task that the agent pursued.
+        truncated: Whether the agent was stopped by a limit of moves, before its task ended.
 
     Example:
         >>> Trajectory(np.array([0, 1, 2]), np.array([3, 3]), task=0).task
@@ -37,6 +38,7 @@ class Trajectory(NamedTuple):
     states: Shaped[np.ndarray, "moves+1 *state"]
     actions: Shaped[np.ndarray, "moves *action"]
     task: int
+    truncated: bool = False
 
 
 class Demonstrations(eqx.Module, Generic[Tasks]):
@@ -170,7 +172,7 @@ def gather(trajectories: Sequence[Trajectory], tasks: Sequence[Task]) -> Demonst
     stacked = stack_tasks(tasks)
     terminal = np.asarray(stacked.terminal)
     check(trajectories, "expected at least one trajectory", field="trajectories")
-    for row, (states, actions, task) in enumerate(trajectories, start=1):
+    for row, (states, actions, task, _) in enumerate(trajectories, start=1):
         if len(actions) == 0 or len(states) != len(actions) + 1:
             message = f"expected moves and one state more, found {len(actions)} and {len(states)}"
         elif not 0 <= task < len(tasks):
@@ -192,7 +194,7 @@ def flatten(trajectories: Sequence[Trajectory], tasks: Task) -> Demonstrations[T
         trajectories: At least one, each with at least one move.
         tasks: The tasks that `Trajectory.task` counts through, stacked.
     """
-    paths, actions, task = zip(*trajectories, strict=True)
+    paths, actions, task, _ = zip(*trajectories, strict=True)
     lengths = [len(taken) for taken in actions]
     states, next_states = flat_moves([path[:-1] for path in paths]), flat_moves([path[1:] for path in paths])
     of_moves, number = (flat_moves([np.repeat(each, lengths)]) for each in (task, np.arange(len(lengths))))

@@ -15,6 +15,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from sidestep._programs import keep_program
 from sidestep.errors import NotConverged, check
 from sidestep.tabular.backups import Behavior, HardMax, tied_where_lost
+from sidestep.tabular.behavior_model import BehaviorModel
+from sidestep.tabular.checks import check_behavior, check_model, check_task
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.proper import check_proper
 from sidestep.tabular.solve import Solution, SolveOptions, solve
@@ -95,20 +97,28 @@ def followed(
 
 
 def plan(
-    model: TransitionModel, task: Task, behavior: Behavior | None = None, *, options: SolveOptions | None = None
+    model: TransitionModel,
+    task: Task,
+    behavior: Behavior | BehaviorModel | None = None,
+    *,
+    person: int | None = None,
+    options: SolveOptions | None = None,
 ) -> Plan:
     """Return the optimal plan for a task under a model, or with `behavior` the plan of an agent that behaves like that.
 
     Args:
         model: The transition model.
         task: One task.
-        behavior: The agent's, π ∝ exp βQ; None for the optimal policy.
+        behavior: The agent's, π ∝ exp βQ; None for the optimal policy. With a `BehaviorModel`, such as that of a fit, the
+            task has its discount, reward weights and costs.
+        person: The person that plans, where a `BehaviorModel` distinguishes them; by default a typical one.
         options: How values are computed; by default `SolveOptions()`.
 
     Returns:
         The probabilities of actions and the intended next state of every state, with the values.
 
     Raises:
+        InputError: For a task of another world or a stack of tasks, and a person that does not exist.
         ImproperTask: For a task that has no values.
         NotConverged: If the values do not converge.
 
@@ -120,7 +130,19 @@ def plan(
         >>> plan(ObstacleGrid(grid), reach(grid, 3)).path_from(0).tolist()
         [0, 1, 2, 3]
     """
-    options, agent = options or SolveOptions(), behavior or Behavior(HardMax())
+    options = options or SolveOptions()
+    check_model(model)
+    check_task(task, model.graph)
+    tasks = task.terminal.shape[:-1]
+    check(not tasks, f"expected one task, found a stack of {tasks}", field="task")
+    if behavior is not None:
+        check_behavior(behavior, learned=True)
+    agent = behavior or Behavior(HardMax())
+    if isinstance(agent, BehaviorModel):
+        task, agent = agent.tasks_of(task), agent.behavior_of(person)
+    else:
+        message = f"expected none without a BehaviorModel, found {person!r}"
+        check(person is None, message, field="person")
     check_proper(task, agent, model.graph, options.horizon)
     made = _plan(model, task, agent, behavior is None, options)
     solution = made.solution
@@ -197,13 +219,12 @@ class RollOuts(NamedTuple):
         return jnp.sum((self.actions >= 0) & (self.states[:, 1:] == self.states[:, :-1]), axis=-1)
 
 
-@eqx.filter_jit
 def roll_out(
     key: PRNGKeyArray,
     world: TransitionModel,
     policy: Float[Array, "states actions"],
     terminal: Bool[Array, " states"],
-    starts: Int[Array, " agents"],
+    starts: Shaped[ArrayLike, "..."] | Sequence[int],
     max_moves: int,
 ) -> RollOuts:
     """Return trajectories of agents that follow a policy in a world.
@@ -219,6 +240,10 @@ def roll_out(
     Returns:
         The trajectories, one for each start.
 
+    Raises:
+        InputError: For a start that is not a state, a policy of another shape or with rows that do not sum to one, and a
+            number of moves below 1.
+
     Example:
         >>> from sidestep.tabular.grid import Grid
         >>> from sidestep.tabular.models import true_model
@@ -230,6 +255,30 @@ def roll_out(
         >>> rolled.arrived.tolist()
         [True, True]
     """
+    check_count(max_moves, 1, "max_moves")
+    check_model(world)
+    shape = world.graph.states, world.graph.actions
+    fits = jnp.shape(policy) == shape and jnp.shape(terminal) == shape[:1]
+    message = f"expected a policy of shape {shape} and terminal states of shape {shape[:1]}, found "
+    check(fits, f"{message}{jnp.shape(policy)} and {jnp.shape(terminal)}", field="policy, terminal")
+    if not is_traced(policy):
+        numbers = np.asarray(policy)
+        rows = np.flatnonzero(~(np.isclose(numbers.sum(axis=1), 1, atol=1e-4) & (numbers >= 0).all(axis=1)))[:1]
+        check(not len(rows), f"expected probabilities that sum to one in every state, not so in {rows}", field="policy")
+    if not is_traced(starts):
+        starts = checked_states(starts, world.graph.states, "starts")
+    return _roll_out(as_key(key), world, policy, terminal, to_jax(starts, np.int32), max_moves)
+
+
+@eqx.filter_jit
+def _roll_out(
+    key: PRNGKeyArray,
+    world: TransitionModel,
+    policy: Float[Array, "states actions"],
+    terminal: Bool[Array, " states"],
+    starts: Int[Array, " agents"],
+    max_moves: int,
+) -> RollOuts:
     log_policy, log_probabilities = jnp.log(policy), jnp.log(world.probabilities())
 
     def of_agent(key: PRNGKeyArray, start: Int[Array, ""]) -> tuple[Array, Array]:
