@@ -66,11 +66,11 @@ def to_finite(
     if isinstance(array, Tracer):
         return array
     numbers = np.asarray(array)
-    valid = np.isfinite(numbers)
+    valid = np.asarray(np.isfinite(numbers))
     if above > -inf or below < inf:
-        valid &= (numbers > above) & (numbers < below)
+        valid = valid & (numbers > above) & (numbers < below)
     if least > -inf or most < inf:
-        valid &= (numbers >= least) & (numbers <= most)
+        valid = valid & (numbers >= least) & (numbers <= most)
     if not valid.all():
         what = "finite numbers" if numbers.ndim else "a finite number"
         raise InputError(
@@ -94,7 +94,7 @@ def to_logits(value: object, count: int, field: str = "logits") -> Any:
     """
     array = to_floats(value, field, (), (count,))
     if not isinstance(array, Tracer):
-        valid = ~np.isnan(array)
+        valid = ~np.isnan(np.asarray(array))
         if not valid.all():
             raise InputError(f"expected numbers, found {_first(np.asarray(array), valid)}", field=field)
     return array
@@ -134,9 +134,9 @@ def to_integers(
     numbers = np.asarray(array)
     valid = np.ones(numbers.shape, bool)
     if least is not None:
-        valid &= numbers >= least
+        valid = valid & (numbers >= least)
     if most is not None:
-        valid &= numbers <= most
+        valid = valid & (numbers <= most)
     if not valid.all():
         span = f" in {least}…{most}" if None not in (least, most) else f", at least {least}"
         span = f", at most {most}" if least is None else span
@@ -158,6 +158,29 @@ def to_states(value: object, states: int, field: str, *shapes: Shape) -> Any:
     """
     numbers = to_integers(value, field, *(shapes or (("states",),)), least=0, most=states - 1, what="states")
     return numbers if isinstance(numbers, Tracer) else numbers.astype(np.int64, copy=False)
+
+
+def to_indices(value: object, count: int, field: str, what: str) -> Any:
+    """Return the indices of rows that a mask or a list of indices selects, from 0 to `count` − 1.
+
+    Args:
+        value: A boolean for each row, or indices, of which negative ones count from the end.
+        count: The number of rows.
+        field: The argument, for the error.
+        what: The name of the rows, for the error.
+
+    Raises:
+        InputError: As `to_mask` and `to_integers` do.
+
+    Example:
+        >>> to_indices([True, False], 2, "index", "walks").tolist(), to_indices([-1], 2, "index", "walks").tolist()
+        ([0], [1])
+    """
+    array = np.asarray(_to_array(value, field, f"indices of {what}, or a mask,", (("selected",),)))
+    if array.dtype == bool:
+        return np.flatnonzero(to_mask(array, field, (count,)))
+    indices = to_integers(value, field, ("selected",), least=-count, most=count - 1, what=f"indices of {what}")
+    return np.where(indices < 0, indices + count, indices)
 
 
 def to_mask(value: object, field: str, *shapes: Shape) -> Any:
@@ -223,7 +246,7 @@ def _contents(value: object, array: Any) -> str:
     return describe(value if array.dtype.kind in "OUS" or array.ndim == 0 else array)
 
 
-def _first(numbers: np.ndarray, valid: np.ndarray) -> str:
+def _first(numbers: np.ndarray, valid: np.ndarray | np.bool) -> str:
     """Return the first number that is not valid and its place."""
     if not numbers.ndim:
         return str(numbers)

@@ -77,20 +77,24 @@ def describe(value: object) -> str:
     """
     if isinstance(value, type):
         return f"the class {value.__name__}"
-    if isinstance(value, str):
-        return reprlib.repr(str(value))
-    if type(value) in (bytes, list, tuple, dict, set):
-        return reprlib.repr(value)
     shape = getattr(value, "shape", None)
-    if value is None or isinstance(value, int | float | complex) or shape == ():
-        return str(value) if len(str(value)) <= _LONGEST else type(value).__name__
+    try:
+        if isinstance(value, str):
+            return reprlib.repr(str(value))
+        if type(value) in (bytes, list, tuple, dict, set):
+            return reprlib.repr(value)
+        if value is None or isinstance(value, int | float | complex) or shape == ():
+            return str(value) if len(str(value)) <= _LONGEST else type(value).__name__
+    except ValueError:  # numbers of thousands of digits have no text
+        return type(value).__name__
     return type(value).__name__ if shape is None else f"{getattr(value, 'dtype', 'numbers')} of shape {shape}"
 
 
 def check_instance(value: object, kinds: type | tuple[type, ...], field: str, *, source: object | None = None) -> None:
     """Raise `InputError` unless a value is an instance of a class, or of one of several."""
     if not isinstance(value, kinds):
-        names = [kind.__name__ for kind in (kinds if isinstance(kinds, tuple) else (kinds,))]
+        every = kinds if isinstance(kinds, tuple) else (kinds,)
+        names = ["None" if kind is type(None) else kind.__name__ for kind in every]
         listed = ", ".join(names[:-1]) + " or " + names[-1] if len(names) > 1 else names[0]
         raise InputError(f"expected {_article(listed)} {listed}, found {describe(value)}", source=source, field=field)
 
@@ -169,9 +173,11 @@ def limits(*, above: Limit = -inf, least: Limit = -inf, below: Limit = inf, most
     """Return the limits of a number as a message says them, such as " above 0 and at most 1"; empty without limits.
 
     Example:
-        >>> limits(above=0, most=1), limits(least=0)
-        (' above 0 and at most 1', ', at least 0')
+        >>> limits(above=0, most=1), limits(least=0), limits(least=0, most=1)
+        (' above 0 and at most 1', ', at least 0', ' from 0 to 1')
     """
+    if least > -inf and most < inf and above == -inf and below == inf:
+        return f" from {least:g} to {most:g}"
     lower = [f" above {above:g}"] if above > -inf else [f", at least {least:g}"] if least > -inf else []
     upper = [f"below {below:g}"] if below < inf else [f"at most {most:g}"] if most < inf else []
     return " and ".join([*lower, *upper]) if lower else "".join(f", {limit}" for limit in upper)
@@ -212,7 +218,7 @@ def _as_float(value: Any) -> float:
 
 
 def _article(noun: str) -> str:
-    return "an" if noun[0] in "AEIOU" else "a"
+    return "an" if noun[0].lower() in "aeiou" else "a"
 
 
 class ImproperTask(SidestepError):

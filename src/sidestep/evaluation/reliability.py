@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sidestep.errors import check
+from sidestep._arguments import to_finite, to_mask
 from sidestep.tabular.grid import Cell, Grid
 
 BINS = 10
@@ -167,8 +167,8 @@ def scored_probabilities(
 
 
 def _check(blocked: _Values, obstacle: _Flags) -> None:
-    check(blocked.shape == obstacle.shape, f"expected {len(blocked)} flags, found {len(obstacle)}", field="obstacle")
-    check(((blocked >= 0) & (blocked <= 1)).all(), "expected numbers in [0, 1]", field="blocked")
+    cells = to_finite(blocked, "blocked", ("cells",), least=0, most=1)
+    to_mask(obstacle, "obstacle", cells.shape)
 
 
 def _ratio(sums: np.ndarray, cells: Int[np.ndarray, " bins"]) -> _Bins:

@@ -25,7 +25,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.errors import NotConverged
+from sidestep.errors import NotConverged, check, check_instance, to_list
+from sidestep.inference.arguments import check_evidence
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.demonstrations import Demonstrations, pad_to_power_of_two
 from sidestep.tabular.likelihood import visited_action_values
@@ -83,6 +84,9 @@ def score_statistics(
         >>> scores.score.shape
         (2,)
     """
+    check_evidence(model, demonstrations, behavior)
+    check_instance(behavior, Behavior, "behavior")
+    check_instance(options, (SolveOptions, type(None)), "options")
     padded = pad_to_power_of_two(demonstrations)
     converged, *numbers = _scores(model, padded, behavior, options)
     if not bool(converged):
@@ -122,7 +126,9 @@ def effective_sample_ratio(held_out: Sequence[ScoreStatistics]) -> float:
         >>> effective_sample_ratio([scores])
         0.5
     """
-    score, information, _, trajectory = (np.concatenate(part) for part in zip(*held_out, strict=True))
+    pieces = to_list(held_out, ScoreStatistics, "held_out")
+    score, information, _, trajectory = (np.concatenate(part) for part in zip(*pieces, strict=True))
+    check(len(score), "expected at least one move, found none", field="held_out")
     by_trajectory = np.bincount(trajectory, score - score.mean())
     variation = float(np.sum(by_trajectory**2))
     return float(information.sum()) / variation if variation > 0 else float("inf")

@@ -14,7 +14,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sidestep.errors import check, check_count
+from sidestep._arguments import to_key
+from sidestep.errors import check_count, to_number
 from sidestep.inference.natural_scale import NaturalScale, natural_scale
 from sidestep.inference.objective import Parameters
 
@@ -96,7 +97,7 @@ class Laplace:
         Raises:
             InputError: For another level.
         """
-        check(0 < level < 1, f"expected a probability above 0 and below 1, found {level}", field="level")
+        to_number(level, "level", above=0, below=1)
         width = float(jax.scipy.special.ndtri((1 + level) / 2))
         errors = self.standard_errors
         lower, upper = (
@@ -119,7 +120,7 @@ class Laplace:
             InputError: For n below 1.
         """
         check_count(n, 1, "n")
-        white = np.asarray(jax.random.normal(key, (n, len(self.scale))), np.float64)
+        white = np.asarray(jax.random.normal(to_key(key), (n, len(self.scale))), np.float64)
         inner = white + (white @ self.vectors * (1 / np.sqrt(self.eigenvalues) - 1)) @ self.vectors.T
         flat, unravel = ravel_pytree(self.parameters)
         return jax.vmap(unravel)(flat + jnp.asarray(inner * self.scale, flat.dtype))

@@ -183,25 +183,30 @@ def gather(trajectories: Sequence[Trajectory], tasks: Sequence[Task]) -> Demonst
     return flatten(to_trajectories(walks, np.asarray(stacked.terminal)), stacked)
 
 
-def to_trajectories(trajectories: Sequence[Trajectory], terminal: Bool[np.ndarray, "tasks states"]) -> list[Trajectory]:
+def to_trajectories(
+    trajectories: Sequence[Trajectory], terminal: Bool[np.ndarray, "tasks states"], actions: int | None = None
+) -> list[Trajectory]:
     """Return trajectories as arrays of integers; each must fit its task.
 
     Args:
         trajectories: The trajectories.
         terminal: The terminal states of each task.
+        actions: The number of actions of the world, None where it is not known.
 
     Raises:
         InputError: As `gather` does, with the row of the trajectory, the first of which is 1.
     """
 
     def checked(trajectory: Trajectory) -> Trajectory:
-        path, actions, task = trajectory
+        path, acted, task = trajectory
         own = to_count(task, "task", 0, len(terminal) - 1)
         states = to_states(path, terminal.shape[1], "states")
-        taken = to_integers(actions, "actions", ("moves",), least=0, what="actions")
+        last = None if actions is None else actions - 1
+        taken = to_integers(acted, "actions", ("moves",), least=0, most=last, what="actions")
         message = f"expected moves and one state more, found {len(taken)} and {len(states)}"
         check(0 < len(taken) == len(states) - 1, message)
-        check(not terminal[own, states[:-1]].any(), "goes on after a terminal state of its task")
+        message = "expected a trajectory that ends in the first terminal state, found one that goes on"
+        check(not terminal[own, states[:-1]].any(), f"{message} after a terminal state of its task")
         return Trajectory(states, taken, own)
 
     results = []

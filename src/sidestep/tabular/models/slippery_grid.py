@@ -9,6 +9,8 @@ f(s, d) = Π_{c needed} (1 − σ(θ(c))), the probability that direction d is f
 and s itself takes the rest. Cells of one terrain share the slip, so observations in one place inform all others.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,7 +53,7 @@ class SlipperyGrid(TransitionModel):
         grid: Grid,
         logits: Logits = -2.0,
         slip: Logits = -2.0,
-        terrain: Int[np.ndarray, "rows columns"] | None = None,
+        terrain: Int[np.ndarray, "rows columns"] | Sequence[Sequence[int]] | None = None,
     ):
         """Make a model with logits of cells and of slips: one number for all, or one for each cell or terrain.
 
