@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.dtypes import prng_key
 
-from sidestep.errors import InputError, Limit, check, describe, limits
+from sidestep.errors import InputError, Limit, describe, limits
 
 Shape = tuple[int | str, ...]
 """An expected shape: a number, or the name of a dimension of any size."""
@@ -35,10 +35,10 @@ def to_floats(value: object, field: str, *shapes: Shape) -> Any:
         [1.0, 2.0]
     """
     array = _to_array(value, field, "numbers", shapes)
-    if jnp.issubdtype(array.dtype, np.floating):
+    if array.dtype.kind == "f" or jnp.issubdtype(array.dtype, np.floating):
         return array
-    is_integer = jnp.issubdtype(array.dtype, np.integer)
-    check(is_integer, f"expected numbers, found {_contents(value, array)}", field=field)
+    if not jnp.issubdtype(array.dtype, np.integer):
+        raise InputError(f"expected numbers, found {_contents(value, array)}", field=field)
     return array.astype(float) if isinstance(array, Tracer) else np.asarray(array, np.float64)
 
 
@@ -66,7 +66,7 @@ def to_finite(
     if isinstance(array, Tracer):
         return array
     numbers = np.asarray(array)
-    valid = np.asarray(np.isfinite(numbers))
+    valid: Any = np.isfinite(numbers)
     if above > -inf or below < inf:
         valid = valid & (numbers > above) & (numbers < below)
     if least > -inf or most < inf:
@@ -125,23 +125,21 @@ def to_integers(
         [0, 2]
     """
     array = _to_array(value, field, what, shapes)
+    if array.dtype.kind not in "iu":
+        if array.size or hasattr(value, "dtype"):
+            raise InputError(f"expected {what}, found {_contents(value, array)}", field=field)
+        array = array.astype(np.int64)  # of an empty list
     if isinstance(array, Tracer):
-        check(jnp.issubdtype(array.dtype, np.integer), f"expected {what}, found {array.dtype}", field=field)
         return array
-    is_empty_list = array.size == 0 and not hasattr(value, "dtype")
-    is_integer = array.dtype.kind in "iu" or is_empty_list
-    check(is_integer, f"expected {what}, found {_contents(value, array)}", field=field)
     numbers = np.asarray(array)
-    valid = np.ones(numbers.shape, bool)
-    if least is not None:
-        valid = valid & (numbers >= least)
-    if most is not None:
-        valid = valid & (numbers <= most)
-    if not valid.all():
+    lower = -inf if least is None else least
+    upper = inf if most is None else most
+    if numbers.size and (numbers.min() < lower or numbers.max() > upper):
+        valid = (numbers >= lower) & (numbers <= upper)
         span = f" in {least}…{most}" if None not in (least, most) else f", at least {least}"
         span = f", at most {most}" if least is None else span
         raise InputError(f"expected {what}{span}, found {_first(numbers, valid)}", field=field)
-    return numbers if array.dtype.kind in "iu" else numbers.astype(np.int64)
+    return numbers
 
 
 def to_states(value: object, states: int, field: str, *shapes: Shape) -> Any:
@@ -195,9 +193,11 @@ def to_mask(value: object, field: str, *shapes: Shape) -> Any:
         InputError: For numbers (0 and 1 too), and other shapes.
     """
     array = _to_array(value, field, "booleans", shapes)
-    is_empty_list = array.size == 0 and not hasattr(value, "dtype")
-    check(array.dtype == bool or is_empty_list, f"expected booleans, found {_contents(value, array)}", field=field)
-    return array if array.dtype == bool else np.asarray(array, bool)
+    if array.dtype == bool:
+        return array
+    if array.size or hasattr(value, "dtype"):
+        raise InputError(f"expected booleans, found {_contents(value, array)}", field=field)
+    return np.asarray(array, bool)  # of an empty list
 
 
 def to_key(value: object, field: str = "key") -> jax.Array:
@@ -225,7 +225,7 @@ def _to_array(value: object, field: str, what: str, shapes: tuple[Shape, ...]) -
             array = np.asarray(value)
         except (TypeError, ValueError) as error:
             raise InputError(f"expected {what}, found {describe(value)} ({error})", field=field) from error
-    if shapes and not any(_fits(array.shape, shape) for shape in shapes):
+    if shapes and array.shape not in shapes and not any(_fits(array.shape, shape) for shape in shapes):
         expected = " or ".join(_words(shape) for shape in shapes)
         actual = _contents(value, array) if array.dtype.kind in "OUS" or not array.ndim else f"shape {array.shape}"
         raise InputError(f"expected {what} of shape {expected}, found {actual}", field=field)

@@ -101,13 +101,15 @@ def check_instance(value: object, kinds: type | tuple[type, ...], field: str, *,
 
 def check_function(value: object, field: str) -> None:
     """Raise `InputError` unless a value can be called."""
-    check(callable(value), f"expected a function, found {describe(value)}", field=field)
+    if not callable(value):
+        raise InputError(f"expected a function, found {describe(value)}", field=field)
 
 
 def check_choice(value: object, choices: Iterable[str | int], field: str) -> None:
     """Raise `InputError` unless a value is one of several texts or numbers."""
     known = isinstance(value, str | Integral) and not isinstance(value, bool) and cast(Any, value) in choices
-    check(known, f"expected one of {', '.join(map(str, choices))}, found {describe(value)}", field=field)
+    if not known:
+        raise InputError(f"expected one of {', '.join(map(str, choices))}, found {describe(value)}", field=field)
 
 
 def to_list(values: object, kinds: type | tuple[type, ...], field: str, least: int = 1) -> list[Any]:
@@ -116,8 +118,9 @@ def to_list(values: object, kinds: type | tuple[type, ...], field: str, least: i
     Raises:
         InputError: For a value that is not a sequence, for fewer elements than `least`, and elements of other types.
     """
-    valid = isinstance(values, Iterable) and not isinstance(values, str | bytes | Mapping | kinds)
-    check(valid and getattr(values, "shape", None) != (), f"expected a list, found {describe(values)}", field=field)
+    single = isinstance(values, str | bytes | Mapping) or (kinds is not object and isinstance(values, kinds))
+    if single or not isinstance(values, Iterable) or getattr(values, "shape", None) == ():
+        raise InputError(f"expected a list, found {describe(values)}", field=field)
     elements = list(cast(Iterable[Any], values))
     check(len(elements) >= least, f"expected at least {least}, found {len(elements)}", field=field)
     for place, element in enumerate(elements):

@@ -86,7 +86,7 @@ class ModelResult(NamedTuple):
         return np.asarray(log_policies(self.model, moves, self.behavior, options=self.options))
 
 
-def check_arguments(grid: object, demonstrations: object, config: object) -> None:
+def check_arguments(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> None:
     """Check the arguments that all methods take.
 
     Args:
@@ -100,8 +100,6 @@ def check_arguments(grid: object, demonstrations: object, config: object) -> Non
     check_instance(grid, Grid, "grid")
     check_instance(config, MapConfig, "config")
     check_instance(demonstrations, Demonstrations, "demonstrations")
-    assert isinstance(grid, Grid)
-    assert isinstance(demonstrations, Demonstrations)
     check_instance(demonstrations.tasks, Task, "demonstrations")
     shape, actions = demonstrations.tasks.terminal.shape, int(np.asarray(demonstrations.actions).max(initial=-1))
     message = f"expected the grid's {grid.size} states and {grid.connectivity} actions, found {shape[-1]} states and "

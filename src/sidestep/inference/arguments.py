@@ -1,18 +1,24 @@
 """Checks of the arguments that fits, samplers and exact posteriors share."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sidestep.errors import check, check_instance, describe, to_list, to_number
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.behavior_model import BehaviorModel
 from sidestep.tabular.demonstrations import Demonstrations
-from sidestep.tabular.likelihood import ALL_TERMS
+from sidestep.tabular.likelihood import ALL_TERMS, Terms
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.tasks import Task
 
 
 def check_evidence(
-    model: object, demonstrations: object, behavior: object, tempering: object = 1.0, terms: object = ALL_TERMS
+    model: TransitionModel,
+    demonstrations: Demonstrations,
+    behavior: Behavior | BehaviorModel,
+    tempering: float = 1.0,
+    terms: Terms = ALL_TERMS,
 ) -> None:
     """Check what a transition model is learned from.
 
@@ -33,7 +39,7 @@ def check_evidence(
     check_world(model, demonstrations)
 
 
-def check_world(model: object, demonstrations: object) -> None:
+def check_world(model: TransitionModel, demonstrations: Demonstrations) -> None:
     """Check that demonstrations were made in the world of a transition model.
 
     Args:
@@ -45,8 +51,6 @@ def check_world(model: object, demonstrations: object) -> None:
     """
     check_instance(model, TransitionModel, "model")
     check_instance(demonstrations, Demonstrations, "demonstrations")
-    assert isinstance(model, TransitionModel)
-    assert isinstance(demonstrations, Demonstrations)
     check_instance(demonstrations.tasks, Task, "demonstrations")
     states, actions = demonstrations.tasks.terminal.shape[-1], np.asarray(demonstrations.actions)
     graph, last = model.graph, int(actions.max(initial=-1))
@@ -55,7 +59,7 @@ def check_world(model: object, demonstrations: object) -> None:
     check(fits, f"{message}actions up to {last}", field="demonstrations")
 
 
-def check_tasks(model: object, tasks: object, field: str) -> list[Task]:
+def check_tasks(model: TransitionModel, tasks: Sequence[Task], field: str) -> list[Task]:
     """Return a list of tasks in the world of a transition model.
 
     Args:
@@ -67,7 +71,6 @@ def check_tasks(model: object, tasks: object, field: str) -> list[Task]:
         InputError: For arguments of another type, no task, and another number of states.
     """
     check_instance(model, TransitionModel, "model")
-    assert isinstance(model, TransitionModel)
     states, elements = model.graph.states, to_list(tasks, Task, field)
     for each in elements:
         message = f"expected tasks of {states} states, found shape {each.terminal.shape}"

@@ -244,7 +244,13 @@ def _of_all_tasks(batches: list[SolveSummary], tasks: int) -> list[Array]:
 
 
 def _check_settings(
-    optimizer: object, options: object, prior: object, memory: object, mesh: object, large_map: object, report: object
+    optimizer: Optimizer,
+    options: SolveOptions,
+    prior: Prior,
+    memory: float,
+    mesh: Mesh | None,
+    large_map: int,
+    report: Callable[[Progress], None] | None,
 ) -> None:
     check_instance(optimizer, Optimizer, "optimizer")
     check_instance(options, SolveOptions, "options")

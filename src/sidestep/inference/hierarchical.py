@@ -105,6 +105,7 @@ class HierarchicalMRF:
             log_odds: δ.
             strength: λ.
         """
+        log_odds, strength = to_number(log_odds, "log_odds"), to_number(strength, "strength")
         weights = dict(zip(SHAPE_TERMS, strength * self.shapes.weights, strict=True))
         field = self.field + log_odds * self.varied + strength * self.shapes.field
         return BinaryMRF(field, self.shapes.shape, **weights)
@@ -117,9 +118,10 @@ class HierarchicalMRF:
         Args:
             closed: Whether each barrier is closed.
         """
-        of_field, varied = closed @ self.field, closed @ self.varied.astype(np.int64)
-        of_log_odds = of_field[..., None] + self.log_odds * varied[..., None]
         of_shapes = self.strengths * self.shapes.log_density(closed)[..., None]
+        maps = np.asarray(closed)
+        of_field, varied = maps @ self.field, maps @ self.varied.astype(np.int64)
+        of_log_odds = of_field[..., None] + self.log_odds * varied[..., None]
         return self.log_prior + of_log_odds[..., :, None] + of_shapes[..., None, :]
 
 

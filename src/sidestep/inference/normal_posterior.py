@@ -14,8 +14,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sidestep._arguments import to_key
-from sidestep.errors import check_count, to_number
+from sidestep._arguments import to_floats, to_key
+from sidestep.errors import check_count, check_function, to_number
 from sidestep.inference.natural_scale import NaturalScale, natural_scale
 from sidestep.inference.objective import Parameters
 
@@ -58,7 +58,7 @@ class Laplace:
         Args:
             vectors: One a row.
         """
-        scaled = vectors * self.scale
+        scaled = to_floats(vectors, "vectors", ("n", len(self.scale))) * self.scale
         return self.scale * (scaled + (scaled @ self.vectors * (1 / self.eigenvalues - 1)) @ self.vectors.T)
 
     @property
@@ -78,6 +78,7 @@ class Laplace:
         Args:
             function: Differentiable by JAX, such as the slip of a model with these parameters.
         """
+        check_function(function, "function")
         flat, unravel = ravel_pytree(self.parameters)
         jacobian = np.asarray(jax.jacrev(lambda x: function(unravel(x)))(flat), np.float64) * self.scale
         inner = np.sum(jacobian**2, axis=-1) + (jacobian @ self.vectors) ** 2 @ (1 / self.eigenvalues - 1)

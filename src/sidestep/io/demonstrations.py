@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Int
 
-from sidestep.errors import check, check_instance
+from sidestep.errors import check, check_instance, to_list
 from sidestep.io.gridding import Moves, grid_walks
 from sidestep.io.tables import check_rows
 from sidestep.io.walks import Walks, position_columns, walks_from_table
@@ -91,6 +91,8 @@ def walks_from_trajectories(trajectories: Sequence[Trajectory], goals: Sequence[
         goals: The goal (a state) of each task.
         grid: The map.
     """
+    check_instance(grid, Grid, "grid")
+    to_list(trajectories, Trajectory, "trajectories")
     lengths = [len(trajectory.states) for trajectory in trajectories]
     states = np.concatenate([trajectory.states for trajectory in trajectories])
     goal = np.repeat([goals[trajectory.task] for trajectory in trajectories], lengths)

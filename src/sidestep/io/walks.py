@@ -24,8 +24,8 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Bool, Float, Int, Integer, Real
 
-from sidestep._arguments import to_indices
-from sidestep.errors import check, check_instance, describe, to_path
+from sidestep._arguments import to_floats, to_indices, to_integers
+from sidestep.errors import check, check_instance, describe, to_list, to_path
 from sidestep.io.minari.walks import read_positions, write_positions
 from sidestep.io.tables import check_columns, check_rows, finite_column, number_column, read_table, write_table
 
@@ -66,6 +66,15 @@ class Walks:
     rows: Int[np.ndarray, " rows"]
     metadata: pa.Table
     source: str
+
+    def __post_init__(self) -> None:
+        labels, rows = len(to_list(self.labels, object, "labels", least=0)), len(self.rows)
+        for name, shape in (("goals", (labels, 2)), ("positions", (rows, 2)), ("failed_moves", (rows, 2))):
+            to_floats(getattr(self, name), name, shape)
+        to_floats(self.steps, "steps", (rows,))
+        to_integers(self.rows, "rows", ("rows",))
+        to_integers(self.offsets, "offsets", (labels + 1,), least=0, most=rows)
+        check_instance(self.metadata, pa.Table, "metadata")
 
     def __len__(self) -> int:
         """Return the number of walks."""

@@ -75,7 +75,7 @@ class PlannedPath:
         Args:
             max_risk: The largest probability that the path is not open.
         """
-        return self.open_probability >= 1 - max_risk
+        return self.open_probability >= 1 - to_number(max_risk, "max_risk", least=0, most=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -203,8 +203,8 @@ def to_trajectories(
         states = to_states(path, terminal.shape[1], "states")
         last = None if actions is None else actions - 1
         taken = to_integers(acted, "actions", ("moves",), least=0, most=last, what="actions")
-        message = f"expected moves and one state more, found {len(taken)} and {len(states)}"
-        check(0 < len(taken) == len(states) - 1, message)
+        if not 0 < len(taken) == len(states) - 1:
+            raise InputError(f"expected moves and one state more, found {len(taken)} and {len(states)}")
         message = "expected a trajectory that ends in the first terminal state, found one that goes on"
         check(not terminal[own, states[:-1]].any(), f"{message} after a terminal state of its task")
         return Trajectory(states, taken, own)

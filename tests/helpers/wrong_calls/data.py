@@ -3,6 +3,8 @@
 # ruff: noqa: E501
 # pyright: basic, reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
 
+from dataclasses import replace
+
 import numpy as np
 import pyarrow as pa
 
@@ -20,8 +22,10 @@ from helpers.wrong_calls.small import (
     labeled,
     walk,
 )
+from sidestep.io.roads import demonstrations_from_trips, read_roads, read_trips
 from sidestep.io.walks import walks_from_table
 
+GRAPH = ss.grid_graph(GRID)
 ARROW = pa.table({"walk": [0]})
 CASES = [
     *labeled("Grid", [
@@ -120,6 +124,10 @@ CASES = [
         ("select, None", lambda: WALKS.select(None), "index"),
         ("per_walk of a number", lambda: WALKS.per_walk(3), "column"),
         ("per_walk of a position", lambda: WALKS.per_walk("x"), "metadata"),
+        ("Walks without positions", lambda: replace(WALKS, positions=None), "positions"),
+        ("Walks with offsets beyond the rows", lambda: replace(WALKS, offsets=np.array([0, 2, 9])), "offsets"),
+        ("Walks with goals of other walks", lambda: replace(WALKS, goals=np.zeros((3, 2))), "goals"),
+        ("Walks with a dictionary of metadata", lambda: replace(WALKS, metadata={}), "metadata"),
         ("read_walks of None", lambda: ss.read_walks(None), "path"),
         ("read_walks of bytes", lambda: ss.read_walks(b"walks.csv"), "path"),
         ("read_walks of another ending", lambda: ss.read_walks("walks.xls"), ".csv"),
@@ -146,6 +154,13 @@ CASES = [
         ("write_map, text", lambda: ss.write_map("map.yaml", "free", GRID), "blocked"),
         ("write_map, numbers for a mask", lambda: ss.write_map("map.yaml", np.zeros((4, 5)), GRID, unknown=np.zeros((4, 5))), "unknown"),
         ("write_map on a shape", lambda: ss.write_map("map.yaml", np.zeros((4, 5)), (4, 5)), "grid"),
+    ]),
+    *labeled("roads", [
+        ("read_roads of None", lambda: read_roads(None, "turns.csv"), "path"),
+        ("read_trips of a graph", lambda: read_trips("trips.csv", GRAPH), "roads"),
+        ("demonstrations_from_trips in a grid", lambda: demonstrations_from_trips([[0, 1]], GRID), "graph"),
+        ("demonstrations_from_trips of other links", lambda: demonstrations_from_trips([[0, 99]], GRAPH), "trips[0]"),
+        ("demonstrations_from_trips of no trip", lambda: demonstrations_from_trips([], GRAPH), "trips"),
     ]),
     *labeled("Minari", [
         ("read_demonstrations of a number", lambda: ss.read_demonstrations(3, GRID), "dataset"),

@@ -153,3 +153,18 @@ LATER = [
         ("a lattice upside down", lambda: Lattice(jnp.ones(2), jnp.zeros(2), (5, 5)), "high"),
     ]),
 ]  # fmt: skip
+
+
+RIGHT_LATER = {
+    "graph of a list": lambda: ss.graph([[[0]]]).states == 1,
+    "road_network of lists": lambda: ss.road_network([[0, 1]], [1.0, 1.0]).graph.states == 2,
+    "road_network of integers": lambda: ss.road_network([[0, 1]], [1, 2], 0).parameters.shape == (2,),
+    "TiedModel of a list": lambda: ss.TiedModel(GRAPH, [[[-1, 0]], [[-1, 0]]], [0]).parameters.tolist() == [0],
+    "TabularModel of lists": lambda: ss.TabularModel(GRAPH, [[[0, 0]], [[0, 0]]]).parameters.shape == (2, 1, 2),
+    "Behavior of integers": lambda: ss.Behavior(ss.BoltzmannAverage(), 5, 0).beta == 5,
+    "task of lists": lambda: ss.task([0, 1], 1, [False, True]).terminal.tolist() == [False, True],
+    "reach of NumPy's numbers": lambda: ss.reach(GRID, np.int8(3), discount=1, step_cost=np.int64(1)).discount == 1,
+    "simulate from a list": lambda: len(ss.simulate(KEY, MODEL, (TASK,), [[0]], BEHAVIOR)) == 1,
+    "behavior_model of a list": lambda: len(ss.behavior_model(BEHAVIOR, person=[0, 1]).person) == 2,
+}
+"""Calls that must work then."""

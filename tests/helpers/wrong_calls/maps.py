@@ -7,9 +7,11 @@ import numpy as np
 
 import sidestep as ss
 from helpers.wrong_calls.small import BEHAVIOR, DEMOS, GRID, INF, MAP, MODEL, NAN, OTHER_GRID, TRUTH, WALKS, labeled
+from sidestep.maps.learned_map import PlannedPath
 
 TENTHS = np.full((4, 5), 0.1)
 VISITED = np.zeros((0, 2), int)
+PATH = PlannedPath(np.array([0]), np.zeros((1, 2)), np.zeros(1), 0.0, 1.0, 0.0, None)
 CASES = [
     *labeled("BehaviorConfig", [
         ("another backup", lambda: ss.BehaviorConfig(backup="softmax"), "backup"),
@@ -102,5 +104,8 @@ CASES = [
         ("save to a number", lambda: MAP.save(3), "folder"),
         ("load_map of None", lambda: ss.load_map(None), "folder"),
         ("load_map of a map", lambda: ss.load_map(MAP), "folder"),
+    ]),
+    *labeled("PlannedPath", [
+        ("within a risk of text", lambda: PATH.within("low"), "max_risk"),
     ]),
 ]  # fmt: skip

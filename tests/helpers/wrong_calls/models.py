@@ -14,9 +14,11 @@ from sidestep.evaluation.metrics import score_map, score_paths, visit_ranking
 from sidestep.evaluation.ranks import rank, uniform_band
 from sidestep.evaluation.relevance import relevant_obstacles
 from sidestep.evaluation.reliability import brier_score
+from sidestep.evaluation.study import run_method
 from sidestep.maps.config import SimulationConfig
 from sidestep.worlds.apartments import apartment
 from sidestep.worlds.blocks import blocks
+from sidestep.worlds.continuous_room import room
 from sidestep.worlds.offices import office, places
 from sidestep.worlds.rooms import rooms_in_a_row
 from sidestep.worlds.walks import simulate_walks
@@ -104,6 +106,8 @@ CASES = [
         ("brier_score, too few flags", lambda: brier_score(np.array([0.5]), np.array([], bool)), "obstacle"),
     ]),
     *labeled("worlds", [
+        ("room of one point", lambda: room(1), "lattice_points"),
+        ("run_method of a grid", lambda: run_method(GRID, "method", lambda *_: None), "problem"),
         ("office of text", lambda: office("20", 30, seed=0), "rows"),
         ("office of fractions", lambda: office(20, 30.5, seed=0), "columns"),
         ("office, a seed below 0", lambda: office(20, 30, seed=-1), "seed"),
