@@ -206,7 +206,7 @@ def to_trajectories(
         if not 0 < len(taken) == len(states) - 1:
             raise InputError(f"expected moves and one state more, found {len(taken)} and {len(states)}")
         message = "expected a trajectory that ends in the first terminal state, found one that goes on"
-        check(not terminal[own, states[:-1]].any(), f"{message} after a terminal state of its task")
+        check(not terminal[own, states[:-1]].any(), f"{message} after a terminal state of its task", field="states")
         return Trajectory(states, taken, own)
 
     results = []
