@@ -145,8 +145,8 @@ class PriorConfig:
         for name in ("log_odds", *SHAPE_WEIGHTS["sample"]):
             if getattr(self, name) is not None:
                 to_number(getattr(self, name), name)
-        to_number(self.mean, "mean")
-        to_number(self.variance, "variance", above=0)
+        to_number(self.mean, "prior mean")
+        to_number(self.variance, "prior variance", above=0)
         to_number(self.wall_prior, "wall_prior", least=0)
         others = _NORMAL_FIELDS if self.kind == "binary" else _BINARY_FIELDS
         for name in others:
