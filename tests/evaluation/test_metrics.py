@@ -152,7 +152,7 @@ def test_score_map_without_cells_to_average_is_none():
 
 def test_score_map_with_another_shape_or_nan_raises():
     flags = np.ones((2, 2), dtype=bool)
-    with pytest.raises(InputError, match=r"'blocked': expected the map's shape \(1, 2\), found \(2, 2\)"):
+    with pytest.raises(InputError, match=r"'blocked': expected numbers of shape \(1, 2\), found shape \(2, 2\)"):
         score_map(np.zeros((2, 2)), grid_of(".."), flags, flags)
     flags = np.ones((1, 2), dtype=bool)
     with pytest.raises(InputError, match="'blocked': expected finite numbers"):
@@ -199,8 +199,8 @@ def test_score_paths_without_legal_paths_has_no_excess_length():
 
 @pytest.mark.parametrize(("call", "message"), [
     (lambda grid: score_paths([array(0), array()], [0, 0], grid), "path, row 2: expected at least one state"),
-    (lambda grid: score_paths([array(0)], [0, 1], grid), "'goals': expected 1, one for each path, found 2"),
-    (lambda grid: score_paths([array(0, 3)], [0], grid), "'paths': expected states in 0…2"),
+    (lambda grid: score_paths([array(0)], [0, 1], grid), "'goals': expected states of shape (1,), found shape (2,)"),
+    (lambda grid: score_paths([array(0, 3)], [0], grid), "'paths[0]': expected states in 0…2"),
     (lambda grid: score_paths([array(0)], [-1], grid), "'goals': expected states in 0…2"),
     (lambda grid: relevant_obstacles(grid, array(3), array(0)), "'visited': expected states in 0…2"),
     (lambda grid: relevant_obstacles(grid, array(0), array(3)), "'goals': expected states in 0…2"),

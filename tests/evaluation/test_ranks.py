@@ -56,7 +56,7 @@ def test_rank_difference_is_the_distribution_less_the_uniform_one():
 
 @pytest.mark.parametrize("ranks", [[0, 4], [-1, 0], []])
 def test_rank_difference_of_ranks_out_of_range_is_refused(ranks):
-    with pytest.raises(InputError, match="from 0 to 3"):
+    with pytest.raises(InputError, match="'ranks': expected"):
         rank_difference(np.array(ranks, dtype=np.int64), 3)
 
 

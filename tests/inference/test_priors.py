@@ -113,7 +113,7 @@ def test_sensor_prior_clips_certain_probabilities():
     (0.5, 0.0, "'sensor variance': expected numbers above 0, found 0.0"),
     (0.5, -1.0, "'sensor variance'.*found -1.0"),
     (0.5, -INF, "'sensor variance'"),
-    (1.1, 1.0, "'sensor map': expected numbers from 0 to 1"),
+    (1.1, 1.0, "'sensor map': expected finite numbers from 0 to 1"),
     (-0.1, 1.0, "'sensor map'"),
 ])  # fmt: skip
 def test_sensor_prior_refuses_impossible_numbers(probability, variance, match):

@@ -100,7 +100,7 @@ def test_prior_has_the_weights_of_the_fit():
 
 
 @pytest.mark.parametrize(("maps", "arguments", "match"), [
-    ([], {}, "'maps': expected at least one map"),
+    ([], {}, "'maps': expected at least 1, found 0"),
     ([Grid(np.zeros((2, 2), dtype=int))], {}, "'maps': expected free and occupied cells"),
     ([Grid(WALL)], {"terms": ["corners"]}, "'terms': expected some of lines, pairs, blocks, isolated, found"),
     ([Grid(WALL)], {"standard_deviation": 0.0}, "'standard_deviation'"),

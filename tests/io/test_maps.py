@@ -241,15 +241,15 @@ def test_write_map_writes_the_keys_of_nav2(tmp_path):
 
 @pytest.mark.parametrize("value", [-0.01, 1.01, float("nan")])
 def test_write_map_of_other_values_raises(tmp_path, value):
-    with pytest.raises(InputError, match="expected probabilities"):
+    with pytest.raises(InputError, match="'blocked': expected finite numbers from 0 to 1"):
         write_map(tmp_path / "map.yaml", np.array([[value]]), Grid.unknown(1, 1))
     assert not list(tmp_path.iterdir())
 
 
 def test_write_map_of_another_shape_or_name_raises(tmp_path):
-    with pytest.raises(InputError, match=r"expected an array of shape \(1, 1\), found \(1, 2\)"):
+    with pytest.raises(InputError, match=r"expected numbers of shape \(1, 1\), found shape \(1, 2\)"):
         write_map(tmp_path / "map.yaml", np.zeros((1, 2)), Grid.unknown(1, 1))
-    with pytest.raises(InputError, match=r"'unknown': expected an array of shape \(1, 1\), found \(1, 2\)"):
+    with pytest.raises(InputError, match=r"'unknown': expected booleans of shape \(1, 1\), found shape \(1, 2\)"):
         write_map(tmp_path / "map.yaml", np.zeros((1, 1)), Grid.unknown(1, 1), unknown=np.zeros((1, 2), bool))
     with pytest.raises(InputError, match=r"ends in \.yaml"):
         write_map(tmp_path / "map.pgm", np.zeros((1, 1)), Grid.unknown(1, 1))

@@ -70,7 +70,8 @@ def random_world(seed: int, discount: float) -> World:
         jnp.asarray(rng.normal(size=STATES)),
         jnp.asarray(BETA),
     )
-    return World(*map(jnp.asarray, (successors, possible, available, terminal, discount)), numbers)
+    arrays = [jnp.asarray(part) for part in (successors, possible, available, terminal, discount)]
+    return World(arrays[0], arrays[1], arrays[2], arrays[3], arrays[4], numbers)
 
 
 def states_with_a_proper_policy(world: World) -> set[int]:

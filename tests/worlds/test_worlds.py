@@ -204,8 +204,8 @@ ROTATIONS = [np.linalg.matrix_power(_TURN, k) @ mirror for k in range(4) for mir
 @pytest.mark.parametrize(("call", "match"), [
     (lambda: apartment(4, 30, seed=0), "at least 5 rows and 5 columns, found 4 and 30"),
     (lambda: blocks(2, 30, seed=0), "at least 3 rows and 3 columns, found 2 and 30"),
-    (lambda: blocks(9, 9, seed=0, density=1.0), "'density': expected a number above 0 and below 1, found 1.0"),
-    (lambda: blocks(9, 9, seed=0, sizes=(5, 2)), r"'sizes': expected two numbers in order, at least 1, found \(5, 2\)"),
+    (lambda: blocks(9, 9, seed=0, density=1.0), "'density': expected a finite number above 0 and below 1, found 1.0"),
+    (lambda: blocks(9, 9, seed=0, sizes=(5, 2)), r"'sizes': expected two numbers in order, found \(5, 2\)"),
 ])  # fmt: skip
 def test_worlds_of_impossible_sizes_are_refused(call, match):
     with pytest.raises(InputError, match=match):
@@ -272,9 +272,9 @@ def rooms_of(grid):
 @pytest.mark.parametrize(("arguments", "match"), [
     ((3, 2, (0,)), "'columns': expected at least 3, found 2"),
     ((0, 3, (0,)), "'rows': expected at least 1, found 0"),
-    ((3, 3, (3,)), "'doors': expected a row in 0…2, found 3"),
+    ((3, 3, (3,)), "'doors': expected rows in 0…2, found 3"),
     ((3, 4, (0, 0)), "'columns': expected at least 5, found 4"),
-    ((3, 5, (0, -1)), "'doors': expected a row in 0…2, found -1"),
+    ((3, 5, (0, -1)), "'doors': expected rows in 0…2, found -1"),
 ])  # fmt: skip
 def test_rooms_of_impossible_sizes_are_refused(arguments, match):
     with pytest.raises(InputError, match=match):

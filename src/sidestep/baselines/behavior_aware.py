@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sidestep.baselines.interface import ModelResult, model_result, with_normal_prior
+from sidestep.baselines.interface import ModelResult, check_arguments, model_result, with_normal_prior
 from sidestep.evaluation.metrics import visit_ranking
 from sidestep.maps.config import MapConfig
 from sidestep.maps.fit import infer_map
@@ -34,6 +34,7 @@ def behavior_aware(grid: Grid, demonstrations: Demonstrations, config: MapConfig
     Raises:
         InputError: As `infer_map` does.
     """
+    check_arguments(grid, demonstrations, config)
     posterior = infer_map(ObstacleGrid(grid, config.prior.first_logit), demonstrations, config)
     result = model_result(posterior.model, demonstrations, config)
     return result._replace(behavior=posterior.behavior.behavior_of(), converged=posterior.converged)
@@ -50,6 +51,7 @@ def transitions_only(grid: Grid, demonstrations: Demonstrations, config: MapConf
     Returns:
         The learned model and P(blocked) of each cell, and whether the fit converged.
     """
+    check_arguments(grid, demonstrations, config)
     config = with_normal_prior(config)
     return behavior_aware(grid, demonstrations, replace(config, fit=replace(config.fit, terms="transitions")))
 
@@ -65,6 +67,7 @@ def visit_counts(grid: Grid, demonstrations: Demonstrations, config: MapConfig) 
     Returns:
         The map, ranked by minus the number of visits.
     """
+    check_arguments(grid, demonstrations, config)
     ranking = visit_ranking(np.concatenate(demonstrations.paths()), grid)
     blocked = np.clip(1 / (1 - ranking), None, _UNVISITED).ravel()
     return model_result(ObstacleGrid(grid, np.log(blocked) - np.log1p(-blocked)), demonstrations, config, ranking)

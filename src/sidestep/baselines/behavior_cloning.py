@@ -23,6 +23,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array, hstack, vstack
 
+from sidestep.baselines.interface import check_arguments
+from sidestep.errors import to_count
 from sidestep.maps.config import MapConfig
 from sidestep.robots.planners import PolicyPlanner
 from sidestep.tabular.demonstrations import Demonstrations
@@ -103,7 +105,8 @@ def behavior_cloning(
     Returns:
         A policy for every goal.
     """
-    del config
+    check_arguments(grid, demonstrations, config)
+    max_iterations = to_count(max_iterations, "max_iterations")
     walks = np.asarray(demonstrations.trajectory)
     fold, everything = walks % _FOLDS, np.ones(len(walks), dtype=bool)
 

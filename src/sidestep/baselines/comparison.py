@@ -8,7 +8,7 @@ import numpy as np
 
 from sidestep.baselines import BASELINES
 from sidestep.baselines.interface import Method, ModelResult, model_result
-from sidestep.errors import ImproperTask, NotConverged, check
+from sidestep.errors import ImproperTask, NotConverged, check, check_instance, to_number
 from sidestep.evaluation.study import Problem, Record, run_method
 from sidestep.inference.goals import goal_posterior
 from sidestep.io.gridding import Moves, grid_walks
@@ -90,6 +90,13 @@ def compare_methods(
         InputError: For a fraction that leaves no walk to learn from, or none to score though it is above 0; and as
             `learn_map` does.
     """
+    for name, value, kind in (("grid", grid, Grid), ("truth", truth, Grid), ("walks", walks, Walks)):
+        check_instance(value, kind, name)
+    check_instance(config, MapConfig, "config")
+    check_instance(annotations, WalkAnnotations, "annotations")
+    message = f"expected the map's shape {grid.shape}, found {truth.shape}"
+    check(truth.shape == grid.shape, message, field="truth")
+    to_number(hold_out, "hold_out", least=0, below=1)
     walks, config = sample_walks(walks, config), replace(config, max_walks=None)
     train, test = _split(walks, hold_out, config.seed)
     notify("map: behavior learns")

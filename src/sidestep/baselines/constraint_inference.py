@@ -19,7 +19,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sidestep.baselines.interface import ModelResult, model_result
+from sidestep.baselines.interface import ModelResult, check_arguments, model_result
 from sidestep.maps.config import MapConfig
 from sidestep.maps.fit import behavior_of
 from sidestep.tabular.backups import Behavior
@@ -44,6 +44,7 @@ def constraint_inference(grid: Grid, demonstrations: Demonstrations, config: Map
     Returns:
         A map in which forbidden cells have P(blocked) above 1/2.
     """
+    check_arguments(grid, demonstrations, config)
     visited = np.zeros(grid.size, dtype=bool)
     visited[np.concatenate(demonstrations.paths())] = True
     candidates = ~visited & (grid.known.ravel() == Cell.UNKNOWN)

@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from sidestep.errors import check, check_instance
 from sidestep.evaluation.study import MethodResult
 from sidestep.maps.config import MapConfig, PriorConfig
 from sidestep.maps.fit import behavior_of
@@ -20,7 +21,7 @@ from sidestep.tabular.likelihood import log_policies
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.reward import Reward
 from sidestep.tabular.solve import SolveOptions
-from sidestep.tabular.tasks import stack_tasks
+from sidestep.tabular.tasks import Task, stack_tasks
 
 _Cells = Float[np.ndarray, "rows columns"]
 
@@ -83,6 +84,27 @@ class ModelResult(NamedTuple):
         tasks = stack_tasks([self.reward.reach(self.model.blank, int(goal)) for goal in goals])
         moves = eqx.tree_at(lambda moves: moves.tasks, demonstrations, tasks)
         return np.asarray(log_policies(self.model, moves, self.behavior, options=self.options))
+
+
+def check_arguments(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> None:
+    """Check the arguments that all methods take.
+
+    Args:
+        grid: A map.
+        demonstrations: Demonstrations on it.
+        config: How they learn.
+
+    Raises:
+        InputError: For arguments of other types, and demonstrations in another world.
+    """
+    check_instance(grid, Grid, "grid")
+    check_instance(config, MapConfig, "config")
+    check_instance(demonstrations, Demonstrations, "demonstrations")
+    check_instance(demonstrations.tasks, Task, "demonstrations")
+    shape, actions = demonstrations.tasks.terminal.shape, int(np.asarray(demonstrations.actions).max(initial=-1))
+    message = f"expected the grid's {grid.size} states and {grid.connectivity} actions, found {shape[-1]} states and "
+    fits = shape[-1] == grid.size and actions < grid.connectivity
+    check(fits, f"{message}actions up to {actions}", field="demonstrations")
 
 
 def with_normal_prior(config: MapConfig) -> MapConfig:

@@ -34,7 +34,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from sidestep.baselines.interface import ModelResult, model_result, with_normal_prior
+from sidestep.baselines.interface import ModelResult, check_arguments, model_result, with_normal_prior
 from sidestep.errors import NotConverged
 from sidestep.inference.fit import fit
 from sidestep.inference.optimizers import LBFGS
@@ -91,6 +91,7 @@ def maxent_irl(grid: Grid, demonstrations: Demonstrations, config: MapConfig) ->
     Raises:
         NotConverged: Where the costs do not converge.
     """
+    check_arguments(grid, demonstrations, config)
     model, agents = true_model(grid.passable()), cost_behavior_model(grid, config)
     optimizer, options = LBFGS(_ITERATIONS, _TOLERANCE), SolveOptions(horizon=config.behavior.horizon)
     result = fit(model, demonstrations, agents, terms=("actions",), optimizer=optimizer, options=options)
@@ -124,6 +125,7 @@ def joint_estimation(grid: Grid, demonstrations: Demonstrations, config: MapConf
     Returns:
         The learned map, with the costs in the reward.
     """
+    check_arguments(grid, demonstrations, config)
     config = with_normal_prior(config)
     model, agents = ObstacleGrid(grid, config.prior.first_logit), cost_behavior_model(grid, config)
     fit = fit_map(model, demonstrations, config, behavior=agents)

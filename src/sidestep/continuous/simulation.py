@@ -124,7 +124,7 @@ def gather_trajectories(trajectories: Sequence[Trajectory], tasks: Sequence[Cont
 
 def _check_trajectory(trajectory: Trajectory, first: Trajectory, tasks: int, row: int) -> None:
     """Refuse a trajectory that is inconsistent, or has other shapes than the first."""
-    states, actions, task = trajectory
+    states, actions, task, _ = trajectory
     shape, action = np.shape(first.states)[1:], np.shape(first.actions)[1:]
     expect = partial(check, source="trajectory", row=row)
     fits = len(states) == len(actions) + 1 > 1 and np.shape(states)[1:] == shape

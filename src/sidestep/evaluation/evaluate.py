@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sidestep._arguments import to_finite, to_mask, to_states
+from sidestep.errors import check_function, check_instance, to_count
 from sidestep.evaluation.metrics import MapScores, PathScores, path_lengths, score_lengths, score_map, shortest_lengths
 from sidestep.evaluation.relevance import relevant_obstacles
 from sidestep.robots.planners import GoalPlan, Planner, grid_environment
@@ -114,6 +116,15 @@ def evaluate(
         >>> evaluate(None, blocked, truth, everywhere, visited).auc_relevant
         1.0
     """
+    check_instance(truth, Grid, "truth")
+    check_instance(planner, (Planner, type(None)), "planner")
+    check_function(callback, "callback")
+    to_count(seed, "seed", 0)
+    visited, scored = to_states(visited, truth.size, "visited", ("visits", 2)), to_mask(scored, "scored", truth.shape)
+    if goals is not None:
+        goals = to_states(goals, truth.size, "goals")
+    if ranking is not None:
+        ranking = to_finite(ranking, "ranking", truth.shape)
     callback("relevant obstacles", 0, 1)
     relevant = relevant_obstacles(truth, visited[:, 0], visited[:, 1])
     callback("relevant obstacles", 1, 1)
@@ -150,7 +161,9 @@ def evaluate(
 
 
 def plan_paths(
-    planner: Planner, starts: Int[np.ndarray, " starts"], goals: Int[np.ndarray, " goals"]
+    planner: Planner,
+    starts: Int[np.ndarray, " starts"] | Sequence[int],
+    goals: Int[np.ndarray, " goals"] | Sequence[int],
 ) -> tuple[Sequence[Int[np.ndarray, " _"]], Int[np.ndarray, " paths"]]:
     """Return the intended paths of a robot from every start to every other goal, and the goal of each path.
 
@@ -173,9 +186,11 @@ def plan_paths(
         >>> [path.tolist() for path in paths]
         [[0, 1, 2], [1, 2]]
     """
-    paths, path_goals = [], []
-    for goal in goals:
-        others = starts[starts != goal]
+    check_instance(planner, Planner, "planner")
+    states = planner.goal_mask().size
+    paths, path_goals, places = [], [], to_states(starts, states, "starts")
+    for goal in to_states(goals, states, "goals"):
+        others = places[places != goal]
         paths += planner.plan_to(int(goal)).paths_from(others)
         path_goals += [int(goal)] * len(others)
     return paths, np.asarray(path_goals, dtype=np.int64)

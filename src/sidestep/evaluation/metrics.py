@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer
 from scipy.sparse import csr_array
 
-from sidestep.errors import check
+from sidestep._arguments import to_finite, to_mask, to_states
+from sidestep.errors import check, check_instance, describe
 from sidestep.evaluation.reliability import brier_score, log_loss, reliability, scored_probabilities
-from sidestep.tabular.graph import check_states, free_cells, walkable_graph
+from sidestep.tabular.graph import free_cells, walkable_graph
 from sidestep.tabular.grid import Cell, Grid
 
 _Cells = Bool[np.ndarray, "rows columns"]
@@ -80,9 +81,9 @@ def score_map(blocked: Float[np.ndarray, "rows columns"], truth: Grid, scored: _
     Raises:
         InputError: For arrays of another shape than the map and for numbers that are not finite.
     """
-    for field, array in (("blocked", blocked), ("scored", scored), ("relevant", relevant)):
-        check(array.shape == truth.shape, f"expected the map's shape {truth.shape}, found {array.shape}", field=field)
-    check(np.isfinite(blocked).all(), "expected finite numbers", field="blocked")
+    check_instance(truth, Grid, "truth")
+    blocked = to_finite(blocked, "blocked", truth.shape)
+    scored, relevant = to_mask(scored, "scored", truth.shape), to_mask(relevant, "relevant", truth.shape)
     obstacle = scored & (truth.known == Cell.OCCUPIED)
     free = scored & (truth.known == Cell.FREE)
     on_obstacles, on_free = blocked[obstacle], blocked[free]
@@ -142,19 +143,19 @@ def score_paths(
         >>> score_paths([np.array([0, 3, 4, 5, 2]), np.array([0, 1, 2])], [2, 2], truth)
         PathScores(legal_fraction=0.5, excess_length=0.0)
     """
-    check(len(paths) == len(goals), f"expected {len(paths)}, one for each path, found {len(goals)}", field="goals")
+    check_instance(truth, Grid, "truth")
+    check(isinstance(paths, Sequence), f"expected a list of paths, found {describe(paths)}", field="paths")
+    ends = to_states(goals, truth.size, "goals", (len(paths),))
     if not len(paths):
         return PathScores()
-    for row, path in enumerate(paths, start=1):
-        check(len(path), "expected at least one state", source="path", row=row)
-    ends = np.asarray(goals)
-    check_states(np.concatenate(paths), truth.size, "paths")
-    check_states(ends, truth.size, "goals")
+    walked = [to_states(path, truth.size, f"paths[{place}]") for place, path in enumerate(paths)]
+    for row, path in enumerate(walked, start=1):
+        check(len(path), "expected at least one state, found none", source="path", row=row)
     graph = walkable_graph(truth)
-    starts = np.array([path[0] for path in paths])
+    starts = np.array([path[0] for path in walked])
     # a single state in an obstacle has no move that could be illegal
     shortest = np.where(free_cells(truth)[starts], shortest_lengths(graph, starts, ends), np.inf)
-    return score_lengths(path_lengths(graph, paths, ends), shortest)
+    return score_lengths(path_lengths(graph, walked, ends), shortest)
 
 
 def score_lengths(lengths: Float[np.ndarray, " paths"], shortest: Float[np.ndarray, " paths"]) -> PathScores:
@@ -221,8 +222,9 @@ def visit_ranking(visited: Integer[np.ndarray, " moves"], grid: Grid) -> Float[n
     Raises:
         InputError: For numbers that are not states of the map.
     """
-    check_states(visited, grid.size, "visited")
-    return -np.bincount(visited, minlength=grid.size).reshape(grid.shape).astype(np.float64)
+    check_instance(grid, Grid, "grid")
+    states = to_states(visited, grid.size, "visited")
+    return -np.bincount(states, minlength=grid.size).reshape(grid.shape).astype(np.float64)
 
 
 def _mean(values: np.ndarray) -> float | None:

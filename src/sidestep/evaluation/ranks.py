@@ -25,7 +25,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sidestep.errors import check, check_count
+from sidestep._arguments import to_floats, to_integers, to_mask
+from sidestep.errors import check, check_count, check_instance, to_count, to_number
 
 _HALVINGS = 50
 """The steps of the bisection of the tails."""
@@ -76,8 +77,12 @@ def rank(
         >>> rank(np.inf, np.array([3.0, 5.0]), np.random.default_rng(0))
         2
     """
-    check(not np.isnan([truth, *draws]).any(), "expected numbers, found NaN", field="draws")
-    return int(np.sum(draws < truth) + random.integers(0, np.sum(draws == truth), endpoint=True))
+    is_boolean = getattr(getattr(draws, "dtype", None), "kind", "") == "b"
+    numbers = (to_mask if is_boolean else to_floats)(draws, "draws", ("draws",))
+    value = truth if isinstance(truth, bool | np.bool_) else to_floats(truth, "truth", ())
+    check(not np.isnan([value, *numbers]).any(), "expected numbers, found NaN", field="draws")
+    check_instance(random, np.random.Generator, "random")
+    return int(np.sum(numbers < value) + random.integers(0, np.sum(numbers == value), endpoint=True))
 
 
 def rank_difference(ranks: Int[np.ndarray, " ranks"], draws: int) -> Float[np.ndarray, " draws"]:
@@ -110,6 +115,7 @@ def band_excess(ranks: Int[np.ndarray, " ranks"], band: UniformBand) -> float:
     Raises:
         InputError: For another number of ranks, and for ranks out of range.
     """
+    check_instance(band, UniformBand, "band")
     check(len(ranks) == band.ranks, f"expected {band.ranks} ranks, found {len(ranks)}", field="ranks")
     numbers = _numbers_up_to(ranks, band.draws)
     return float(np.maximum(numbers - band.high, band.low - numbers).max().clip(min=0) / len(ranks))
@@ -130,7 +136,8 @@ def outside_fraction(ranks: Int[np.ndarray, " ranks"], draws: int, probability: 
         >>> outside_fraction(np.arange(20), draws=19, probability=0.9)
         0.1
     """
-    tail = (1 - probability) / 2 * (draws + 1)
+    to_integers(ranks, "ranks", ("ranks",), least=0, most=to_count(draws, "draws"), what="ranks")
+    tail = (1 - to_number(probability, "probability", above=0, below=1)) / 2 * (draws + 1)
     # a tail of 3 ranks has exactly 3 of them, whatever the rounding
     return float(np.mean(np.minimum(ranks, draws - ranks) < np.floor(tail + 1e-9)))
 
@@ -156,7 +163,7 @@ def uniform_band(ranks: int, draws: int, probability: float = 0.95) -> UniformBa
 
     check_count(ranks, 1, "ranks")
     check_count(draws, 1, "draws")
-    check(0 < probability < 1, f"expected a number in (0, 1), found {probability}", field="probability")
+    to_number(probability, "probability", above=0, below=1)
     uniform = np.arange(1, draws + 1) / (draws + 1)
     so_far = np.arange(ranks + 1)
     # the number of ranks up to k, from that up to k − 1
@@ -188,6 +195,6 @@ def _coverage(
 
 
 def _numbers_up_to(ranks: Int[np.ndarray, " ranks"], draws: int) -> Int[np.ndarray, " draws"]:
-    message = f"expected ranks from 0 to {draws}"
-    check(len(ranks) > 0 and ranks.min() >= 0 and ranks.max() <= draws, message, field="ranks")
-    return np.cumsum(np.bincount(ranks, minlength=draws + 1))[:-1]
+    numbers = to_integers(ranks, "ranks", ("ranks",), least=0, most=to_count(draws, "draws"), what="ranks")
+    check(len(numbers), "expected at least one rank, found none", field="ranks")
+    return np.cumsum(np.bincount(numbers, minlength=draws + 1))[:-1]

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer
 from scipy.sparse import csr_array, vstack
 
-from sidestep.errors import check
-from sidestep.tabular.graph import check_states, clear_cells, clear_moves, free_cells, moves_into, walkable_graph
+from sidestep._arguments import to_states
+from sidestep.errors import check_instance
+from sidestep.tabular.graph import clear_cells, clear_moves, free_cells, moves_into, walkable_graph
 from sidestep.tabular.grid import Cell, Grid
 
 _Lengths = Float[np.ndarray, " states"]
@@ -43,10 +44,9 @@ def relevant_obstacles(
     """
     from scipy.sparse.csgraph import dijkstra
 
-    message = f"expected {len(visited)}, one for each visited state, found {len(goals)}"
-    check(len(visited) == len(goals), message, field="goals")
-    check_states(visited, truth.size, "visited")
-    check_states(goals, truth.size, "goals")
+    check_instance(truth, Grid, "truth")
+    visited = to_states(visited, truth.size, "visited")
+    goals = to_states(goals, truth.size, "goals", visited.shape)
     graph = walkable_graph(truth)
     through, past = _moves_of_closed_cells(truth), _prevented_diagonals(truth)
     relevant = np.zeros(truth.size, dtype=bool)

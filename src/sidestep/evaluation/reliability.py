@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sidestep.errors import check
+from sidestep._arguments import to_finite, to_mask
 from sidestep.tabular.grid import Cell, Grid
 
 BINS = 10
@@ -85,7 +85,7 @@ def reliability(blocked: _Values, obstacle: _Flags) -> Reliability:
     Raises:
         InputError: For arrays of different lengths, and for numbers outside [0, 1].
     """
-    _check(blocked, obstacle)
+    blocked, obstacle = _checked(blocked, obstacle)
     own = np.minimum((BINS * blocked).astype(np.int64), BINS - 1)
     cells, obstacles = (np.bincount(bins, minlength=BINS) for bins in (own, own[obstacle]))
     expected = np.zeros(BINS)
@@ -107,7 +107,7 @@ def brier_score(blocked: _Values, obstacle: _Flags) -> float | None:
         >>> brier_score(np.array([0.5, 0.0]), np.array([True, False]))
         0.125
     """
-    _check(blocked, obstacle)
+    blocked, obstacle = _checked(blocked, obstacle)
     return float(np.mean((blocked - obstacle) ** 2)) if len(blocked) else None
 
 
@@ -127,7 +127,7 @@ def log_loss(blocked: _Values, obstacle: _Flags) -> float | None:
         >>> round(log_loss(np.array([0.5, 0.0]), np.array([True, False])), 6)
         0.346574
     """
-    _check(blocked, obstacle)
+    blocked, obstacle = _checked(blocked, obstacle)
     clipped = np.clip(blocked, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)
     return float(-np.log(np.where(obstacle, clipped, 1 - clipped)).mean()) if len(blocked) else None
 
@@ -166,9 +166,9 @@ def scored_probabilities(
     return ranking[known], truth.known[known] == Cell.OCCUPIED
 
 
-def _check(blocked: _Values, obstacle: _Flags) -> None:
-    check(blocked.shape == obstacle.shape, f"expected {len(blocked)} flags, found {len(obstacle)}", field="obstacle")
-    check(((blocked >= 0) & (blocked <= 1)).all(), "expected numbers in [0, 1]", field="blocked")
+def _checked(blocked: _Values, obstacle: _Flags) -> tuple[_Values, _Flags]:
+    cells = np.asarray(to_finite(blocked, "blocked", ("cells",), least=0, most=1))
+    return cells, np.asarray(to_mask(obstacle, "obstacle", cells.shape))
 
 
 def _ratio(sums: np.ndarray, cells: Int[np.ndarray, " bins"]) -> _Bins:

@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Int
 
-from sidestep.errors import ImproperTask, NotConverged
+from sidestep.errors import ImproperTask, NotConverged, check_function, check_instance
 from sidestep.evaluation.evaluate import Evaluation, evaluate
 from sidestep.evaluation.reliability import Reliability, map_reliability
 from sidestep.robots.planners import Planner
@@ -146,6 +146,8 @@ def run_method(
     Returns:
         The record; without scores if the method raises `ImproperTask` or `NotConverged`.
     """
+    check_instance(problem, Problem, "problem")
+    check_function(learn, "learn")
     label, visited = f"{problem.name}: {name}", problem.demonstrations.visited_state_goals()
     try:
         notify(f"{label} learns")

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.errors import NotConverged
+from sidestep.errors import NotConverged, check, check_instance, to_list
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.behavior_model import BehaviorModel
 from sidestep.tabular.demonstrations import Demonstrations
@@ -88,6 +88,7 @@ def score_statistics(
         >>> scores.score.shape
         (2,)
     """
+    check_instance(options, (SolveOptions, type(None)), "options")
     check_likelihood(model, demonstrations, behavior, options or SolveOptions())
     padded, agents = padded_for(demonstrations, behavior)
     converged, *numbers = _scores(model, padded, agents, options)
@@ -135,7 +136,9 @@ def effective_sample_ratio(held_out: Sequence[ScoreStatistics]) -> float:
         >>> effective_sample_ratio([scores])
         0.5
     """
-    score, information, _, trajectory = (np.concatenate(part) for part in zip(*held_out, strict=True))
+    pieces = to_list(held_out, ScoreStatistics, "held_out")
+    score, information, _, trajectory = (np.concatenate(part) for part in zip(*pieces, strict=True))
+    check(len(score), "expected at least one move, found none", field="held_out")
     by_trajectory = np.bincount(trajectory, score - score.mean())
     variation = float(np.sum(by_trajectory**2))
     return float(information.sum()) / variation if variation > 0 else float("inf")

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from sidestep.errors import InputError, NotConverged, check
+from sidestep.errors import InputError, NotConverged, check, check_instance, to_count
+from sidestep.inference.arguments import check_evidence
 from sidestep.inference.chain_kernels import Chain, ChainKernels, Evidence, Workspace, World, chain_kernels
 from sidestep.inference.hierarchical import HierarchicalMRF, as_hierarchical, evidence_normalizers
 from sidestep.inference.mrf import BinaryMRF
@@ -243,7 +244,8 @@ def problem_of(
         InputError: For a model without barriers, a prior of another size, and a weight out of range.
         ImproperTask: For tasks without finite values.
     """
-    check(0 < tempering <= 1, f"expected a number in (0, 1], found {tempering}", field="tempering")
+    check_evidence(model, demonstrations, behavior, tempering, terms)
+    to_count(seed, "seed", 0)
     agents = behavior if isinstance(behavior, BehaviorModel) else behavior_model(behavior)
     barriers = barriers_of(model)
     check_prior(barriers, prior)
@@ -337,6 +339,7 @@ def check_prior(barriers: Barriers, prior: BinaryMRF | HierarchicalMRF) -> None:
     Raises:
         InputError: For another number of barriers, and for shape terms on another grid.
     """
+    check_instance(prior, (BinaryMRF, HierarchicalMRF), "prior")
     size, prior = len(barriers.known), as_hierarchical(prior).shapes
     check(len(prior.field) == size, f"expected {size} barriers, found {len(prior.field)}", field="prior")
     message = f"expected shape {barriers.shape} or None, found {prior.shape}"

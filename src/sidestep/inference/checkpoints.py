@@ -18,7 +18,7 @@ import numpy as np
 
 from sidestep._files import read_whole, write_whole
 from sidestep._typing import Tree
-from sidestep.errors import InputError, check, input_errors
+from sidestep.errors import InputError, check, check_instance, input_errors, to_number, to_path
 
 History = Sequence[Sequence[int | float]]
 
@@ -69,8 +69,13 @@ class Saver:
     """
 
     def __init__(self, checkpoint: str | Path | Checkpoint | None, key: str):
-        checkpoint = Checkpoint(checkpoint) if isinstance(checkpoint, str | Path) else checkpoint
-        self.checkpoint: Checkpoint | None = checkpoint
+        check_instance(checkpoint, (str, Path, Checkpoint, type(None)), "checkpoint")
+        self.checkpoint: Checkpoint | None = None
+        if checkpoint is not None:
+            own = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(checkpoint)
+            interval = to_number(own.min_interval, "min_interval", least=0)
+            fraction = to_number(own.max_fraction, "max_fraction", above=0, most=1)
+            self.checkpoint = Checkpoint(to_path(own.path, "checkpoint"), interval, fraction)
         self.key, self.next = key, 0.0
 
     def load(self, like: Tree, optional: Tree = ()) -> tuple[Tree, History, Tree]:

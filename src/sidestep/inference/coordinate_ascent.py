@@ -33,7 +33,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 from scipy.special import entr, expit, softmax
 
-from sidestep.errors import check, check_count
+from sidestep._arguments import to_key
+from sidestep.errors import check, check_count, check_function, check_instance
 from sidestep.inference.chain_kernels import Chain, Workspace
 from sidestep.inference.chains import NEG_INF, BarrierProblem, problem_of
 from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
@@ -169,7 +170,7 @@ class BarrierMeanField(Generic[Model]):
             Whether each barrier is closed, in each map.
         """
         check_count(count, 1, "count")
-        of_part, of_barriers = jax.random.split(key)
+        of_part, of_barriers = jax.random.split(to_key(key))
         part = np.asarray(jax.random.choice(of_part, len(self.weights), (count,), p=jax.numpy.asarray(self.weights)))
         return np.asarray(jax.random.uniform(of_barriers, (count, self.parts.shape[1]))) < self.parts[part]
 
@@ -241,6 +242,9 @@ def mean_field_barriers(
     """
     check_count(starts, 1, "starts")
     check_count(max_sweeps, 1, "max_sweeps")
+    check_instance(prior, BinaryMRF, "prior")
+    if report is not None:
+        check_function(report, "report")
     problem, agents = problem_of(model, demonstrations, behavior, prior, tempering=tempering, terms=terms)
     states, history = _starts(problem, prior, starts, seed), list[Sweep]()
     saver = Saver(checkpoint, fingerprint((astuple(problem), starts, seed)))

@@ -10,6 +10,7 @@ an infinite R̂ and as many effective draws as there are halves.
 import numpy as np
 from jaxtyping import Bool, Float
 
+from sidestep._arguments import to_floats, to_mask
 from sidestep.errors import check
 
 Draws = Float[np.ndarray, "chains draws quantities"] | Bool[np.ndarray, "chains draws quantities"]
@@ -73,9 +74,12 @@ def effective_sizes(draws: Draws) -> Float[np.ndarray, " quantities"]:
 
 
 def _halves(draws: Draws) -> Float[np.ndarray, "halves half quantities"]:
-    half = draws.shape[1] // 2
-    check(half >= 2, f"expected at least 4 draws of each chain, found {draws.shape[1]}", field="draws")
-    return np.concatenate([draws[:, :half], draws[:, half : 2 * half]]).astype(np.float64)
+    is_boolean = getattr(getattr(draws, "dtype", None), "kind", "") == "b"
+    numbers = np.asarray((to_mask if is_boolean else to_floats)(draws, "draws", ("chains", "draws", "quantities")))
+    half = numbers.shape[1] // 2
+    check(half >= 2, f"expected at least 4 draws of each chain, found {numbers.shape[1]}", field="draws")
+    check(len(numbers), "expected at least one chain, found none", field="draws")
+    return np.concatenate([numbers[:, :half], numbers[:, half : 2 * half]]).astype(np.float64)
 
 
 def _variances(halves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

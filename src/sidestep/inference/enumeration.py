@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sidestep.errors import NotConverged, check
+from sidestep.errors import NotConverged, check, check_instance, to_count
+from sidestep.inference.arguments import check_evidence
 from sidestep.inference.chains import PASSING, check_prior, crossed_barriers
 from sidestep.inference.hierarchical import HierarchicalMRF, as_hierarchical, evidence_normalizers
 from sidestep.inference.mrf import BinaryMRF
@@ -87,8 +88,11 @@ def enumerate_barriers(
         >>> exact.closed.round(2).tolist()  # the walk says nothing of the third cell
         [0.0, 0.0, 0.5]
     """
+    check_evidence(model, demonstrations, behavior, tempering, ALL_TERMS if terms == () else terms)
+    check_instance(behavior, Behavior, "behavior")
     barriers = barriers_of(model)
     check_prior(barriers, prior)
+    to_count(seed, "seed", 0)
     crossed = crossed_barriers(barriers, demonstrations, terms)
     free = np.flatnonzero((barriers.known == Cell.UNKNOWN) & ~crossed)
     message = f"expected at most {MAX_BARRIERS} unknown barriers to enumerate, found {len(free)}"

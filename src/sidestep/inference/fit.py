@@ -17,7 +17,8 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.errors import check
+from sidestep.errors import check, check_function, check_instance, to_count, to_number
+from sidestep.inference.arguments import check_evidence
 from sidestep.inference.batching import LARGE_MAP, MEMORY, plan_batches
 from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
 from sidestep.inference.maximize import Progress, Status, maximize, solve_tolerances
@@ -26,9 +27,8 @@ from sidestep.inference.optimizers import LBFGS, Adam, Optimizer
 from sidestep.inference.priors import Normal, Prior
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
-from sidestep.tabular.checks import check_behavior, check_demonstrations, check_model, check_persons
 from sidestep.tabular.demonstrations import Demonstrations
-from sidestep.tabular.likelihood import ALL_TERMS, Terms, check_terms
+from sidestep.tabular.likelihood import ALL_TERMS, Terms
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.proper import check_proper
 from sidestep.tabular.solve import SolveOptions
@@ -187,7 +187,8 @@ def fit(
         mesh: The devices over which tasks are spread (see `tasks_mesh`). With devices of several processes, each
             process calls `fit` with the same arguments and gets the same model.
         large_map: The number of states from which a map is large: its first solves are loose, its batches small.
-        report: Called with a `Progress` before the first and after every iteration, in every process.
+        report: Called with a `Progress` before the first and after every iteration, in every process. An error that it
+            raises ends the fit and is passed on unchanged.
         checkpoint: A file that is kept up to date while the fit runs.
         resume: Continue from the checkpoint. The fit ends exactly as if it had not been interrupted; with other
             devices, cores or `memory` than before, or with several processes, up to the tolerances. (The first process
@@ -197,7 +198,8 @@ def fit(
         The learned model, and how the optimization ended.
 
     Raises:
-        InputError: For arguments that exclude each other, visited states from which a goal cannot be reached, or a
+        InputError: For arguments of other types or out of range, or that exclude each other, demonstrations in another
+            world, visited states from which a goal cannot be reached, or a
             checkpoint of another fit.
         ImproperTask: For tasks without values.
         NotConverged: If values do not converge at the start, or stop converging on the way.
@@ -216,14 +218,13 @@ def fit(
     References:
         Equations 1 and 6 of the behavior-aware modeling paper.
     """
-    optimizer, options = optimizer or LBFGS(), options or SolveOptions()
-    check_model(model)
-    check_behavior(behavior, learned=True)
-    check_demonstrations(demonstrations, model.graph)
+    check_evidence(model, demonstrations, behavior, tempering, terms)
+    optimizer, options, prior = optimizer or LBFGS(), options or SolveOptions(), prior or Normal()
+    _check_settings(optimizer, options, prior, memory, mesh, large_map, report)
     behavior = as_behavior_model(behavior)
     solver = options.solver_for(behavior.behavior.backup, model.graph.states)
     options = SolveOptions(options.gradient, options.horizon, solver)
-    problem = Problem(model, behavior, demonstrations, prior or Normal(), terms, options, tempering)
+    problem = Problem(model, behavior, demonstrations, prior, tuple(terms), options, tempering)
     _check_problem(problem, optimizer)
     count, devices, reuse = len(demonstrations.tasks.terminal), 1 if mesh is None else mesh.size, optimizer.approximates
     plan = plan_batches(model, solver, count, memory=memory, devices=devices, reuse=reuse, large_map=large_map)
@@ -243,13 +244,31 @@ def _of_all_tasks(batches: list[SolveSummary], tasks: int) -> list[Array]:
     return [jax.device_put(leaf[:tasks]) for leaf in (joined(batches)[:3] if batches else unsolved)]
 
 
+def _check_settings(
+    optimizer: Optimizer,
+    options: SolveOptions,
+    prior: Prior,
+    memory: float,
+    mesh: Mesh | None,
+    large_map: int,
+    report: Callable[[Progress], None] | None,
+) -> None:
+    check_instance(optimizer, Optimizer, "optimizer")
+    check_instance(options, SolveOptions, "options")
+    check_instance(prior, Prior, "prior")
+    to_number(memory, "memory", above=0)
+    check_instance(mesh, (Mesh, type(None)), "mesh")
+    to_count(large_map, "large_map", 0)
+    if report is not None:
+        check_function(report, "report")
+
+
 def _check_problem(problem: Problem, optimizer: Optimizer) -> None:
-    terms, tempering, options, behavior = problem.terms, float(problem.tempering), problem.options, problem.behavior
+    options, behavior = problem.options, problem.behavior
     graph, demos = problem.model.graph, problem.demonstrations
-    check_terms(terms)
-    check(0 < tempering <= 1, f"expected a number above 0 and at most 1, found {tempering}", field="tempering")
+    problem.prior.check_parameters(problem.model.parameters)
     has_objective = options.gradient == "exact" or not isinstance(behavior.behavior.backup, BoltzmannAverage)
     message = "the fixed-policy gradient of the Boltzmann average belongs to no objective: expected Adam(), or 'exact'"
+    message += f", found {type(optimizer).__name__}"
     check(has_objective or isinstance(optimizer, Adam), message, field="gradient")
-    check_persons(behavior, len(demos.tasks.terminal))
     check_proper(behavior.tasks_of(demos.tasks), behavior.behavior_of(), graph, options.horizon)

@@ -24,10 +24,12 @@ import numpy as np
 from jax.scipy.special import logsumexp
 from jaxtyping import Float
 
-from sidestep.errors import InputError, NotConverged, check_count
+from sidestep._arguments import to_finite
+from sidestep.errors import InputError, NotConverged, check_count, check_function, check_instance, to_list, to_number
+from sidestep.inference.arguments import check_tasks
 from sidestep.inference.fit import Fit, Model
 from sidestep.tabular.backups import Behavior
-from sidestep.tabular.demonstrations import Demonstrations, Trajectory, flatten, gather
+from sidestep.tabular.demonstrations import Demonstrations, Trajectory, flatten, gather, to_trajectories
 from sidestep.tabular.likelihood import log_policies
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.tasks import Task, stack_tasks
@@ -73,7 +75,7 @@ def goal_posterior(
     trajectories: Sequence[Trajectory],
     candidates: Sequence[Task],
     behavior: Behavior,
-    goal_probabilities: Float[np.ndarray, " candidates"] | None = None,
+    goal_probabilities: Float[np.ndarray, " candidates"] | Sequence[float] | None = None,
 ) -> tuple[Float[np.ndarray, "trajectories candidates"], float]:
     """Return the posterior of each trajectory's goal, and the actions' log-likelihood.
 
@@ -104,11 +106,14 @@ def goal_posterior(
         >>> int(posterior[0].argmax())  # a walk to the right has the right end as its goal
         1
     """
+    tasks, walks = check_tasks(model, candidates, "candidates"), _checked(trajectories, model)
+    check_instance(behavior, Behavior, "behavior")
     if goal_probabilities is None:
-        goal_probabilities = np.full(len(candidates), 1 / len(candidates))
-    log_likelihood = [_trajectory_log_likelihoods(task, model, trajectories, behavior) for task in candidates]
+        goal_probabilities = np.full(len(tasks), 1 / len(tasks))
+    probabilities = np.asarray(to_finite(goal_probabilities, "goal_probabilities", (len(tasks),), least=0, most=1))
+    log_likelihood = [_trajectory_log_likelihoods(task, model, walks, behavior) for task in tasks]
     with np.errstate(divide="ignore"):
-        joint = np.log(goal_probabilities) + np.stack(log_likelihood, axis=1)
+        joint = np.log(probabilities) + np.stack(log_likelihood, axis=1)
     total = np.asarray(logsumexp(jnp.asarray(joint), axis=1))
     if not np.isfinite(total).all():
         raise InputError(
@@ -165,6 +170,9 @@ def fit_goals(
         (1, 2)
     """
     check_count(rounds, 1, "rounds")
+    to_number(tolerance, "tolerance", least=0)
+    check_function(learn, "learn")
+    trajectories, candidates = _checked(trajectories, model), check_tasks(model, candidates, "candidates")
     posterior, log_likelihood = goal_posterior(model, trajectories, candidates, behavior)
     history = [log_likelihood]
     while True:
@@ -197,6 +205,12 @@ def weighted_demonstrations(
     demos = gather([trajectories[index]._replace(task=int(candidate)) for index, candidate in pairs], candidates)
     weights = np.repeat(posterior[posterior > 0], [len(trajectories[index].actions) for index, _ in pairs])
     return eqx.tree_at(lambda demos: demos.weights, demos, jnp.asarray(weights))
+
+
+def _checked(trajectories: Sequence[Trajectory], model: TransitionModel) -> list[Trajectory]:
+    """Return trajectories in the world of a model, for which their tasks do not matter."""
+    walks = [walk._replace(task=0) for walk in to_list(trajectories, Trajectory, "trajectories")]
+    return to_trajectories(walks, np.zeros((1, model.graph.states), bool), model.graph.actions)
 
 
 def _trajectory_log_likelihoods(

@@ -21,13 +21,15 @@ a 36th of the unknown barriers, whichever is more.
 Pettitt 2008).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 from scipy.special import expit
 
-from sidestep.errors import check
+from sidestep._arguments import to_finite, to_floats, to_mask
+from sidestep.errors import check, check_instance, describe, to_number
 from sidestep.inference.mrf import SHAPE_TERMS, BinaryMRF
 from sidestep.inference.prior_chains import native_terms, run_prior
 from sidestep.tabular.grid import Cell
@@ -80,20 +82,21 @@ class HierarchicalMRF:
     most_crossed: float = _MOST_CROSSED
 
     def __post_init__(self) -> None:
-        check(np.isfinite(self.field).all(), "expected finite numbers", field="field")
-        check(np.isfinite(self.log_odds).all(), "expected finite numbers", field="log_odds")
-        rises = np.isfinite(self.strengths).all() and (np.diff(self.strengths) > 0).all()
-        starts = self.log_prior.size == 1 or self.strengths[0] == 0
-        check(rises and starts, "expected ascending numbers from 0, or a single one with one δ", field="strengths")
-        check(np.isfinite(self.log_prior).all(), "expected finite numbers", field="log_prior")
-        sizes = len(self.log_odds), len(self.strengths)
-        check(self.log_prior.shape == sizes, f"expected shape {sizes}, found {self.log_prior.shape}", field="log_prior")
-        barriers = len(self.shapes.field)
-        for name in ("field", "varied"):
-            size = len(getattr(self, name))
-            check(size == barriers, f"expected {barriers} barriers, found {size}", field=name)
-        message = f"expected a number of at least 0, found {self.most_crossed}"
-        check(self.most_crossed >= 0, message, field="most_crossed")
+        check_instance(self.shapes, BinaryMRF, "shapes")
+        barriers = (len(self.shapes.field),)
+        field, varied = to_finite(self.field, "field", barriers), to_mask(self.varied, "varied", barriers)
+        log_odds = to_finite(self.log_odds, "log_odds", ("densities",))
+        strengths = to_finite(self.strengths, "strengths", ("strengths",))
+        log_prior = to_finite(self.log_prior, "log_prior", (len(log_odds), len(strengths)))
+        check(log_prior.size, "expected at least one density and strength, found none", field="log_prior")
+        rises = (np.diff(strengths) > 0).all() and (log_prior.size == 1 or strengths[0] == 0)
+        message = f"expected ascending numbers from 0, or a single one with one δ, found {describe(strengths.tolist())}"
+        check(rises, message, field="strengths")
+        most_crossed = to_number(self.most_crossed, "most_crossed", least=0)
+        names = ("field", "varied", "log_odds", "strengths", "log_prior", "most_crossed")
+        values = (field, varied, log_odds, strengths, log_prior, most_crossed)
+        for name, value in zip(names, values, strict=True):
+            object.__setattr__(self, name, value)
 
     def at(self, log_odds: float, strength: float) -> BinaryMRF:
         """Return the prior at one δ and λ.
@@ -102,6 +105,7 @@ class HierarchicalMRF:
             log_odds: δ.
             strength: λ.
         """
+        log_odds, strength = to_number(log_odds, "log_odds"), to_number(strength, "strength")
         weights = dict(zip(SHAPE_TERMS, strength * self.shapes.weights, strict=True))
         field = self.field + log_odds * self.varied + strength * self.shapes.field
         return BinaryMRF(field, self.shapes.shape, **weights)
@@ -114,14 +118,15 @@ class HierarchicalMRF:
         Args:
             closed: Whether each barrier is closed.
         """
-        of_field, varied = closed @ self.field, closed @ self.varied.astype(np.int64)
-        of_log_odds = of_field[..., None] + self.log_odds * varied[..., None]
         of_shapes = self.strengths * self.shapes.log_density(closed)[..., None]
+        maps = np.asarray(closed)
+        of_field, varied = maps @ self.field, maps @ self.varied.astype(np.int64)
+        of_log_odds = of_field[..., None] + self.log_odds * varied[..., None]
         return self.log_prior + of_log_odds[..., :, None] + of_shapes[..., None, :]
 
 
 def hierarchical_mrf(
-    field: Float[np.ndarray, " barriers"],
+    field: Float[np.ndarray, " barriers"] | Sequence[float],
     shape: tuple[int, int] | None = None,
     *,
     lines: float = 2.5,
@@ -143,7 +148,8 @@ def hierarchical_mrf(
         >>> len(hierarchical_mrf(np.full(7, np.nan)).strengths)  # barriers that are no cells have no shapes
         1
     """
-    varied = np.isnan(field)
+    log_odds = to_floats(field, "field", ("barriers",))
+    varied = np.isnan(log_odds)
     strengths = np.zeros(1) if shape is None else _STRENGTHS
     weights = (0.0,) * 4 if shape is None else (lines, pairs, blocks, isolated)
     cost = 0.0 if shape is None else _STRENGTH_COST
@@ -153,7 +159,7 @@ def hierarchical_mrf(
         for values, (mean, deviation) in ((_LOG_ODDS, _LOG_ODDS_PRIOR), (strengths, _STRENGTH_PRIOR))
     )
     log_prior = of_log_odds[:, None] + of_strengths
-    return HierarchicalMRF(shapes, np.where(varied, 0.0, field), varied, _LOG_ODDS, strengths, log_prior)
+    return HierarchicalMRF(shapes, np.where(varied, 0.0, log_odds), varied, _LOG_ODDS, strengths, log_prior)
 
 
 def as_hierarchical(prior: BinaryMRF | HierarchicalMRF) -> HierarchicalMRF:

@@ -15,7 +15,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from sidestep.errors import InputError, SidestepError, check, check_count
+from sidestep.errors import InputError, SidestepError, check, check_count, describe
 from sidestep.inference.decomposition import low_rank, whole
 from sidestep.inference.fit import Estimate, Fit
 from sidestep.inference.information import HasInformation, Information
@@ -62,6 +62,9 @@ def laplace(fit: HasInformation | Information, *, dense: int = 500, rank: int = 
         (2013), for the low rank.
     """
     check_count(rank, 1, "rank")
+    check_count(dense, 0, "dense")
+    if isinstance(fit, type) or not isinstance(fit, Information | HasInformation):
+        raise InputError(f"expected a fit, or its information, found {describe(fit)}", field="fit")
     information = fit if isinstance(fit, Information) else fit.information()
     _check_bounds(information.parameters)
     finite = np.isfinite(information.gradient).all()

@@ -19,6 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sidestep._arguments import to_integers
+from sidestep.errors import check, check_instance
 from sidestep.inference.mrf import BinaryMRF, expected_shapes
 from sidestep.inference.priors import Prior
 from sidestep.tabular.arrays import to_jax
@@ -45,11 +47,17 @@ class MeanField(Prior):
     known: Int[Array, "*shape"]
 
     def __init__(self, prior: BinaryMRF, known: Int[Array | np.ndarray, "*shape"]):
+        """Raise `InputError` for another prior, and barriers that are not its own."""
+        check_instance(prior, BinaryMRF, "prior")
+        cells = to_integers(known, "known", least=-1, most=1, what="barriers")
+        shape = prior.field.shape if prior.shape is None else prior.shape
+        fits = cells.shape == shape or (prior.shape is None and cells.size == len(prior.field))
+        check(fits, f"expected barriers of shape {shape}, found shape {cells.shape}", field="known")
         self.field, self.weights = (
             to_jax(prior.field, jnp.result_type(float)),
             to_jax(prior.weights, jnp.result_type(float)),
         )
-        self.known = to_jax(known)
+        self.known = to_jax(cells)
 
     def log_density(self, parameters: Float[Array, " parameters"]) -> Float[Array, ""]:
         """Return E_q[log p(z)] + H(q) in nats, over unknown barriers and the shapes that they are part of."""

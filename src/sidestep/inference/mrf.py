@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 
-from sidestep.errors import check
+from sidestep._arguments import to_finite, to_integers
+from sidestep.errors import check, describe, to_number
 
 SHAPE_TERMS = ("lines", "pairs", "blocks", "isolated")
 
@@ -54,13 +55,17 @@ class BinaryMRF:
     isolated: float = 0.0
 
     def __post_init__(self) -> None:
-        check(np.isfinite(self.field).all(), "expected finite numbers", field="field")
-        check(np.isfinite(self.weights).all(), "expected finite numbers", field=", ".join(SHAPE_TERMS))
+        object.__setattr__(self, "field", np.asarray(to_finite(self.field, "field", ("barriers",))))
+        for name in SHAPE_TERMS:
+            object.__setattr__(self, name, to_number(getattr(self, name), name))
         if self.shape is None:
-            check(not self.weights.any(), "expected a shape, or no weights of shape terms", field="shape")
+            message = f"expected a shape, or no weights of shape terms, found {self.weights.tolist()}"
+            check(not self.weights.any(), message, field="shape")
         else:
-            fits = self.shape[0] * self.shape[1] == len(self.field)
-            check(fits, f"expected {len(self.field)} cells, found {self.shape}", field="shape")
+            rows, columns = to_integers(self.shape, "shape", (2,), least=1).tolist()
+            fits = rows * columns == len(self.field)
+            check(fits, f"expected {len(self.field)} cells, found {rows} × {columns}", field="shape")
+            object.__setattr__(self, "shape", (rows, columns))
 
     @property
     def weights(self) -> Float[np.ndarray, " 4"]:
@@ -74,11 +79,18 @@ class BinaryMRF:
 
         Args:
             closed: Whether each barrier is closed.
+
+        Raises:
+            InputError: For anything but whether each barrier is closed.
         """
-        total = closed @ self.field
+        maps = np.asarray(closed)
+        fits = maps.dtype.kind in "biu" and maps.shape[-1:] == self.field.shape
+        message = f"expected booleans, or 0 and 1, of {len(self.field)} barriers, found {describe(closed)}"
+        check(fits, message, field="closed")
+        total = maps @ self.field
         if self.shape is not None:
-            maps = np.asarray(closed, bool).reshape(*closed.shape[:-1], *self.shape)
-            total = total + shape_counts(maps) @ self.weights
+            cells = maps.astype(bool, copy=False).reshape(*maps.shape[:-1], *self.shape)
+            total = total + shape_counts(cells) @ self.weights
         return np.asarray(total)
 
 

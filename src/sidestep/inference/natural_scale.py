@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sidestep._typing import Tree
+from sidestep.errors import check_instance
 from sidestep.inference.objective import Parameters
 
 
@@ -40,6 +41,7 @@ def natural_scale(parameters: Parameters) -> NaturalScale:
     Args:
         parameters: As a fit learns them, with any leading axes.
     """
+    check_instance(parameters, Parameters, "parameters")
     own = parameters.behavior
     scales = jnp.exp, jax.nn.sigmoid, jax.nn.sigmoid, lambda weights: weights, jax.nn.softplus
     mapped = (None if part is None else scale(jnp.asarray(part)) for scale, part in zip(scales, own, strict=True))

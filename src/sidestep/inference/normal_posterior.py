@@ -14,7 +14,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sidestep.errors import check, check_count
+from sidestep._arguments import to_floats, to_key
+from sidestep.errors import check_count, check_function, to_number
 from sidestep.inference.natural_scale import NaturalScale, natural_scale
 from sidestep.inference.objective import Parameters
 
@@ -57,7 +58,7 @@ class Laplace:
         Args:
             vectors: One a row.
         """
-        scaled = vectors * self.scale
+        scaled = to_floats(vectors, "vectors", ("n", len(self.scale))) * self.scale
         return self.scale * (scaled + (scaled @ self.vectors * (1 / self.eigenvalues - 1)) @ self.vectors.T)
 
     @property
@@ -77,6 +78,7 @@ class Laplace:
         Args:
             function: Differentiable by JAX, such as the slip of a model with these parameters.
         """
+        check_function(function, "function")
         flat, unravel = ravel_pytree(self.parameters)
         jacobian = np.asarray(jax.jacrev(lambda x: function(unravel(x)))(flat), np.float64) * self.scale
         inner = np.sum(jacobian**2, axis=-1) + (jacobian @ self.vectors) ** 2 @ (1 / self.eigenvalues - 1)
@@ -96,7 +98,7 @@ class Laplace:
         Raises:
             InputError: For another level.
         """
-        check(0 < level < 1, f"expected a probability above 0 and below 1, found {level}", field="level")
+        to_number(level, "level", above=0, below=1)
         width = float(jax.scipy.special.ndtri((1 + level) / 2))
         errors = self.standard_errors
         lower, upper = (
@@ -119,7 +121,7 @@ class Laplace:
             InputError: For n below 1.
         """
         check_count(n, 1, "n")
-        white = np.asarray(jax.random.normal(key, (n, len(self.scale))), np.float64)
+        white = np.asarray(jax.random.normal(to_key(key), (n, len(self.scale))), np.float64)
         inner = white + (white @ self.vectors * (1 / np.sqrt(self.eigenvalues) - 1)) @ self.vectors.T
         flat, unravel = ravel_pytree(self.parameters)
         return jax.vmap(unravel)(flat + jnp.asarray(inner * self.scale, flat.dtype))

@@ -19,8 +19,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from sidestep._arguments import to_key
 from sidestep._typing import Tree
-from sidestep.errors import check_count
+from sidestep.errors import check_count, check_instance
 from sidestep.inference.arviz_data import inference_data, require
 from sidestep.inference.batching import Batch
 from sidestep.inference.diagnostics import effective_sizes, split_rhat
@@ -99,6 +100,8 @@ def sample(fit: Fit[Any], key: PRNGKeyArray, n: int = 1_000, *, chains: int = 4,
         JAX" (2024). Vehtari et al., "Rank-normalization, folding, and localization: an improved R̂" (2021), for
         splitting chains.
     """
+    check_instance(fit, Fit, "fit")
+    to_key(key)
     require("blackjax", "sample")
     for count, least, field in ((n, 4, "n"), (chains, 1, "chains"), (warmup, 1, "warmup")):
         check_count(count, least, field)

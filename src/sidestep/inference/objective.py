@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sidestep._programs import keep_program
 from sidestep._typing import Tree
-from sidestep.errors import InputError
+from sidestep.errors import InputError, to_list
 from sidestep.inference.batching import Batch, BatchPlan, make_batches, plan_batches
 from sidestep.inference.checkpoints import fingerprint
 from sidestep.inference.priors import Prior
@@ -324,7 +324,8 @@ def tasks_mesh(devices: Sequence[Any] | None = None) -> Mesh:
         >>> tasks_mesh(jax.devices()[:1]).size
         1
     """
-    return Mesh(np.asarray(jax.devices() if devices is None else devices), (AXIS,))
+    own = jax.devices() if devices is None else to_list(devices, jax.Device, "devices")
+    return Mesh(np.asarray(own), (AXIS,))
 
 
 def transitions_and_prior(

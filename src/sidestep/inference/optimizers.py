@@ -8,6 +8,7 @@ minus the objective. To add an optimizer, subclass `Optimizer`.
 import abc
 import warnings
 from collections.abc import Callable
+from functools import partial
 from threading import Thread
 from typing import Any, ClassVar, NamedTuple
 
@@ -19,6 +20,7 @@ from jaxtyping import Array, Float
 
 from sidestep._programs import keep_program
 from sidestep._typing import Tree
+from sidestep.errors import to_count, to_number
 
 Vector = Float[np.ndarray, " parameters"]
 
@@ -28,6 +30,14 @@ Loss = Callable[..., tuple[float, Vector]]
 
 `approximate` allows a cheaper value, which omits what has hardly changed since the last evaluation.
 """
+
+
+_max_iterations = partial(to_count, field="max_iterations", least=0)
+_tolerance = partial(to_number, field="tolerance", least=0)
+_memory_size = partial(to_count, field="memory_size")
+_learning_rate, _initial_step, _max_step = (
+    partial(to_number, field=name, above=0) for name in ("learning_rate", "initial_step", "max_step")
+)
 
 
 class Optimizer(eqx.Module):
@@ -124,9 +134,9 @@ class LBFGS(Optimizer):
         True
     """
 
-    max_iterations: int = eqx.field(default=500, static=True)
-    tolerance: float = eqx.field(default=1e-4, static=True)
-    memory_size: int = eqx.field(default=20, static=True)
+    max_iterations: int = eqx.field(default=500, static=True, converter=_max_iterations)
+    tolerance: float = eqx.field(default=1e-4, static=True, converter=_tolerance)
+    memory_size: int = eqx.field(default=20, static=True, converter=_memory_size)
     resumes_with: ClassVar[tuple[str, ...]] = ("memory_size",)
 
     def init(self, x: Vector) -> Tree:
@@ -165,9 +175,9 @@ class Adam(Optimizer):
         True
     """
 
-    max_iterations: int = eqx.field(default=2000, static=True)
-    learning_rate: float = eqx.field(default=0.2, static=True)
-    tolerance: float = eqx.field(default=1e-2, static=True)
+    max_iterations: int = eqx.field(default=2000, static=True, converter=_max_iterations)
+    learning_rate: float = eqx.field(default=0.2, static=True, converter=_learning_rate)
+    tolerance: float = eqx.field(default=1e-2, static=True, converter=_tolerance)
     resumes_with: ClassVar[tuple[str, ...]] = ("learning_rate", "max_iterations")
 
     def _transformation(self) -> Any:
@@ -220,10 +230,10 @@ class Rprop(Optimizer):
         True
     """
 
-    max_iterations: int = eqx.field(default=500, static=True)
-    tolerance: float = eqx.field(default=1.0, static=True)
-    initial_step: float = eqx.field(default=0.7, static=True)
-    max_step: float = eqx.field(default=1.5, static=True)
+    max_iterations: int = eqx.field(default=500, static=True, converter=_max_iterations)
+    tolerance: float = eqx.field(default=1.0, static=True, converter=_tolerance)
+    initial_step: float = eqx.field(default=0.7, static=True, converter=_initial_step)
+    max_step: float = eqx.field(default=1.5, static=True, converter=_max_step)
     solve_tolerance: ClassVar[float] = 1e-5
     approximates: ClassVar[bool] = True
     measure: ClassVar[str] = "the next step promises {:.2g} nats"

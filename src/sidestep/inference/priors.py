@@ -13,29 +13,42 @@ an agent in a cell is as much evidence that the cell is free as a move into it.
 """
 
 import abc
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int, Shaped
 
+from sidestep._arguments import to_finite, to_floats, to_integers
 from sidestep._typing import FloatTree
-from sidestep.errors import check, check_not_negative
+from sidestep.errors import InputError, check, check_instance, to_number
+from sidestep.tabular.arrays import to_jax
 
-Numbers = float | Float[Array | np.ndarray, "..."]
+Numbers = float | Float[Array | np.ndarray, "..."] | Sequence[float]
 MIN_PROBABILITY = 1 / 1020
 """The least distance of a sensor's probability from 0 and 1: a quarter of a gray level of an 8-bit image."""
 
 
-def _as_floats(numbers: Numbers) -> Float[Array, "..."]:
-    # `jnp.asarray` would compile a function for each shape
-    return jax.device_put(np.asarray(numbers, jnp.result_type(float)))
+def _as_floats(numbers: Shaped[ArrayLike, "..."]) -> Float[Array, "..."]:
+    return to_jax(np.asarray(numbers), jnp.result_type(float))
 
 
 def _checked_strength(strength: float) -> Float[Array, ""]:
-    check_not_negative(strength, "strength")
-    return _as_floats(strength)
+    return _as_floats(to_number(strength, "strength", least=0))
+
+
+def _checked_pairs(pairs: Int[Array | np.ndarray, "pairs 2"] | Sequence[Sequence[int]]) -> Int[Array, "pairs 2"]:
+    return to_jax(to_integers(pairs, "pairs", ("pairs", 2), least=0))
+
+
+def _checked_known(known: Int[Array | np.ndarray, "rows columns"]) -> Int[Array, "rows columns"]:
+    return to_jax(to_integers(known, "known", ("rows", "columns"), least=-1, most=1, what="cells"))
+
+
+def _checked_counts(counts: Float[Array | np.ndarray, " cells"] | Sequence[float]) -> Float[Array, " cells"]:
+    return to_jax(to_finite(counts, "counts", ("cells",), least=0))
 
 
 class Prior(eqx.Module):
@@ -59,6 +72,20 @@ class Prior(eqx.Module):
             log p(θ) in nats, up to a constant.
         """
 
+    def check_parameters(self, parameters: FloatTree) -> None:
+        """Raise `InputError` unless this is a density over parameters of such shapes.
+
+        Args:
+            parameters: The parameters of a model.
+        """
+        try:
+            shape = jax.eval_shape(self.log_density, parameters).shape
+        except (TypeError, ValueError, IndexError) as error:
+            shapes = [np.shape(leaf) for leaf in jax.tree.leaves(parameters)]
+            message = f"expected a density over the model's parameters, of shapes {shapes}, found another ({error})"
+            raise InputError(message, field="prior") from error
+        check(shape == (), f"expected a density that is one number, found shape {shape}", field="prior")
+
 
 class Normal(Prior):
     """Independent normal parameters: log p(θ) = −Σ (θ − b)²/(2σ²), without the constant.
@@ -81,10 +108,8 @@ class Normal(Prior):
     variance: Float[Array, "..."]
 
     def __init__(self, mean: Numbers = -2.0, variance: Numbers = 2.0):
-        self.mean, self.variance = _as_floats(mean), _as_floats(variance)
-        check(np.isfinite(self.mean).all(), "expected finite numbers", field="prior mean")
-        positive = np.isfinite(self.variance) & (np.asarray(self.variance) > 0)
-        check(positive.all(), "expected numbers above 0", field="prior variance")
+        self.mean = _as_floats(to_finite(mean, "prior mean"))
+        self.variance = _as_floats(to_finite(variance, "prior variance", above=0))
 
     def log_density(self, parameters: FloatTree) -> Float[Array, ""]:
         """Return −Σ (θ − b)²/(2σ²) over all parameters."""
@@ -96,8 +121,8 @@ class Normal(Prior):
 
 
 def sensor_prior(
-    probability: Float[np.ndarray, "rows columns"],
-    variance: float | Float[np.ndarray, "rows columns"],
+    probability: Float[np.ndarray, "rows columns"] | Sequence[Sequence[float]],
+    variance: float | Float[np.ndarray, "rows columns"] | Sequence[Sequence[float]],
     unobserved: Normal,
 ) -> Normal:
     """Return the prior of the cells' logits after a sensor: the mean of an observed cell is ln(p / (1 − p)).
@@ -118,12 +143,17 @@ def sensor_prior(
         >>> sensor_prior(np.array([[0.5, np.nan]]), 1.0, Normal(-2.0, 4.0)).mean.tolist()
         [0.0, -2.0]
     """
-    variances = np.broadcast_to(np.asarray(variance, dtype=np.float64), probability.shape)
-    least = np.nanmin(variances, initial=np.inf)
+    check_instance(unobserved, Normal, "unobserved")
+    cells = to_floats(probability, "sensor map", ("rows", "columns"))
+    variances = np.broadcast_to(to_floats(variance, "sensor variance", (), cells.shape), cells.shape)
+    least, values = np.nanmin(variances, initial=np.inf), cells[~np.isnan(cells)]
     check(least > 0, f"expected numbers above 0, found {least}", field="sensor variance")
-    check(not ((probability < 0) | (probability > 1)).any(), "expected numbers from 0 to 1", field="sensor map")
-    observed = ~np.isnan(probability) & np.isfinite(variances)
-    p = np.clip(np.where(observed, probability, 0.5), MIN_PROBABILITY, 1 - MIN_PROBABILITY)
+    to_finite(values, "sensor map", least=0, most=1)
+    observed = ~np.isnan(cells) & np.isfinite(variances)
+    p = np.clip(np.where(observed, cells, 0.5), MIN_PROBABILITY, 1 - MIN_PROBABILITY)
+    for each in (unobserved.mean, unobserved.variance):
+        message = f"expected one number, or one for each of {p.size} cells, found shape {each.shape}"
+        check(each.shape in ((), (p.size,)), message, field="unobserved")
     mean, spread = (np.broadcast_to(each, p.size) for each in (unobserved.mean, unobserved.variance))
     observed, logit = observed.ravel(), (np.log(p) - np.log1p(-p)).ravel()
     return Normal(np.where(observed, logit, mean), np.where(observed, variances.ravel(), spread))
@@ -147,8 +177,22 @@ class GaussianMRF(Prior):
     """
 
     independent: Normal
-    pairs: Int[Array, "pairs 2"] = eqx.field(converter=jnp.asarray)
+    pairs: Int[Array, "pairs 2"] = eqx.field(converter=_checked_pairs)
     strength: Float[Array, ""] = eqx.field(converter=_checked_strength)
+
+    def __check_init__(self) -> None:
+        check_instance(self.independent, Normal, "independent")
+
+    def check_parameters(self, parameters: FloatTree) -> None:
+        """Raise `InputError` for parameters that are no vector, or too short for the pairs.
+
+        Args:
+            parameters: The parameters of a model.
+        """
+        shape, last = getattr(parameters, "shape", None), int(np.asarray(self.pairs).max(initial=-1))
+        message = f"expected pairs of the model's parameters, of shape {shape}, found a pair with {last}"
+        check(shape is not None and len(shape) == 1 and last < shape[0], message, field="prior")
+        self.independent.check_parameters(parameters)
 
     def log_density(self, parameters: Float[Array, " parameters"]) -> Float[Array, ""]:
         """Return the independent prior's log density − s Σ (θ_i − θ_j)²."""
@@ -175,8 +219,11 @@ class WallPrior(Prior):
     """
 
     independent: Normal
-    known: Int[Array, "rows columns"] = eqx.field(converter=jnp.asarray)
+    known: Int[Array, "rows columns"] = eqx.field(converter=_checked_known)
     strength: Float[Array, ""] = eqx.field(converter=_checked_strength)
+
+    def __check_init__(self) -> None:
+        check_instance(self.independent, Normal, "independent")
 
     def log_density(self, parameters: Float[Array, " cells"]) -> Float[Array, ""]:
         """Return the independent prior's log density + s Σ p [1 − (1 − p_left p_right)(1 − p_up p_down)].
@@ -206,7 +253,10 @@ class FreeCellEvidence(Prior):
     """
 
     prior: Prior
-    counts: Float[Array, " cells"]
+    counts: Float[Array, " cells"] = eqx.field(converter=_checked_counts)
+
+    def __check_init__(self) -> None:
+        check_instance(self.prior, Prior, "prior")
 
     def log_density(self, parameters: Float[Array, " cells"]) -> Float[Array, ""]:
         """Return the prior's log density + Σ n ln(1 − p)."""

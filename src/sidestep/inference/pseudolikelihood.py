@@ -21,7 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sidestep.errors import check, check_positive
+from sidestep._arguments import to_integers
+from sidestep.errors import check, check_positive, describe, to_list, to_number
 from sidestep.inference.mrf import SHAPE_TERMS, BinaryMRF
 from sidestep.tabular.grid import STEPS, Cell, Grid
 
@@ -53,9 +54,14 @@ class MRFFit:
         Args:
             shape: The rows and columns.
             field: Another η; None for the mean of those that were fitted.
+
+        Raises:
+            InputError: For a shape that is no pair of numbers above 0, and a field that is not finite.
         """
-        own = float(self.field.mean()) if field is None else field
-        return BinaryMRF(np.full(shape[0] * shape[1], own), shape, self.lines, self.pairs, self.blocks, self.isolated)
+        own = float(self.field.mean()) if field is None else to_number(field, "field")
+        rows, columns = to_integers(shape, "shape", (2,), least=1).tolist()
+        field_of_cells = np.full(rows * columns, own)
+        return BinaryMRF(field_of_cells, (rows, columns), self.lines, self.pairs, self.blocks, self.isolated)
 
 
 def fit_mrf(
@@ -89,16 +95,16 @@ def fit_mrf(
         >>> bool(fit.field[0] < 0 < fit.lines), fit.cells
         (True, 36)
     """
-    check(len(maps) > 0, "expected at least one map", field="maps")
+    grids = to_list(maps, Grid, "maps")
     check_positive(standard_deviation, "standard_deviation")
-    unknown = [term for term in terms if term not in SHAPE_TERMS]
-    check(not unknown, f"expected some of {', '.join(SHAPE_TERMS)}, found {unknown}", field="terms")
+    known = isinstance(terms, list | tuple) and all(term in SHAPE_TERMS for term in terms)
+    check(known, f"expected some of {', '.join(SHAPE_TERMS)}, found {describe(terms)}", field="terms")
     # equal cells count together: a row has the cell's map, whether it is closed, and the changes
-    cells = np.concatenate([_cells(grid, index if separate_fields else 0, terms) for index, grid in enumerate(maps)])
+    cells = np.concatenate([_cells(grid, index if separate_fields else 0, terms) for index, grid in enumerate(grids)])
     rows, counts = np.unique(cells, axis=0, return_counts=True)
     owner, closed = rows[:, 0], rows[:, 1] == 1
-    check(closed.any() and not closed.all(), "expected free and occupied cells", field="maps")
-    fields = np.eye(len(maps) if separate_fields else 1)[owner]
+    check(closed.any() and not closed.all(), "expected free and occupied cells, found one kind", field="maps")
+    fields = np.eye(len(grids) if separate_fields else 1)[owner]
     weights, mean = _logistic(np.hstack([fields, rows[:, 2:]]), closed, counts, standard_deviation)
     field, shape = np.split(weights, [fields.shape[1]])
     shared = dict.fromkeys(SHAPE_TERMS, 0.0) | dict(zip(terms, shape.tolist(), strict=True))

@@ -37,7 +37,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
-from sidestep.errors import check_count
+from sidestep._arguments import to_key
+from sidestep.errors import check_count, check_function
 from sidestep.inference.chains import BarrierProblem, ChainState, problem_of
 from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
 from sidestep.inference.diagnostics import effective_sizes, split_rhat
@@ -192,7 +193,7 @@ class BarrierPosterior(Generic[Model]):
         """
         check_count(count, 1, "count")
         every = self.samples.reshape(-1, self.samples.shape[-1])
-        return every[np.asarray(jax.random.randint(key, (count,), 0, len(every)))]
+        return every[np.asarray(jax.random.randint(to_key(key), (count,), 0, len(every)))]
 
     def summary(self) -> dict[str, Any]:
         """Return the posterior's numbers: log-likelihoods and log prior in nats, and how well the chains agree.
@@ -275,6 +276,8 @@ def sample_barriers(
         Metropolis et al. (1953); Christen & Fox (2005), *Markov chain Monte Carlo using an approximation*.
     """
     check_count(sweeps, MIN_SWEEPS, "sweeps")
+    if report is not None:
+        check_function(report, "report")
     most = sweeps if most_sweeps is None else most_sweeps
     check_count(most, sweeps, "most_sweeps")
     check_count(chains, 2, "chains")

@@ -6,13 +6,14 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Int
 
-from sidestep.errors import check
+from sidestep.errors import check, check_instance, to_list
 from sidestep.io.gridding import Moves, grid_walks
 from sidestep.io.tables import check_rows
 from sidestep.io.walks import Walks, position_columns, walks_from_table
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.graph import walkable_graph
 from sidestep.tabular.grid import Cell, Grid
+from sidestep.tabular.reward import Reward
 from sidestep.tabular.tasks import reach
 
 
@@ -35,6 +36,9 @@ def demonstrations_from_walks(
         >>> demonstrations_from_walks(walks, Grid.unknown(rows=1, columns=3)).next_states.tolist()
         [1, 2]
     """
+    check_instance(walks, Walks, "walks")
+    check_instance(grid, Grid, "grid")
+    Reward(discount, step_cost)  # checks both before the walks are gridded
     return demonstrations_from_moves(grid_walks(walks, grid), grid, discount=discount, step_cost=step_cost)
 
 
@@ -87,6 +91,8 @@ def walks_from_trajectories(trajectories: Sequence[Trajectory], goals: Sequence[
         goals: The goal (a state) of each task.
         grid: The map.
     """
+    check_instance(grid, Grid, "grid")
+    to_list(trajectories, Trajectory, "trajectories")
     lengths = [len(trajectory.states) for trajectory in trajectories]
     states = np.concatenate([trajectory.states for trajectory in trajectories])
     goal = np.repeat([goals[trajectory.task] for trajectory in trajectories], lengths)

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int
 
-from sidestep.errors import check
+from sidestep.errors import check, check_instance
 from sidestep.io.crossings import TOUCH, Occupied, Points, Visits, cells_at, visited_cells
 from sidestep.io.tables import check_rows
 from sidestep.io.walks import Walks
@@ -102,6 +102,7 @@ def grid_walks(walks: Walks, grid: Grid) -> Moves:
         >>> grid_walks(walks, Grid.unknown(rows=1, columns=3)).next_states.tolist()
         [1, 2]
     """
+    check_instance(grid, Grid, "grid")
     check(len(walks) > 0, "expected at least one walk, found none", source=walks.source)
     _check_inside(walks.positions, walks.rows, "", walks, grid)
     _check_inside(walks.goals, walks.rows[walks.offsets[:-1]], "goal_", walks, grid)

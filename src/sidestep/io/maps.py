@@ -11,14 +11,16 @@ above 100 (`raw`) are unknown.
 
 import math
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from sidestep._arguments import to_finite, to_mask
 from sidestep._files import read_array, read_whole, write_whole
-from sidestep.errors import InputError, check, input_errors
+from sidestep.errors import InputError, check, check_choice, check_instance, input_errors, to_path
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 
 MOST_PIXELS = 100_000_000
@@ -69,6 +71,7 @@ def read_map(path: str | Path, connectivity: Connectivity = 4) -> Grid:
     Example:
         >>> grid = read_map("office.yaml")  # doctest: +SKIP
     """
+    check_choice(connectivity, (4, 8), "connectivity")
     raster = read_raster(path)
     with np.errstate(invalid="ignore"):
         free = np.where(raster.occupancy < raster.free_below, Cell.FREE, Cell.UNKNOWN)
@@ -127,7 +130,7 @@ def read_raster(path: str | Path) -> Raster:
         InputError: Naming file and key, for YAML that cannot be read, lacks keys or has values of the wrong kind, and
             for an image that is outside the folder of the YAML file, has more than `MOST_PIXELS` or cannot be decoded.
     """
-    path = Path(path)
+    path = to_path(path)
     settings = _settings(path)
     keys = ("resolution", "occupied_thresh", "free_thresh")
     resolution, occupied, free = (_number(settings[key], key, path) for key in keys)
@@ -166,6 +169,7 @@ def read_sensor_map(path: str | Path, grid: Grid) -> Float[np.ndarray, "rows col
     Example:
         >>> occupied = read_sensor_map("sensed.yaml", grid)  # doctest: +SKIP
     """
+    check_instance(grid, Grid, "grid")
     raster = read_raster(path)
     message = "expected scale or raw: a trinary map has no probabilities"
     check(raster.mode != "trinary", message, source=path, field="mode")
@@ -186,7 +190,8 @@ def read_sensor_variance(path: str | Path, grid: Grid) -> Float[np.ndarray, "row
     Example:
         >>> variance = read_sensor_variance("variance.npy", grid)  # doctest: +SKIP
     """
-    variance, field = read_array(path, kinds="fiu").astype(np.float64), "sensor variance"
+    check_instance(grid, Grid, "grid")
+    variance, field = read_array(to_path(path), kinds="fiu").astype(np.float64), "sensor variance"
     message = f"expected the map's {grid.shape} rows and columns, found {variance.shape}"
     check(variance.shape == grid.shape, message, source=path, field=field)
     wrong = np.argwhere(variance <= 0)
@@ -199,10 +204,10 @@ def read_sensor_variance(path: str | Path, grid: Grid) -> Float[np.ndarray, "row
 
 def write_map(
     path: str | Path,
-    blocked: Float[np.ndarray, "rows columns"],
+    blocked: Float[np.ndarray, "rows columns"] | Sequence[Sequence[float]],
     grid: Grid,
     *,
-    unknown: Bool[np.ndarray, "_ _"] | None = None,
+    unknown: Bool[np.ndarray, "_ _"] | Sequence[Sequence[bool]] | None = None,
 ) -> None:
     """Write P(blocked) as a ROS map in `raw` mode: `NAME.yaml` and `NAME.pgm`.
 
@@ -226,17 +231,17 @@ def write_map(
     import yaml
     from PIL import Image
 
-    path = Path(path)
-    check(path.suffix.lower() in (".yaml", ".yml"), "expected a file name that ends in .yaml or .yml", source=path)
-    unknown = np.zeros(grid.shape, bool) if unknown is None else unknown
-    for name, cells in (("blocked", blocked), ("unknown", unknown)):
-        check(cells.shape == grid.shape, f"expected an array of shape {grid.shape}, found {cells.shape}", field=name)
-    check(((blocked >= 0) & (blocked <= 1)).all(), "expected probabilities from 0 to 1 in every cell", field="blocked")
+    path = to_path(path)
+    message = f"expected a file name that ends in .yaml or .yml, found {path.name!r}"
+    check(path.suffix.lower() in (".yaml", ".yml"), message, source=path)
+    check_instance(grid, Grid, "grid")
+    probabilities = to_finite(blocked, "blocked", grid.shape, least=0, most=1)
+    is_unknown = np.zeros(grid.shape, bool) if unknown is None else to_mask(unknown, "unknown", grid.shape)
     image = path.with_suffix(".pgm")
     place = {"resolution": float(grid.resolution), "origin": [float(number) for number in grid.origin]}
     meaning = {"negate": 0, "occupied_thresh": OCCUPIED_ABOVE, "free_thresh": FREE_BELOW}
     settings = {"image": image.name, "mode": "raw", **place, **meaning}
-    pixels = Image.fromarray(np.where(unknown, UNKNOWN_PIXEL, np.rint(100 * blocked)).astype(np.uint8))
+    pixels = Image.fromarray(np.where(is_unknown, UNKNOWN_PIXEL, np.rint(100 * probabilities)).astype(np.uint8))
     text = yaml.safe_dump(settings, sort_keys=False, allow_unicode=True)
     write_whole(image, lambda file: pixels.save(file, format="PPM"))
     write_whole(path, lambda file: file.write(text.encode()))

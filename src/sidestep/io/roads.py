@@ -20,7 +20,8 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Bool, Float, Int
 
-from sidestep.errors import check
+from sidestep._arguments import to_states
+from sidestep.errors import check, check_instance, to_list, to_path
 from sidestep.io.tables import check_columns, check_rows, finite_column, read_table
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.graph import Graph
@@ -104,6 +105,7 @@ def read_trips(path: str | Path, roads: Roads) -> list[Int[np.ndarray, " _"]]:
     Example:
         >>> trips = read_trips("trips.csv", roads)  # doctest: +SKIP
     """
+    check_instance(roads, Roads, "roads")
     table = _read(path, ("trip", "origin", "destination", "links"))
     number = {label: index for index, label in enumerate(roads.labels)}
     turns = {(int(begin), int(onto)) for begin, onto in roads.turns}
@@ -138,19 +140,25 @@ def demonstrations_from_trips(
     Raises:
         InputError: Naming the trip, for one without a turn from one link to the next.
     """
+    check_instance(graph, Graph, "graph")
+    links = [
+        to_states(trip, graph.states, f"trips[{place}]") for place, trip in enumerate(to_list(trips, object, "trips"))
+    ]
     next_links = np.asarray(graph.successors)[:, :, 0]
-    goals, task = np.unique([trip[-1] for trip in trips], return_inverse=True)
+    goals, task = np.unique([trip[-1] for trip in links], return_inverse=True)
     trajectories = []
-    for row, (trip, goal) in enumerate(zip(trips, task.tolist(), strict=True), start=1):
+    for row, (trip, goal) in enumerate(zip(links, task.tolist(), strict=True), start=1):
         matches = next_links[trip[:-1]] == trip[1:, None]
-        check(matches.any(axis=1).all(), "expected a turn from each link to the next", source="trip", row=row)
+        check(
+            matches.any(axis=1).all(), "expected a turn from each link to the next, found none", source="trip", row=row
+        )
         trajectories.append(Trajectory(trip, matches.argmax(axis=1), goal))
     return gather(trajectories, [reach(graph, int(goal), discount=discount, step_cost=step_cost) for goal in goals])
 
 
 def _read(path: str | Path, names: tuple[str, ...]) -> pa.Table:
     """Return a table that has these columns, and rows."""
-    table = read_table(path, labels=tuple(name for name in names if name != "length_m"))
+    table = read_table(to_path(path), labels=tuple(name for name in names if name != "length_m"))
     check_columns(table, names, str(path))
     check(len(table), "expected at least one row", source=path)
     return table

@@ -147,7 +147,8 @@ def finite_column(table: pa.Table, name: str, source: str) -> Float[np.ndarray, 
 def _by_ending(path: str | Path, for_csv: Callable, for_parquet: Callable) -> Callable:
     functions = {".csv": for_csv, ".parquet": for_parquet}
     ending = Path(path).suffix.lower()
-    check(ending in functions, "expected a file name that ends in .csv or .parquet", source=path)
+    message = f"expected a file name that ends in .csv or .parquet, found {Path(path).name!r}"
+    check(ending in functions, message, source=path)
     return functions[ending]
 
 

@@ -14,17 +14,18 @@ and any other column is metadata. A Minari dataset, `minari:ID`, is such a table
 (`sidestep.io.minari.walks`). Rows are counted from 1, the first row below the header.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from jaxtyping import Bool, Float, Int, Integer, Real
 
-from sidestep.errors import check
+from sidestep._arguments import to_floats, to_indices, to_integers
+from sidestep.errors import check, check_instance, describe, to_list, to_path
 from sidestep.io.minari.walks import read_positions, write_positions
 from sidestep.io.tables import check_columns, check_rows, finite_column, number_column, read_table, write_table
 
@@ -66,6 +67,15 @@ class Walks:
     metadata: pa.Table
     source: str
 
+    def __post_init__(self) -> None:
+        labels, rows = len(to_list(self.labels, object, "labels", least=0)), len(self.rows)
+        for name, shape in (("goals", (labels, 2)), ("positions", (rows, 2)), ("failed_moves", (rows, 2))):
+            to_floats(getattr(self, name), name, shape)
+        to_floats(self.steps, "steps", (rows,))
+        to_integers(self.rows, "rows", ("rows",))
+        to_integers(self.offsets, "offsets", (labels + 1,), least=0, most=rows)
+        check_instance(self.metadata, pa.Table, "metadata")
+
     def __len__(self) -> int:
         """Return the number of walks."""
         return len(self.labels)
@@ -83,7 +93,9 @@ class Walks:
         Raises:
             InputError: If the column does not exist, has an empty cell, or has two values within a walk.
         """
-        check(column not in _REQUIRED + _OPTIONAL, "expected a column of metadata", source=self.source, field=column)
+        check(isinstance(column, str), f"expected the name of a column, found {describe(column)}", field="column")
+        message = f"expected a column of metadata, found {column}"
+        check(column not in _REQUIRED + _OPTIONAL, message, source=self.source, field=column)
         check_columns(self.metadata, (column,), self.source)
         values, first = self.metadata[column].to_pylist(), np.repeat(self.offsets[:-1], np.diff(self.offsets))
         valid = np.array([own is not None and own == values[index] for own, index in zip(values, first, strict=True)])
@@ -91,16 +103,19 @@ class Walks:
         check_rows(valid, message, self.source, column, self.rows, values)
         return [values[index] for index in self.offsets[:-1]]
 
-    def select(self, index: Bool[np.ndarray, " walks"] | Integer[np.ndarray, " selected"]) -> "Walks":
+    def select(self, index: Bool[np.ndarray, " walks"] | Integer[np.ndarray, " selected"] | Sequence[int]) -> "Walks":
         """Return the walks that a mask or an array of indices selects, in that order.
 
         Args:
             index: A mask over all walks, or indices of walks; negative ones count from the end.
 
+        Raises:
+            InputError: For a mask of another length, and indices of walks that do not exist.
+
         Example:
             >>> first_ten = walks.select(np.arange(10))  # doctest: +SKIP
         """
-        indices = np.arange(len(self))[index]
+        indices = to_indices(index, len(self), "index", "walks")
         lengths = np.diff(self.offsets)[indices]
         offsets = np.concatenate([[0], np.cumsum(lengths)])
         rows = np.arange(offsets[-1]) + np.repeat(self.offsets[indices] - offsets[:-1], lengths)
@@ -140,11 +155,12 @@ def write_walks(path: str | Path, walks: Walks) -> None:
     Example:
         >>> write_walks("walks.csv", walks)  # doctest: +SKIP
     """
+    check_instance(walks, Walks, "walks")
     _, write, name = _store(path)
     write(name, table_from_walks(walks))
 
 
-def walks_from_table(table: pa.Table, source: str = "walks") -> Walks:
+def walks_from_table(table: pa.Table | pa.RecordBatch, source: str = "walks") -> Walks:
     """Return the walks in a table in memory.
 
     Args:
@@ -162,6 +178,8 @@ def walks_from_table(table: pa.Table, source: str = "walks") -> Walks:
         >>> len(walks), walks.goals.tolist()
         (1, [[1.5, 0.5]])
     """
+    check_instance(table, (pa.Table, pa.RecordBatch), "table")
+    table = pa.Table.from_batches([table]) if isinstance(table, pa.RecordBatch) else table
     check_columns(table, _REQUIRED, source)
     check(len(table) > 0, "expected at least one walk, found a table without rows", source=source)
     encoded = _labels(table, source)
@@ -222,7 +240,7 @@ def position_columns(prefix: str, positions: Float[np.ndarray, "rows 2"]) -> dic
 
 def _store(path: str | Path) -> tuple[Callable[[Any], pa.Table], Callable[[Any, pa.Table], None], str | Path]:
     """Return the functions that read and write walks in a place, and the name of the place for them."""
-    store, _, name = PurePath(path).as_posix().partition(":")
+    store, _, name = to_path(path).as_posix().partition(":")
     return (*_STORES[store], name) if store in _STORES else (partial(read_table, labels=("walk",)), write_table, path)
 
 

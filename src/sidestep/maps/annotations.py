@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int
 
-from sidestep.errors import check
+from sidestep.errors import check, check_instance
 from sidestep.io.gridding import Moves
 from sidestep.io.walks import Walks
 from sidestep.maps.config import BehaviorConfig
@@ -29,6 +29,10 @@ class WalkAnnotations:
     person_column: str | None = None
     goal_candidates: GoalCandidates | None = None
 
+    def __post_init__(self) -> None:
+        check_instance(self.person_column, (str, type(None)), "person_column")
+        check_instance(self.goal_candidates, (GoalCandidates, type(None)), "goal_candidates")
+
     def check(self, config: BehaviorConfig, resume: bool) -> None:
         """Check that settings do not exclude each other.
 
@@ -51,7 +55,7 @@ class WalkAnnotations:
             "horizon": config.horizon is not None,
         }
         for field, is_set in refused.items():
-            check(not is_set, "cannot be combined with candidates for goals", field=field)
+            check(not is_set, "expected none beside candidates for goals, found one", field=field)
 
     def without_goals(self, walks: Walks) -> Walks:
         """Return the walks; with candidates for goals, each walk's own goal is its last position.

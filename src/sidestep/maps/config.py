@@ -5,10 +5,19 @@ line can show the defaults without delay.
 """
 
 from dataclasses import dataclass, field, replace
-from math import isfinite
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
-from sidestep.errors import check, check_count, check_not_negative, check_positive
+from sidestep.errors import (
+    check,
+    check_choice,
+    check_count,
+    check_instance,
+    check_not_negative,
+    check_positive,
+    describe,
+    to_count,
+    to_number,
+)
 from sidestep.tabular.reward import Reward
 
 BackupName = Literal["boltzmann", "max", "logsumexp", "mellowmax"]
@@ -69,7 +78,7 @@ class BehaviorConfig:
         horizon: The number of actions that agents look ahead; None for no limit.
 
     Raises:
-        InputError: For an unknown backup or parameter.
+        InputError: For an unknown backup or parameter, and numbers out of these ranges.
 
     Example:
         >>> BehaviorConfig(beta=5.0, learn=("lapse",)).backup
@@ -84,9 +93,20 @@ class BehaviorConfig:
     horizon: int | None = None
 
     def __post_init__(self) -> None:
-        _check_choice(self.backup, BackupName, "backup")
+        check_choice(self.backup, get_args(BackupName), "backup")
+        listed = isinstance(self.learn, tuple | list)
+        check(listed, f"expected a tuple of names, found {describe(self.learn)}", field="learn")
         for name in self.learn:
-            _check_choice(name, Learnable, "learn")
+            check_choice(name, get_args(Learnable), "learn")
+        object.__setattr__(self, "learn", tuple(self.learn))
+        if self.beta is not None:
+            to_number(self.beta, "beta", above=0)
+        if self.lapse is not None:
+            to_number(self.lapse, "lapse", least=0, below=1)
+        if self.tempering is not None:
+            to_number(self.tempering, "tempering", above=0, most=1)
+        if self.horizon is not None:
+            to_count(self.horizon, "horizon")
 
 
 @dataclass(frozen=True)
@@ -103,7 +123,7 @@ class PriorConfig:
         wall_prior: The weight of `WallPrior` in nats, at least 0: the worth of a blocked cell between two others.
 
     Raises:
-        InputError: For an unknown kind, and numbers of the binary prior that are not finite.
+        InputError: For an unknown kind, numbers out of these ranges, and numbers of the other kind.
 
     Example:
         >>> PriorConfig(kind="normal", mean=0.0).variance
@@ -121,14 +141,18 @@ class PriorConfig:
     wall_prior: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_choice(self.kind, PriorKind, "prior")
+        check_choice(self.kind, get_args(PriorKind), "prior")
+        for name in ("log_odds", *SHAPE_WEIGHTS["sample"]):
+            if getattr(self, name) is not None:
+                to_number(getattr(self, name), name)
+        to_number(self.mean, "prior mean")
+        to_number(self.variance, "prior variance", above=0)
+        to_number(self.wall_prior, "wall_prior", least=0)
         others = _NORMAL_FIELDS if self.kind == "binary" else _BINARY_FIELDS
         for name in others:
             unset = getattr(self, name) == getattr(type(self), name)
-            check(unset, f"belongs to the other prior: expected none for a {self.kind} prior", field=name)
-        for name in ("log_odds", *SHAPE_WEIGHTS["sample"]):
-            value = getattr(self, name)
-            check(value is None or isfinite(value), f"expected a finite number, found {value}", field=name)
+            message = f"belongs to the other prior: expected none for a {self.kind} prior, found {getattr(self, name)}"
+            check(unset, message, field=name)
 
     @property
     def first_logit(self) -> float:
@@ -164,7 +188,7 @@ class PosteriorConfig:
 
     def __post_init__(self) -> None:
         if self.method is not None:
-            _check_choice(self.method, PosteriorMethod, "posterior")
+            check_choice(self.method, get_args(PosteriorMethod), "posterior")
         if self.sweeps is not None:
             check_count(self.sweeps, 12, "sweeps")
         check_count(self.chains, 2, "chains")
@@ -196,11 +220,12 @@ class FitConfig:
     large_map: int = 10_000
 
     def __post_init__(self) -> None:
-        _check_choice(self.terms, Terms, "terms")
-        _check_choice(self.gradient, GradientName, "gradient")
+        check_choice(self.terms, get_args(Terms), "terms")
+        check_choice(self.gradient, get_args(GradientName), "gradient")
         if self.max_iterations is not None:
             check_count(self.max_iterations, 1, "max_iterations")
         check_positive(self.memory, "memory")
+        check_count(self.large_map, 0, "large_map")
 
 
 @dataclass(frozen=True)
@@ -223,7 +248,7 @@ class MapConfig:
         ('binary', None, 0.05)
 
     Raises:
-        InputError: For a method that does not go with the prior, and for a threshold below 0 or not finite.
+        InputError: For a method that does not go with the prior, parts of other types, and numbers out of these ranges.
     """
 
     reward: Reward = field(default_factory=Reward)
@@ -236,11 +261,17 @@ class MapConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        kinds = {"reward": Reward, "behavior": BehaviorConfig, "prior": PriorConfig}
+        for name, kind in (kinds | {"posterior": PosteriorConfig, "fit": FitConfig}).items():
+            check_instance(getattr(self, name), kind, name)
+        if self.max_walks is not None:
+            check_count(self.max_walks, 1, "max_walks")
+        check_count(self.seed, 0, "seed")
         check_not_negative(self.unknown_below, "unknown_below")
         method, kind = self.posterior.method, self.prior.kind
         expected = "mode" if kind == "normal" else "sample or mean_field"
         fits = method is None or (method == "mode") == (kind == "normal")
-        check(fits, f"the {kind} prior has {expected}, found {method}", field="posterior")
+        check(fits, f"expected {expected} with the {kind} prior, found {method}", field="posterior")
 
     @property
     def agents(self) -> Agents:
@@ -284,8 +315,8 @@ class SimulationConfig:
     def __post_init__(self) -> None:
         check_count(self.walks, 1, "walks")
         check_count(self.goals, 1, "goals")
-        _check_choice(self.backup, BackupName, "backup")
-
-
-def _check_choice(value: str, choices: Any, field: str) -> None:
-    check(value in get_args(choices), f"expected one of {', '.join(get_args(choices))}, found {value!r}", field=field)
+        check_choice(self.backup, get_args(BackupName), "backup")
+        check_instance(self.reward, Reward, "reward")
+        check_count(self.seed, 0, "seed")
+        if self.beta is not None:
+            check_positive(self.beta, "beta")

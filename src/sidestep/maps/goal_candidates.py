@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sidestep.errors import check
+from sidestep._arguments import to_finite
+from sidestep.errors import check, to_path
 from sidestep.inference.fit import Fit
 from sidestep.inference.goals import GoalFit, fit_goals
 from sidestep.inference.maximize import Progress
@@ -40,6 +41,12 @@ class GoalCandidates:
 
     positions: Float[np.ndarray, "candidates 2"]
     source: str = "goal candidates"
+
+    def __post_init__(self) -> None:
+        positions = to_finite(self.positions, "positions", ("candidates", 2))
+        message = f"expected at least 2 candidates, found {len(positions)}"
+        check(len(positions) > 1, message, source=self.source)
+        object.__setattr__(self, "positions", positions)
 
 
 class GoalPosterior(NamedTuple):
@@ -92,10 +99,9 @@ def read_goal_candidates(path: str | Path) -> GoalCandidates:
     """
     from sidestep.io.tables import check_columns, finite_column, read_table
 
-    table = read_table(path)
+    table = read_table(to_path(path))
     check_columns(table, ("goal_x", "goal_y"), str(path))
     positions = np.stack([finite_column(table, name, str(path)) for name in ("goal_x", "goal_y")], axis=1)
-    check(len(positions) > 1, f"expected at least 2 candidates, found {len(positions)}", source=path)
     return GoalCandidates(positions, str(path))
 
 

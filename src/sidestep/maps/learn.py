@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sidestep.errors import check
+from sidestep.errors import check, check_function, check_instance
 from sidestep.inference.coordinate_ascent import AscentProgress
 from sidestep.inference.maximize import Progress
 from sidestep.inference.sampler import BarrierPosterior, SweepProgress
@@ -158,6 +158,12 @@ def learn_map(
     """
     started = time.monotonic()
     config = config or MapConfig()
+    arguments = {"grid": (grid, Grid), "walks": (walks, Walks), "config": (config, MapConfig)}
+    arguments |= {"sensor": (sensor, (SensorMap, type(None))), "annotations": (annotations, WalkAnnotations)}
+    for name, (value, kinds) in arguments.items():
+        check_instance(value, kinds, name)
+    if callback is not None:
+        check_function(callback, "callback")
     annotations.check(config.behavior, resume)
     config = with_annotations(config, annotations)
     walks = annotations.without_goals(sample_walks(walks, config))

@@ -20,8 +20,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sidestep._arguments import to_finite, to_floats, to_mask, to_states
 from sidestep._files import read_array, read_json, write_array, write_arrays, write_json
-from sidestep.errors import InputError, check, check_not_negative, input_errors
+from sidestep.errors import InputError, check, check_instance, check_not_negative, input_errors, to_number, to_path
 from sidestep.io.maps import read_map, write_map
 from sidestep.robots.planners import GoalPlan, ModelPlanner
 from sidestep.robots.risk import expected_length, independent_open_probability, open_probability
@@ -74,7 +75,7 @@ class PlannedPath:
         Args:
             max_risk: The largest probability that the path is not open.
         """
-        return self.open_probability >= 1 - max_risk
+        return self.open_probability >= 1 - to_number(max_risk, "max_risk", least=0, most=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +108,22 @@ class LearnedMap:
     samples: Bool[np.ndarray, "samples rows columns"] | None = None
     information: Float[np.ndarray, "rows columns"] | None = None
     unknown_below: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_instance(self.grid, Grid, "grid")
+        check_instance(self.reward, Reward, "reward")
+        shape, states = self.grid.shape, self.grid.size
+        arrays = {
+            "blocked": to_finite(self.blocked, "blocked", shape, least=0, most=1),
+            "visited": to_states(self.visited, states, "visited", ("visits", 2)),
+            "unknown_below": to_number(self.unknown_below, "unknown_below", least=0),
+        }
+        if self.samples is not None:
+            arrays["samples"] = to_mask(self.samples, "samples", ("samples", *shape))
+        if self.information is not None:
+            arrays["information"] = to_floats(self.information, "information", shape)
+        for name, array in arrays.items():
+            object.__setattr__(self, name, array)
 
     @property
     def unknown(self) -> Bool[np.ndarray, "rows columns"]:
@@ -165,8 +182,10 @@ class LearnedMap:
             InputError: For positions outside the map or in known obstacles, where there is no path, and for a risk
                 outside [0, 1].
         """
+        to_number(bump_cost, "bump_cost", least=0)
+        if max_risk is not None:
+            to_number(max_risk, "max_risk", least=0, most=1)
         first, last = state_at(self.grid, start, "start"), state_at(self.grid, goal, "goal")
-        check(max_risk is None or 0 <= max_risk <= 1, f"expected a probability, found {max_risk}", field="max_risk")
         # a path that several bump costs lead to is assessed once
         plans: dict[bytes, tuple[GoalPlan, Int[np.ndarray, " steps"]]] = {}
         for factor in _BUMP_FACTORS if max_risk is not None else (1.0,):
@@ -248,7 +267,7 @@ class LearnedMap:
         Raises:
             InputError: Where the file system refuses.
         """
-        folder, smallest = Path(folder), np.finfo(np.float64).epsneg
+        folder, smallest = to_path(folder, "folder"), np.finfo(np.float64).epsneg
         blocked = np.where(self.unknown, np.clip(self.blocked, smallest, 1 - smallest), self.blocked)
         write_map(folder / "map.yaml", blocked, self.grid, unknown=self.without_evidence)
         write_array(folder / "blocked.npy", blocked)
@@ -288,7 +307,7 @@ def load_map(folder: str | Path) -> LearnedMap:
         ...     load_map(folder).blocked.tolist()
         [[0.0, 0.1, 0.0]]
     """
-    folder = Path(folder)
+    folder = to_path(folder, "folder")
     connectivity, reward, unknown_below = _settings(folder / "summary.json")
     geometry = read_map(folder / "map.yaml", connectivity=connectivity)
     blocked = read_array(folder / "blocked.npy", kinds="f")

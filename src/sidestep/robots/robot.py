@@ -21,7 +21,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Int
 
-from sidestep.errors import check
+from sidestep._arguments import to_states
+from sidestep.errors import check_instance, to_number
 from sidestep.robots.planners import ModelPlanner
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.grid import Cell
@@ -50,6 +51,8 @@ def risk_averse_robot(
         >>> robot.plan_to(2).paths_from(np.array([0]))[0].tolist()
         [0, 1, 2]
     """
+    check_instance(model, ObstacleGrid, "model")
+    to_number(bump_cost, "bump_cost", least=0)
     known = mark_visited_free(model, visited)
     return ModelPlanner(known, partial(risk_averse_task, known, bump_cost=bump_cost))
 
@@ -62,8 +65,8 @@ def mark_visited_free(model: ObstacleGrid, visited: Int[np.ndarray, " visits"] |
         visited: The states.
     """
     known = np.array(model.known).reshape(-1)
-    visited = np.asarray(visited, dtype=np.int64)
-    known[visited[known[visited] == Cell.UNKNOWN]] = Cell.FREE
+    states = to_states(visited, known.size, "visited")
+    known[states[known[states] == Cell.UNKNOWN]] = Cell.FREE
     return eqx.tree_at(lambda model: model.known, model, to_jax(known.reshape(model.known.shape)))
 
 
@@ -78,8 +81,7 @@ def risk_averse_task(model: ObstacleGrid, goal: int, bump_cost: float = BUMP_COS
     Raises:
         InputError: For a cost out of range or a goal that is not a state.
     """
-    valid = np.isfinite(bump_cost) and bump_cost >= 0
-    check(valid, f"expected a number of at least 0, found {bump_cost}", field="bump_cost")
+    to_number(bump_cost, "bump_cost", least=0)
     task = reach(model.blank, goal, discount=1.0, step_cost=1.0)
     probabilities, successors = np.asarray(model.probabilities()), np.asarray(model.graph.successors)
     fails = np.where(successors == np.arange(len(successors))[:, None, None], probabilities, 0).sum(axis=-1)

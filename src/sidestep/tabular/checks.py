@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from sidestep.errors import InputError, check
+from sidestep.errors import InputError, check, check_instance
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.behavior_model import BehaviorModel
 from sidestep.tabular.demonstrations import Demonstrations
@@ -25,21 +25,20 @@ def is_traced(*trees: Any) -> bool:
 
 
 def check_model(model: TransitionModel) -> None:
-    """Raise `InputError` unless something is a transition model with finite parameters.
+    """Raise `InputError` unless something is a transition model without NaN in its parameters.
 
     Args:
         model: The model.
     """
-    kind = type(model).__name__
-    check(isinstance(model, TransitionModel), f"expected a TransitionModel, found {kind}", field="model")
+    check_instance(model, TransitionModel, "model")
     for leaf in jax.tree.leaves(model.parameters):
         if not is_traced(leaf):
-            finite = np.isfinite(np.asarray(leaf))
-            message = f"expected finite parameters, found {np.asarray(leaf)[~finite][:1]}"
-            check(finite.all(), message, field="model")
+            missing = np.isnan(np.asarray(leaf))
+            places = np.argwhere(missing)[:1].tolist()
+            check(not missing.any(), f"expected numbers as parameters, found nan at {places}", field="model")
 
 
-def check_persons(behavior: Behavior | BehaviorModel, tasks: int) -> None:
+def check_persons(behavior: Behavior | BehaviorModel | None, tasks: int) -> None:
     """Raise `InputError` unless a behavior model has no persons, or the person of each task.
 
     Args:
@@ -59,33 +58,28 @@ def check_behavior(behavior: Behavior | BehaviorModel, *, learned: bool = False)
         behavior: The behavior.
         learned: Whether a `BehaviorModel` is one too.
     """
-    kind, advice = type(behavior).__name__, ""
-    if isinstance(behavior, BehaviorModel) and not learned:
-        advice = "; a BehaviorModel has one of each person: `behavior_of(person)`"
-    valid = isinstance(behavior, (Behavior, BehaviorModel) if learned else Behavior)
-    check(valid, f"expected a Behavior, found {kind}{advice}", field="behavior")
+    check_instance(behavior, (Behavior, BehaviorModel) if learned else Behavior, "behavior")
 
 
-def check_task(task: Task, world: Graph) -> None:
+def check_task(task: Task, world: Graph, field: str = "task") -> None:
     """Raise `InputError` unless a task, or a stack of tasks, is of the world of a graph.
 
     Args:
         task: One task or a stack.
         world: The graph of a model.
+        field: The argument, for the error.
     """
-    check(isinstance(task, Task), f"expected a Task, found {type(task).__name__}", field="task")
-    check(isinstance(world, Graph), f"expected the Graph of a model, found {type(world).__name__}", field="world")
+    check_instance(task, Task, field)
+    check_instance(world, Graph, "world")
     states = task.terminal.shape[-1]
     message = f"expected a task of the model's {world.states} states, found one of {states}"
-    check(states == world.states, message, field="task")
-    _check_axes("rewards", task.reward.shape[-2:], (world.states, world.actions))
+    check(states == world.states, message, field=field)
+    own = [("rewards", task.reward.shape[-2:], (world.states, world.actions))]
     if task.outcome_reward is not None:
-        _check_axes("rewards of outcomes", task.outcome_reward.shape[-3:], world.successors.shape)
-
-
-def _check_axes(what: str, axes: tuple[int, ...], expected: tuple[int, ...]) -> None:
-    fits = all(own in (1, size) for own, size in zip(axes, expected, strict=True))
-    check(fits, f"expected {what} of shape {expected}, or 1 instead of an axis, found {axes}", field="task")
+        own.append(("rewards of outcomes", task.outcome_reward.shape[-3:], world.successors.shape))
+    for what, axes, expected in own:
+        fits = all(axis in (1, size) for axis, size in zip(axes, expected, strict=True))
+        check(fits, f"expected {what} of shape {expected}, or 1 instead of an axis, found {axes}", field=field)
 
 
 def check_demonstrations(demonstrations: Demonstrations, world: Graph) -> None:
@@ -95,12 +89,9 @@ def check_demonstrations(demonstrations: Demonstrations, world: Graph) -> None:
         demonstrations: The moves and their tasks.
         world: The graph of a model.
     """
-    kind = type(demonstrations).__name__
-    check(isinstance(demonstrations, Demonstrations), f"expected Demonstrations, found {kind}", field="demonstrations")
-    discrete = isinstance(demonstrations.tasks, Task)
-    message = f"expected tasks of a discrete world, found {type(demonstrations.tasks).__name__}"
-    check(discrete, message, field="demonstrations")
-    check_task(demonstrations.tasks, world)
+    check_instance(demonstrations, Demonstrations, "demonstrations")
+    check_instance(demonstrations.tasks, Task, "demonstrations")
+    check_task(demonstrations.tasks, world, "demonstrations")
     if is_traced(demonstrations, world):
         return
     moves = (demonstrations.states, demonstrations.actions, demonstrations.next_states)
@@ -110,7 +101,9 @@ def check_demonstrations(demonstrations: Demonstrations, world: Graph) -> None:
     _check_moves(demonstrations, (next_states < 0) | (next_states >= world.states), "state", next_states, "the world's")
     available = np.broadcast_to(np.asarray(world.available), (world.states, world.actions))
     if not available.all():
-        _check_moves(demonstrations, ~available[states, actions], "action", actions, "one that is available in its state")
+        _check_moves(
+            demonstrations, ~available[states, actions], "action", actions, "one that is available in its state"
+        )
 
 
 def _check_moves(demonstrations: Demonstrations, wrong: np.ndarray, name: str, numbers: np.ndarray, valid: str) -> None:

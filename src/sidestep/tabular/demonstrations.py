@@ -10,7 +10,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from typing_extensions import TypeVar
 
-from sidestep.errors import InputError, check
+from sidestep._arguments import to_integers, to_mask, to_states
+from sidestep.errors import InputError, check, check_instance, describe, to_count, to_list
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.tasks import Task, stack_tasks
 
@@ -73,6 +74,13 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         if self.weights is None:
             self.weights = to_jax(np.ones(len(self.states)))
 
+    def __check_init__(self) -> None:
+        moves = getattr(self.states, "shape", ())[:1]
+        for name in ("states", "actions", "next_states", "task", "trajectory", "weights"):
+            value = getattr(self, name)
+            fits = isinstance(value, jax.Array | np.ndarray) and value.shape[:1] == moves != ()
+            check(fits, f"expected an array with a row for each move, found {describe(value)}", field=name)
+
     def __len__(self) -> int:
         """Return the number of moves."""
         return len(self.states)
@@ -82,7 +90,7 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         """Return the number of trajectories."""
         return int(np.asarray(self.trajectory)[-1]) + 1
 
-    def with_only(self, trajectories: Bool[np.ndarray, " trajectories"]) -> "Demonstrations[Tasks]":
+    def with_only(self, trajectories: Bool[np.ndarray, " trajectories"] | Sequence[bool]) -> "Demonstrations[Tasks]":
         """Return the same moves, with weight 1 for those of the chosen trajectories and 0 for the others.
 
         Args:
@@ -90,8 +98,12 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
 
         Returns:
             Demonstrations of the same length, so that no function is compiled anew.
+
+        Raises:
+            InputError: For anything but a boolean for each trajectory.
         """
-        weights = np.asarray(trajectories, dtype=np.float64)[np.asarray(self.trajectory)]
+        mask = to_mask(trajectories, "trajectories", (self.trajectories,))
+        weights = np.asarray(mask, dtype=np.float64)[np.asarray(self.trajectory)]
         return eqx.tree_at(lambda demonstrations: demonstrations.weights, self, to_jax(weights))
 
     def first_moves(self) -> Int[np.ndarray, " trajectories"]:
@@ -116,7 +128,7 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
 
 
 def split_by_person(
-    demonstrations: Demonstrations[Task], person: Int[np.ndarray, " trajectories"]
+    demonstrations: Demonstrations[Task], person: Int[np.ndarray, " trajectories"] | Sequence[int]
 ) -> tuple[Demonstrations[Task], Int[np.ndarray, " tasks"]]:
     """Return the same moves with a separate task for every person that pursues it, and the person of each task.
 
@@ -138,10 +150,9 @@ def split_by_person(
         >>> split_by_person(shown, np.array([0, 1]))[1].tolist()  # the goal of both is now two tasks
         [0, 1]
     """
-    person = np.asarray(person)
-    whole = person.shape == (demonstrations.trajectories,) and person.dtype.kind in "iu"
-    check(whole, f"expected a whole number for each trajectory, found {person.dtype} {person.shape}", field="person")
-    of_moves = person[np.asarray(demonstrations.trajectory)]
+    check_instance(demonstrations, Demonstrations, "demonstrations")
+    persons = to_integers(person, "person", (demonstrations.trajectories,), least=0)
+    of_moves = np.asarray(persons)[np.asarray(demonstrations.trajectory)]
     pairs, task = np.unique(np.stack([np.asarray(demonstrations.task), of_moves], axis=1), axis=0, return_inverse=True)
     tasks = jax.tree.map(lambda leaf: to_jax(np.asarray(leaf)[pairs[:, 0]]), demonstrations.tasks)
     split = eqx.tree_at(lambda each: (each.task, each.tasks), demonstrations, (flat_moves([task]), tasks))
@@ -169,22 +180,44 @@ def gather(trajectories: Sequence[Trajectory], tasks: Sequence[Task]) -> Demonst
         >>> len(gather([walk], [reach(Grid.unknown(rows=1, columns=3), 2)]))
         2
     """
-    stacked = stack_tasks(tasks)
-    terminal = np.asarray(stacked.terminal)
-    check(trajectories, "expected at least one trajectory", field="trajectories")
-    for row, (states, actions, task, _) in enumerate(trajectories, start=1):
-        if len(actions) == 0 or len(states) != len(actions) + 1:
-            message = f"expected moves and one state more, found {len(actions)} and {len(states)}"
-        elif not 0 <= task < len(tasks):
-            message = f"expected a task in 0…{len(tasks) - 1}, found {task}"
-        elif min(states) < 0 or max(states) >= terminal.shape[1] or min(actions) < 0:
-            message = f"expected states in 0…{terminal.shape[1] - 1}"
-        elif terminal[task, states[:-1]].any():
-            message = "goes on after a terminal state of its task"
-        else:
-            continue
-        raise InputError(message, source="trajectory", row=row)
-    return flatten(trajectories, stacked)
+    stacked = stack_tasks(to_list(tasks, Task, "tasks"))
+    walks = to_list(trajectories, Trajectory, "trajectories")
+    return flatten(to_trajectories(walks, np.asarray(stacked.terminal)), stacked)
+
+
+def to_trajectories(
+    trajectories: Sequence[Trajectory], terminal: Bool[np.ndarray, "tasks states"], actions: int | None = None
+) -> list[Trajectory]:
+    """Return trajectories as arrays of integers; each must fit its task.
+
+    Args:
+        trajectories: The trajectories.
+        terminal: The terminal states of each task.
+        actions: The number of actions of the world, None where it is not known.
+
+    Raises:
+        InputError: As `gather` does, with the row of the trajectory, the first of which is 1.
+    """
+
+    def checked(trajectory: Trajectory) -> Trajectory:
+        path, acted, task, truncated = trajectory
+        own = to_count(task, "task", 0, len(terminal) - 1)
+        states = to_states(path, terminal.shape[1], "states")
+        last = None if actions is None else actions - 1
+        taken = to_integers(acted, "actions", ("moves",), least=0, most=last, what="actions")
+        if not 0 < len(taken) == len(states) - 1:
+            raise InputError(f"expected moves and one state more, found {len(taken)} and {len(states)}")
+        message = "expected a trajectory that ends in the first terminal state, found one that goes on"
+        check(not terminal[own, states[:-1]].any(), f"{message} after a terminal state of its task", field="states")
+        return Trajectory(states, taken, own, truncated)
+
+    results = []
+    for row, trajectory in enumerate(trajectories, start=1):
+        try:
+            results.append(checked(trajectory))
+        except InputError as error:
+            raise InputError(error.message, source="trajectory", row=row, field=error.field) from None
+    return results
 
 
 def flatten(trajectories: Sequence[Trajectory], tasks: Task) -> Demonstrations[Task]:

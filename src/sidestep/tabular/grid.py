@@ -6,6 +6,7 @@ A grid is a rectangle of square cells. Row 0 is the *top* row, as in an image; c
 `origin + ((c + .5), (r + .5)) * resolution`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Literal
@@ -13,9 +14,12 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 
-from sidestep.errors import InputError, check, check_positive
+from sidestep._arguments import to_finite, to_floats, to_integers, to_states
+from sidestep.errors import InputError, check, check_choice, to_count, to_number
 
 Connectivity = Literal[4, 8]
+Positions = Sequence[Sequence[float]]
+"""x and y of points, as lists."""
 
 STEPS = np.array([[-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [-1, 1], [1, -1], [1, 1]])
 """Row and column change of each action: up, down, left, right, then the four diagonals."""
@@ -45,8 +49,8 @@ class Grid:
         connectivity: 4 (up, down, left, right) or 8 (and diagonals).
 
     Raises:
-        InputError: For an empty grid, values that are not `Cell`s, a resolution that is not positive, an origin that
-            is not finite, or another connectivity.
+        InputError: For a grid without cells or of more than two axes, values that are not `Cell`s, a resolution that
+            is not positive, an origin that is not finite, or another connectivity.
 
     Example:
         >>> grid = Grid.unknown(rows=2, columns=3)
@@ -60,14 +64,14 @@ class Grid:
     connectivity: Connectivity = 4
 
     def __post_init__(self) -> None:
-        cells = self.known.size > 0 and np.isin(self.known, list(Cell)).all()
-        check(cells, "expected at least one cell, each -1 (unknown), 0 (free) or 1 (occupied)", field="known")
-        check_positive(self.resolution, "resolution")
-        finite = len(self.origin) == 3 and np.isfinite(self.origin).all()
-        check(finite, f"expected three finite numbers x, y, yaw, found {self.origin}", field="origin")
-        check(self.connectivity in (4, 8), f"expected 4 or 8, found {self.connectivity}", field="connectivity")
+        known = to_integers(self.known, "known", ("rows", "columns"), least=-1, most=1, what="cells")
+        check(known.size, "expected at least one cell, found none", field="known")
+        origin = to_finite(self.origin, "origin", (3,)).tolist()
+        check_choice(self.connectivity, (4, 8), "connectivity")
         # one byte for each cell: maps may have ten million
-        object.__setattr__(self, "known", self.known.astype(np.int8))
+        object.__setattr__(self, "known", known.astype(np.int8))
+        object.__setattr__(self, "resolution", to_number(self.resolution, "resolution", above=0))
+        object.__setattr__(self, "origin", tuple(origin))
 
     @classmethod
     def unknown(cls, rows: int, columns: int, connectivity: Connectivity = 4) -> "Grid":
@@ -77,7 +81,11 @@ class Grid:
             rows: Their number, at least 1.
             columns: Their number, at least 1.
             connectivity: 4, or 8 with diagonals.
+
+        Raises:
+            InputError: For numbers below 1 and another connectivity.
         """
+        rows, columns = to_count(rows, "rows"), to_count(columns, "columns")
         return cls(np.full((rows, columns), Cell.UNKNOWN, dtype=np.int8), connectivity=connectivity)
 
     @property
@@ -108,11 +116,14 @@ class Grid:
         """Return the same grid with everything free that is not known to be occupied."""
         return replace(self, known=np.where(self.known == Cell.OCCUPIED, Cell.OCCUPIED, Cell.FREE))
 
-    def contains(self, positions: Float[np.ndarray, "points 2"]) -> Bool[np.ndarray, " points"]:
+    def contains(self, positions: Float[np.ndarray, "points 2"] | Positions) -> Bool[np.ndarray, " points"]:
         """Return whether each position (metres) lies on the grid; a position that is not finite does not.
 
         Args:
             positions: x, y of each point in metres.
+
+        Raises:
+            InputError: For positions that are not pairs of numbers.
         """
         rows, columns = self.shape
         with np.errstate(invalid="ignore"):
@@ -120,7 +131,7 @@ class Grid:
             slack = 1e-9 * max(rows, columns)
             return (column >= -slack) & (column <= columns + slack) & (row_up >= -slack) & (row_up <= rows + slack)
 
-    def states(self, positions: Float[np.ndarray, "points 2"]) -> Int[np.ndarray, " points"]:
+    def states(self, positions: Float[np.ndarray, "points 2"] | Positions) -> Int[np.ndarray, " points"]:
         """Return the state of the cell at each position.
 
         Args:
@@ -129,15 +140,16 @@ class Grid:
         Raises:
             InputError: For a position outside the grid.
         """
-        inside = self.contains(positions)
+        points = to_floats(positions, "positions", ("points", 2))
+        inside = self.contains(points)
         if not inside.all():
             index = int(np.argmin(inside))
-            message = f"expected a position on the map, {self.extent()}, found {positions[index].tolist()}"
+            message = f"expected a position on the map, {self.extent()}, found {points[index].tolist()}"
             raise InputError(message, row=index + 1)
         rows, columns = self.shape
         # a position on a border, but for rounding, belongs to the cell above or to the right of it; one on the outer
         # edge to the cell inside it
-        column, row_up = np.floor(self.to_cell_units(positions) + 1e-9).astype(np.int64).T
+        column, row_up = np.floor(self.to_cell_units(points) + 1e-9).astype(np.int64).T
         return (rows - 1 - np.clip(row_up, 0, rows - 1)) * columns + np.clip(column, 0, columns - 1)
 
     def state(self, position: tuple[float, float]) -> int:
@@ -149,16 +161,19 @@ class Grid:
         Raises:
             InputError: For a position outside the grid.
         """
-        return int(self.states(np.array([position], dtype=np.float64))[0])
+        return int(self.states(to_floats(position, "position", (2,))[None])[0])
 
-    def centers(self, states: Integer[np.ndarray, " points"]) -> Float[np.ndarray, "points 2"]:
+    def centers(self, states: Integer[np.ndarray, " points"] | Sequence[int]) -> Float[np.ndarray, "points 2"]:
         """Return the position (metres) of the center of each state's cell.
 
         Args:
             states: The states, in 0…size − 1.
+
+        Raises:
+            InputError: For anything but a list of such states.
         """
         rows, columns = self.shape
-        row, column = np.divmod(np.asarray(states), columns)
+        row, column = np.divmod(to_states(states, self.size, "states"), columns)
         return self.to_metres(np.stack([column + 0.5, rows - row - 0.5], axis=-1))
 
     def corners(self) -> Float[np.ndarray, "4 2"]:
@@ -171,22 +186,30 @@ class Grid:
         (left, bottom), (right, top) = self.corners().min(axis=0), self.corners().max(axis=0)
         return f"x in {left:g} to {right:g} m and y in {bottom:g} to {top:g} m"
 
-    def to_cell_units(self, positions: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 2"]:
+    def to_cell_units(self, positions: Float[np.ndarray, "points 2"] | Positions) -> Float[np.ndarray, "points 2"]:
         """Return positions in metres as (columns from the left, rows from the *bottom*), not rounded.
 
         Args:
             positions: x, y of each point in metres.
+
+        Raises:
+            InputError: For positions that are not pairs of numbers.
         """
-        offset = np.asarray(positions, dtype=np.float64) - np.asarray(self.origin[:2])
+        offset = to_floats(positions, "positions", ("points", 2)) - np.asarray(self.origin[:2])
         return offset @ _rotation(self.origin[2]) / self.resolution
 
-    def to_metres(self, cell_units: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 2"]:
+    def to_metres(self, cell_units: Float[np.ndarray, "points 2"] | Positions) -> Float[np.ndarray, "points 2"]:
         """Return positions in metres; the inverse of `to_cell_units`.
 
         Args:
             cell_units: Columns from the left and rows from the bottom of each point.
+
+        Raises:
+            InputError: For anything but pairs of numbers.
         """
-        return cell_units * self.resolution @ _rotation(self.origin[2]).T + np.asarray(self.origin[:2])
+        return to_floats(cell_units, "cell_units", ("points", 2)) * self.resolution @ _rotation(
+            self.origin[2]
+        ).T + np.asarray(self.origin[:2])
 
 
 def _rotation(yaw: float) -> Float[np.ndarray, "2 2"]:

@@ -4,19 +4,22 @@ A plan knows only the model it was made with. Followed in another one, such as t
 the model did not know: the move fails, and an optimal plan repeats it forever. `roll_out` shows that.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, Shaped
 
+from sidestep._arguments import to_key, to_states
 from sidestep._programs import keep_program
-from sidestep.errors import NotConverged, check
+from sidestep.errors import NotConverged, check, check_instance, to_count
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior, HardMax, tied_where_lost
 from sidestep.tabular.behavior_model import BehaviorModel
-from sidestep.tabular.checks import check_behavior, check_model, check_task
+from sidestep.tabular.checks import check_behavior, check_model, check_task, is_traced
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.proper import check_proper
 from sidestep.tabular.solve import Solution, SolveOptions, solve
@@ -109,8 +112,8 @@ def plan(
     Args:
         model: The transition model.
         task: One task.
-        behavior: The agent's, π ∝ exp βQ; None for the optimal policy. With a `BehaviorModel`, such as that of a fit, the
-            task has its discount, reward weights and costs.
+        behavior: The agent's, π ∝ exp βQ; None for the optimal policy. With a `BehaviorModel`, such as that of a fit,
+            the task has its discount, reward weights and costs.
         person: The person that plans, where a `BehaviorModel` distinguishes them; by default a typical one.
         options: How values are computed; by default `SolveOptions()`.
 
@@ -131,6 +134,7 @@ def plan(
         [0, 1, 2, 3]
     """
     options = options or SolveOptions()
+    check_instance(options, SolveOptions, "options")
     check_model(model)
     check_task(task, model.graph)
     tasks = task.terminal.shape[:-1]
@@ -241,8 +245,8 @@ def roll_out(
         The trajectories, one for each start.
 
     Raises:
-        InputError: For a start that is not a state, a policy of another shape or with rows that do not sum to one, and a
-            number of moves below 1.
+        InputError: For a start that is not a state, a policy of another shape or with rows that do not sum to one, and
+            a number of moves below 1.
 
     Example:
         >>> from sidestep.tabular.grid import Grid
@@ -255,7 +259,7 @@ def roll_out(
         >>> rolled.arrived.tolist()
         [True, True]
     """
-    check_count(max_moves, 1, "max_moves")
+    max_moves = to_count(max_moves, "max_moves")
     check_model(world)
     shape = world.graph.states, world.graph.actions
     fits = jnp.shape(policy) == shape and jnp.shape(terminal) == shape[:1]
@@ -265,9 +269,8 @@ def roll_out(
         numbers = np.asarray(policy)
         rows = np.flatnonzero(~(np.isclose(numbers.sum(axis=1), 1, atol=1e-4) & (numbers >= 0).all(axis=1)))[:1]
         check(not len(rows), f"expected probabilities that sum to one in every state, not so in {rows}", field="policy")
-    if not is_traced(starts):
-        starts = checked_states(starts, world.graph.states, "starts")
-    return _roll_out(as_key(key), world, policy, terminal, to_jax(starts, np.int32), max_moves)
+    states = to_jax(to_states(starts, world.graph.states, "starts"), np.int32)
+    return _roll_out(to_key(key), world, policy, terminal, states, max_moves)
 
 
 @eqx.filter_jit

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from sidestep.errors import to_number
+
 if TYPE_CHECKING:
     import sidestep.tabular.graph
     import sidestep.tabular.grid
@@ -19,6 +21,9 @@ class Reward:
         discount: γ in (0, 1]; below 1 without a step cost.
         step_cost: The cost of a cell side, above 0. Without it the goal pays 1 (the paper's form).
 
+    Raises:
+        InputError: For numbers out of these ranges.
+
     Example:
         >>> from sidestep import Grid
         >>> float(Reward(discount=1.0, step_cost=2.0).reach(Grid.unknown(1, 3), 2).reward[0, 0])
@@ -27,6 +32,11 @@ class Reward:
 
     discount: float = 0.95
     step_cost: float | None = None
+
+    def __post_init__(self) -> None:
+        to_number(self.discount, "discount", above=0, most=1)
+        if self.step_cost is not None:
+            to_number(self.step_cost, "step_cost", above=0)
 
     def reach(
         self, world: sidestep.tabular.grid.Grid | sidestep.tabular.graph.Graph, goal: int | tuple[float, float]

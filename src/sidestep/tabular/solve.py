@@ -93,8 +93,8 @@ class Solution(eqx.Module):
             of acting once less.
         action_values: Q(s, a) of all states, or of the `visited` ones; −∞ for actions that are not available, and at
             discount 1 for those that may lead to a state of value −∞.
-        advantages: Q(s, a) − V(s), with V from `values_after`, of the same states; summed as differences, they are exact
-            where values are far larger than their differences. Policies depend on these.
+        advantages: Q(s, a) − V(s), with V from `values_after`, of the same states; summed as differences, they are
+            exact where values are far larger than their differences. Policies depend on these.
         sweeps: The number of times that each state was solved, on average; the horizon where it is finite.
         residual: The largest relative change in the last sweep; 0 for a finite horizon.
         converged: Whether the residual is within the solver's tolerance.

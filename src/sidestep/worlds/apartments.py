@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Int
 from numpy.random import Generator
 
-from sidestep.errors import check
+from sidestep.errors import check, check_count, to_count
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 
 _Room = Int[np.ndarray, "_ _"]
@@ -39,6 +39,8 @@ def apartment(rows: int, columns: int, seed: int, connectivity: Connectivity = 4
         >>> apartment(20, 30, seed=0).shape
         (20, 30)
     """
+    rows, columns = to_count(rows, "rows"), to_count(columns, "columns")
+    check_count(seed, 0, "seed")
     message = f"expected at least {_SMALLEST} rows and {_SMALLEST} columns, found {rows} and {columns}"
     check(rows >= _SMALLEST and columns >= _SMALLEST, message)
     random = np.random.default_rng(seed)

@@ -5,7 +5,8 @@ from jaxtyping import Bool, Int
 from numpy.random import Generator
 from scipy import ndimage
 
-from sidestep.errors import check
+from sidestep._arguments import to_integers
+from sidestep.errors import check, check_count, to_count, to_number
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 
 _SIDES = np.array([[-1, 0], [1, 0], [0, -1], [0, 1]])
@@ -48,10 +49,12 @@ def blocks(
         >>> blocks(20, 30, seed=0).shape
         (20, 30)
     """
+    rows, columns = to_count(rows, "rows"), to_count(columns, "columns")
+    check_count(seed, 0, "seed")
     check(rows >= 3 and columns >= 3, f"expected at least 3 rows and 3 columns, found {rows} and {columns}")
-    check(0 < density < 1, f"expected a number above 0 and below 1, found {density}", field="density")
-    least, greatest = sizes
-    check(1 <= least <= greatest, f"expected two numbers in order, at least 1, found {sizes}", field="sizes")
+    to_number(density, "density", above=0, below=1)
+    least, greatest = to_integers(sizes, "sizes", (2,), least=1).tolist()
+    check(least <= greatest, f"expected two numbers in order, found {sizes}", field="sizes")
     random = np.random.default_rng(seed)
     occupied, failures = np.zeros((rows, columns), dtype=bool), 0
     while occupied.sum() < density * occupied.size and failures < _TRIES:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 import sidestep as ss
 import sidestep.continuous as sc
+from sidestep.errors import to_count
 
 SIDE, NOISE, RADIUS = 10.0, 0.1, 0.8
 """The length of the room's sides, the standard deviation of moves, and the radius of goals; in meters."""
@@ -63,6 +64,7 @@ def room(lattice_points: int = 41) -> Room:
     Args:
         lattice_points: The number of points, 2 or more.
     """
+    lattice_points = to_count(lattice_points, "lattice_points", 2)
     walls = sc.Walls(low=jnp.asarray([WALL_LOW]), high=jnp.asarray([WALL_HIGH]))
     low, high = jnp.zeros(2), jnp.full(2, SIDE)
     angles = np.arange(8) * np.pi / 4
@@ -83,7 +85,7 @@ def random_starts(world: Room, count: int, random: np.random.Generator) -> list[
     Returns:
         For each task, starts of shape (count, 2).
     """
-    starts = []
+    count, starts = to_count(count, "count"), []
     for goal in GOALS:
         places = random.uniform(0.5, SIDE - 0.5, size=(100 * count, 2))
         free = ~world.inside(places) & (np.linalg.norm(places - goal, axis=1) > _LEAST_DISTANCE)

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 import sidestep as ss
-from sidestep.errors import check
+from sidestep._arguments import to_floats, to_integers
+from sidestep.errors import check, check_instance
 from sidestep.tabular.graph import straight_moves
 
 _CERTAIN_LOGIT = 12.0
@@ -44,9 +45,14 @@ class Farm(NamedTuple):
         Raises:
             InputError: For maps of different shapes, or without terrain or machines.
         """
+        check_instance(self.terrain, np.ndarray, "terrain")
+        check_instance(self.machine, np.ndarray, "machine")
+        shape = to_integers(self.terrain, "terrain", ("rows", "columns"), least=0, what="terrains").shape
+        to_integers(self.machine, "machine", shape, least=-1, what="machines")
         count, terrains = self.machines, int(self.terrain.max())
-        valid = self.terrain.shape == self.machine.shape and terrains >= 1 and count >= 1
-        check(valid, "expected maps of one shape with terrain above 0 and machines from 0", field="terrain")
+        message = f"expected terrain above 0 and machines from 0, found {terrains} and {count}"
+        check(terrains >= 1 and count >= 1, message, field="terrain")
+        to_floats(logits, "logits", (), (terrains, count))
         cells, driven = np.divmod(np.arange(count * self.terrain.size), count)
         target = straight_moves(ss.Grid.unknown(*self.terrain.shape))[cells]
         moves = target != cells[:, None]

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 import sidestep as ss
-from sidestep.errors import check
+from sidestep._arguments import to_floats, to_integers
+from sidestep.errors import check, check_instance
 from sidestep.tabular.graph import straight_moves
 
 DIRECTIONS = ("up", "down", "left", "right")
@@ -40,8 +41,11 @@ class Gravity(NamedTuple):
         Raises:
             InputError: For a map without colors.
         """
-        count = int(self.colors.max())
-        check(self.colors.min() >= 0 and count > 0, "expected colors 0…n, and one above 0", field="colors")
+        check_instance(self.colors, np.ndarray, "colors")
+        to_integers(self.colors, "colors", ("rows", "columns"), least=0, what="colors")
+        count = int(np.max(self.colors, initial=0))
+        check(count > 0, "expected colors 0…n, and one above 0, found none", field="colors")
+        to_floats(logits, "logits", (), (count, 4))
         cells, gravity = np.divmod(np.arange(4 * self.colors.size), 4)
         target = straight_moves(ss.Grid.unknown(*self.colors.shape))[cells]
         moved = (target != cells[:, None]) & (np.arange(4) != _OPPOSITE[gravity][:, None])

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Int
 from numpy.random import Generator
 
-from sidestep.errors import check
+from sidestep.errors import check, check_count, to_count
 from sidestep.tabular.graph import walkable_graph
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 
@@ -40,6 +40,8 @@ def office(rows: int, columns: int, seed: int, connectivity: Connectivity = 4) -
         >>> office(20, 30, seed=0).shape
         (20, 30)
     """
+    rows, columns = to_count(rows, "rows"), to_count(columns, "columns")
+    check_count(seed, 0, "seed")
     message = f"expected at least {_SMALLEST[0]} rows and {_SMALLEST[1]} columns, found {rows} and {columns}"
     check(rows >= _SMALLEST[0] and columns >= _SMALLEST[1], message)
     random = np.random.default_rng(seed)
@@ -74,8 +76,8 @@ def places(grid: Grid, count: int, seed: int) -> Int[np.ndarray, " count"]:
 
     graph = walkable_graph(grid)
     candidates = connected_cells(grid)
-    message = f"expected 1…{len(candidates)} (connected free cells), found {count}"
-    check(1 <= count <= len(candidates), message, field="count")
+    count = to_count(count, "count", 1, len(candidates))
+    check_count(seed, 0, "seed")
     random = np.random.default_rng(seed)
     chosen = [int(random.choice(candidates))]
     distance = dijkstra(graph, indices=chosen[0])

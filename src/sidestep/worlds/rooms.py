@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from sidestep.errors import check
+from sidestep._arguments import to_integers
+from sidestep.errors import check, to_count
 from sidestep.tabular.grid import Cell, Connectivity, Grid
 
 
@@ -25,12 +26,12 @@ def rooms_in_a_row(rows: int, columns: int, doors: tuple[int, ...], connectivity
         >>> rooms_in_a_row(3, 5, doors=(2,)).known.tolist()
         [[0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 0, 0]]
     """
+    rows, columns = to_count(rows, "rows"), to_count(columns, "columns")
+    own = to_integers(doors, "doors", ("doors",), least=0, most=rows - 1, what="rows").tolist()
     check(columns >= 2 * len(doors) + 1, f"expected at least {2 * len(doors) + 1}, found {columns}", field="columns")
-    check(rows >= 1, f"expected at least 1, found {rows}", field="rows")
     cells = np.full((rows, columns), int(Cell.FREE))
     walls = np.arange(1, len(doors) + 1) * (columns + 1) // (len(doors) + 1) - 1
-    for wall, door in zip(walls, doors, strict=True):
-        check(0 <= door < rows, f"expected a row in 0…{rows - 1}, found {door}", field="doors")
+    for wall, door in zip(walls, own, strict=True):
         cells[:, wall] = Cell.OCCUPIED
         cells[door, wall] = Cell.FREE
     return Grid(cells, connectivity=connectivity)

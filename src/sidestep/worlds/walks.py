@@ -4,7 +4,7 @@ import jax
 import numpy as np
 
 import sidestep as ss
-from sidestep.errors import check
+from sidestep.errors import check, check_instance
 from sidestep.maps.config import SimulationConfig
 from sidestep.tabular.backups import BACKUPS
 from sidestep.worlds.offices import connected_cells, places
@@ -23,6 +23,8 @@ def simulate_walks(grid: ss.Grid, config: SimulationConfig) -> tuple[list[ss.Tra
     Raises:
         InputError: For a map with fewer connected free cells than goals, or agents that do not arrive.
     """
+    check_instance(grid, ss.Grid, "grid")
+    check_instance(config, SimulationConfig, "config")
     candidates = connected_cells(grid)
     needed = max(2, config.goals)
     message = f"expected at least {needed} free cells that can reach one another, found {len(candidates)}"

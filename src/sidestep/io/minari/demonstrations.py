@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from sidestep.errors import InputError, check, input_errors
+from sidestep.errors import InputError, check, check_instance, describe, input_errors, to_number
 from sidestep.io.minari.datasets import Episode, Metadata, read_dataset, require_minari, write_dataset
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.graph import Graph
@@ -53,6 +53,9 @@ def write_demonstrations(
     from gymnasium.spaces import Discrete
 
     states, actions = _world_size(world)
+    check_instance(demonstrations, Demonstrations, "demonstrations")
+    check_instance(demonstrations.tasks, Task, "demonstrations")
+    _check_dataset(dataset, ends)
     moves = jax.tree.map(np.asarray, demonstrations)
     own_states, last_action = moves.tasks.terminal.shape[-1], moves.actions.max()
     message = f"expected demonstrations in a world of {states} states and {actions} actions"
@@ -94,6 +97,11 @@ def read_demonstrations(
         >>> demonstrations = read_demonstrations("office/walks-v0", grid)  # doctest: +SKIP
     """
     states, actions = _world_size(world)
+    _check_dataset(dataset, ends)
+    check_instance(task, (Task, type(None)), "task")
+    for value, field in ((discount, "discount"), (step_cost, "step_cost")):
+        if value is not None:
+            to_number(value, field, above=0)
 
     def check_spaces(*spaces: object) -> None:
         from gymnasium.spaces import Discrete
@@ -251,6 +259,14 @@ def _table(entry: Mapping[str, Any], field: str, shape: tuple[int, ...], source:
     return table
 
 
+def _check_dataset(dataset: object, ends: object) -> None:
+    """Check the arguments of both functions that name the dataset and its terminal states."""
+    message = f"expected the name of a dataset, found {describe(dataset)}"
+    check(isinstance(dataset, str | Path), message, field="dataset")
+    check_instance(ends, Mapping, "ends")
+
+
 def _world_size(world: Grid | Graph) -> tuple[int, int]:
     """Return the numbers of states and actions of a world."""
+    check_instance(world, (Grid, Graph), "world")
     return (world.size, len(world.steps)) if isinstance(world, Grid) else (world.states, world.actions)

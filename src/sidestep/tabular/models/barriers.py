@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Float, Int
 
-from sidestep.errors import InputError, check
+from sidestep.errors import InputError, check, describe
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import moves_into
 from sidestep.tabular.grid import Cell, Grid
@@ -72,7 +72,7 @@ def barriers_of(model: TransitionModel) -> Barriers:
         [-1, -1]
     """
     message = "expected a model of barriers: an ObstacleGrid, SlipperyGrid, walled_grid or road_network"
-    raise InputError(f"{message}, found {type(model).__name__}", field="model")
+    raise InputError(f"{message}, found {describe(model)}", field="model")
 
 
 @barriers_of.register
@@ -97,7 +97,7 @@ def _(model: SlipperyGrid) -> Barriers:
 def _(model: TiedModel) -> Barriers:
     index, successors = np.asarray(model.index), np.asarray(model.graph.successors)
     states = np.arange(len(index))[:, None]
-    message = "expected outcomes of a `walled_grid` or `road_network`: a move, and staying by the logit of a barrier"
+    message = "expected outcomes of a `walled_grid` or `road_network`, a move and staying, found others"
     check(index.shape[-1] == 2 and (successors[..., 1] == states).all(), message, field="model")
     move, stay = index[..., 0], index[..., 1]
     passable = (move == FIXED) & (stay != FIXED)

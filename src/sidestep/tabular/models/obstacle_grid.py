@@ -9,7 +9,7 @@ In a **featured grid** the logits are a function of features of each cell, θ(s)
 are learned. In a **walled grid** it is the border between two cells that may be closed, P(closed) = σ(θ(border)).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -17,9 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sidestep._arguments import to_finite, to_logits
 from sidestep._programs import keep_program
 from sidestep._typing import FloatTree
-from sidestep.errors import check
+from sidestep.errors import check, check_function, check_instance
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph, grid_graph, grid_successors
 from sidestep.tabular.grid import STEPS, Cell, Grid
@@ -47,11 +48,16 @@ class ObstacleGrid(TransitionModel):
     parameters: Float[Array, " cells"]
     known: Int[Array, "rows columns"]
 
-    def __init__(self, grid: Grid, logits: Float[Array | np.ndarray, " cells"] | float = -2.0):
-        """Make a model of a grid with logits: one number for all, or one for each cell."""
+    def __init__(self, grid: Grid, logits: Float[Array | np.ndarray, " cells"] | Sequence[float] | float = -2.0):
+        """Make a model of a grid with logits: one number for all, or one for each cell.
+
+        Raises:
+            InputError: For anything but a grid and such numbers.
+        """
+        check_instance(grid, Grid, "grid")
         self.graph = grid_graph(grid)
         self.known = to_jax(grid.known)
-        self.parameters = logit_array(logits, (grid.size,))
+        self.parameters = logit_array(to_logits(logits, grid.size), (grid.size,))
 
     @property
     def blocked(self) -> Float[Array, "rows columns"]:
@@ -102,9 +108,9 @@ class FeaturedGrid(TransitionModel):
             InputError: For features that are not finite or not those of every cell, and for a network without
                 parameters or with another output.
         """
-        features = to_jax(features)
-        complete = features.shape[0] == grid.size and np.isfinite(features).all()
-        check(complete, f"expected {grid.size} rows of finite numbers, found {features.shape}", field="features")
+        check_instance(grid, Grid, "grid")
+        check_function(network, "network")
+        features = to_jax(to_finite(features, "features", (grid.size, "features")))
         self.graph, self.known, self.features = grid_graph(grid), to_jax(grid.known), features
         self.parameters, self.network = eqx.partition(network, eqx.is_inexact_array)
         check(jax.tree.leaves(self.parameters), "expected parameters to learn, found none", field="network")
@@ -139,12 +145,15 @@ def borders(grid: Grid) -> Int[np.ndarray, "borders 2"]:
         >>> borders(Grid.unknown(1, 3)).tolist()
         [[0, 1], [1, 2]]
     """
+    check_instance(grid, Grid, "grid")
     cells = np.arange(grid.size).reshape(grid.shape)
     sides = (cells[:, :-1], cells[:, 1:]), (cells[:-1], cells[1:])
     return np.concatenate([np.stack([one.ravel(), other.ravel()], axis=1) for one, other in sides])
 
 
-def walled_grid(grid: Grid, logits: Float[Array | np.ndarray, " borders"] | float = -2.0) -> TiedModel:
+def walled_grid(
+    grid: Grid, logits: Float[Array | np.ndarray, " borders"] | Sequence[float] | float = -2.0
+) -> TiedModel:
     """Return a model of a grid in which the borders between cells may be closed, P(closed) = σ(θ).
 
     A border is the same from both sides. Known obstacles stay blocked.
@@ -157,13 +166,15 @@ def walled_grid(grid: Grid, logits: Float[Array | np.ndarray, " borders"] | floa
         The model, with one logit for each border.
 
     Raises:
-        InputError: For 8-connected grids, because a diagonal crosses no border.
+        InputError: For 8-connected grids, because a diagonal crosses no border, and for anything but such logits.
 
     Example:
         >>> walled_grid(Grid.unknown(1, 3)).parameters.shape
         (2,)
     """
-    check(grid.connectivity == 4, "expected 4: a diagonal crosses no border", field="connectivity")
+    check_instance(grid, Grid, "grid")
+    message = f"expected 4, found {grid.connectivity}: a diagonal crosses no border"
+    check(grid.connectivity == 4, message, field="connectivity")
     graph, between = grid_graph(grid), borders(grid)
     number = {(int(a), int(b)): index for index, pair in enumerate(between) for a, b in (pair, pair[::-1])}
     index = np.full(graph.successors.shape, IMPOSSIBLE)
@@ -173,7 +184,7 @@ def walled_grid(grid: Grid, logits: Float[Array | np.ndarray, " borders"] | floa
                 index[state, action, 1] = FIXED
             else:
                 index[state, action] = FIXED, number[state, int(target)]
-    return TiedModel(graph, index, logit_array(logits, (len(between),)))
+    return TiedModel(graph, index, logit_array(to_logits(logits, len(between)), (len(between),)))
 
 
 @keep_program
@@ -241,5 +252,6 @@ def true_model(grid: Grid) -> ObstacleGrid:
         >>> true_model(Grid(np.array([[0, 1]]))).blocked.tolist()
         [[0.0, 1.0]]
     """
+    check_instance(grid, Grid, "grid")
     known = np.where(grid.known == Cell.FREE, Cell.FREE, Cell.OCCUPIED)
     return ObstacleGrid(Grid(known, grid.resolution, grid.origin, grid.connectivity))

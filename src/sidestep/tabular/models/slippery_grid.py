@@ -9,12 +9,15 @@ f(s, d) = Π_{c needed} (1 − σ(θ(c))), the probability that direction d is f
 and s itself takes the rest. Cells of one terrain share the slip, so observations in one place inform all others.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sidestep.errors import check
+from sidestep._arguments import to_integers, to_logits
+from sidestep.errors import check, check_instance, describe
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph, grid_successors
 from sidestep.tabular.grid import STEPS, Grid
@@ -50,7 +53,7 @@ class SlipperyGrid(TransitionModel):
         grid: Grid,
         logits: Logits = -2.0,
         slip: Logits = -2.0,
-        terrain: Int[np.ndarray, "rows columns"] | None = None,
+        terrain: Int[np.ndarray, "rows columns"] | Sequence[Sequence[int]] | None = None,
     ):
         """Make a model with logits of cells and of slips: one number for all, or one for each cell or terrain.
 
@@ -59,17 +62,18 @@ class SlipperyGrid(TransitionModel):
         Raises:
             InputError: For terrain of another shape than the grid, below −1, or with a gap in its numbers.
         """
-        terrain = np.zeros(grid.shape, dtype=np.int64) if terrain is None else terrain
-        same_shape = terrain.shape == grid.shape
-        check(same_shape, f"expected the grid's shape {grid.shape}, found {terrain.shape}", field="terrain")
-        kinds = np.unique(terrain[terrain >= 0])
-        numbered = terrain.min() >= -1 and len(kinds) and kinds[-1] == len(kinds) - 1
-        check(numbered, "expected all the kinds 0…n−1, and −1 where moves do not slip", field="terrain")
+        check_instance(grid, Grid, "grid")
+        chosen = np.zeros(grid.shape, dtype=np.int64) if terrain is None else terrain
+        of_cells = to_integers(chosen, "terrain", grid.shape, least=-1, what="terrains")
+        kinds = np.unique(of_cells[of_cells >= 0])
+        message = f"expected all the kinds 0…n−1, and −1 where moves do not slip, found {describe(kinds.tolist())}"
+        check(len(kinds) and kinds[-1] == len(kinds) - 1, message, field="terrain")
         entered, staying = np.split(grid_successors(grid), [1], axis=-1)
         successors = np.concatenate([entered[:, DIRECTIONS[: grid.connectivity], 0], staying], axis=-1)
         self.graph = Graph(to_jax(successors, np.int32), to_jax(grid.lengths[None]))
-        self.known, self.terrain = to_jax(grid.known), to_jax(terrain.ravel(), np.int32)
-        cells, slips = logit_array(logits, (grid.size,)), logit_array(slip, (len(kinds),))
+        self.known, self.terrain = to_jax(grid.known), to_jax(of_cells.ravel(), np.int32)
+        cells = logit_array(to_logits(logits, grid.size), (grid.size,))
+        slips = logit_array(to_logits(slip, len(kinds), "slip"), (len(kinds),))
         self.parameters = jnp.concatenate([cells, slips.astype(cells.dtype)])
 
     @property
