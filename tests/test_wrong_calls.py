@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 import sidestep as ss
-from helpers.wrong_calls import data, learning, maps, models, right, small
+from helpers.wrong_calls import data, learning, maps, models, right, small, tabular
 from sidestep.errors import InputError
 
-CASES = [*data.CASES, *models.CASES, *learning.CASES, *maps.CASES]
+CASES = [*data.CASES, *models.CASES, *learning.CASES, *maps.CASES, *tabular.CASES]
+RIGHT = right.CASES | tabular.RIGHT
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -37,7 +38,7 @@ def test_wrong_call_raises_an_error_that_says_what_was_expected(call, word):
     assert len(message) < 400
 
 
-@pytest.mark.parametrize("call", right.CASES.values(), ids=right.CASES)
+@pytest.mark.parametrize("call", RIGHT.values(), ids=RIGHT)
 def test_unusual_call_works(call):
     assert call()
 

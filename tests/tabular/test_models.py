@@ -180,7 +180,7 @@ def test_tabular_model_impossible_outcomes_have_probability_0():
 
 def test_tabular_model_of_wrong_shapes_raises():
     world = graph(np.array([[[0, 1]], [[0, 1]]]))
-    with pytest.raises(InputError, match=r"graph's shape \(2, 1, 2\)"):
+    with pytest.raises(InputError, match=r"of shape \(2, 1, 2\)"):
         TabularModel(world, jnp.zeros((2, 1, 3)))
     with pytest.raises(InputError, match="possible outcome"):
         TabularModel(world, jnp.zeros((2, 1, 2)), jnp.asarray([[[True, True]], [[False, False]]]))

@@ -73,10 +73,10 @@ def test_stack_tasks_of_different_shapes_broadcasts():
     (lambda: reach(Grid(KNOWN), 4), "goal.*0…3"),
     (lambda: task(np.array([1.0, NAN]), 0.9, TERMINAL), "reward.*finite"),
     (lambda: task(np.array([1.0, 2.0]), 0.0, TERMINAL), "discount"),
-    (lambda: task(np.ones(3), 0.9, TERMINAL), r"reward, terminal.*\(3,\)"),
-    (lambda: task(np.ones((2, 2, 2)), 0.9, TERMINAL), "reward, terminal"),
-    (lambda: task(np.ones(2), 0.9, TERMINAL.astype(int)), "reward, terminal|Type-check"),
-    (lambda: stack_tasks([]), "tasks.*at least one"),
+    (lambda: task(np.ones(3), 0.9, TERMINAL), r"terminal.*\(3,\)"),
+    (lambda: task(np.ones((2, 2, 2)), 0.9, TERMINAL), "reward.*world"),
+    (lambda: task(np.ones(2), 0.9, TERMINAL.astype(int)), "terminal.*booleans"),
+    (lambda: stack_tasks([]), "tasks.*at least 1"),
 ])  # fmt: skip
 def test_tasks_of_wrong_arguments_raise(make, message):
     with pytest.raises(Exception, match=message) as caught:

@@ -22,11 +22,10 @@ from typing import ClassVar, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Scalar
 
-from sidestep.errors import InputError, check, check_positive
+from sidestep._arguments import to_finite
+from sidestep.errors import InputError, describe, to_number
 from sidestep.tabular.arrays import to_jax
 
 Gradient = Literal["exact", "fixed_policy"]
@@ -115,6 +114,9 @@ class HardMax(Backup):
     """
 
     tie: float = eqx.field(default=4e-12, static=True)
+
+    def __check_init__(self) -> None:
+        to_number(self.tie, "tie", least=0)
 
     def value(self, q: ActionValues, beta: Float[Scalar, ""], available: Available | None = None) -> Values:
         """Return the best action's value."""
@@ -258,13 +260,9 @@ class Behavior(eqx.Module):
 
     def __init__(self, backup: Backup | type[Backup] | str, beta: Number = 10.0, lapse: Number | None = None):
         self.backup = backup_of(backup)
-        self.beta = _one_number(beta, "beta")
-        self.lapse = None if lapse is None else _one_number(lapse, "lapse")
-        if not isinstance(self.beta, Tracer):
-            check_positive(float(self.beta), "beta")
-        if self.lapse is not None and not isinstance(self.lapse, Tracer):
-            valid = 0 <= float(self.lapse) < 1
-            check(valid, f"expected a probability, at least 0 and below 1, found {lapse}", field="lapse")
+        dtype = jnp.result_type(float)
+        self.beta = to_jax(to_finite(beta, "beta", (), above=0), dtype)
+        self.lapse = None if lapse is None else to_jax(to_finite(lapse, "lapse", (), least=0, below=1), dtype)
 
     def log_policy(self, q: ActionValues, available: Available | None = None) -> ActionValues:
         """Return log π(a | s) from action values; −∞ for actions that are never taken.
@@ -312,18 +310,7 @@ def backup_of(backup: Backup | type[Backup] | str) -> Backup:
     made = backup() if isinstance(backup, type) and issubclass(backup, Backup) else backup
     if isinstance(made, Backup):
         return made
-    raise InputError(f"expected a backup, or one of {', '.join(BACKUPS)}, found {backup!r}", field="backup")
-
-
-def _one_number(value: Number, field: str) -> Float[Array, ""]:
-    """Return a number as an array without axes; a traced one as it is."""
-    if isinstance(value, Tracer):
-        return jnp.asarray(value, jnp.result_type(float))
-    number = np.asarray(value)
-    single = number.shape == () and number.dtype.kind in "fiu"
-    what = repr(value) if number.dtype.kind not in "fiu" else f"shape {number.shape}"
-    check(single, f"expected a number, found {what}", field=field)
-    return to_jax(value, jnp.result_type(float))
+    raise InputError(f"expected a Backup, or one of {', '.join(BACKUPS)}, found {describe(backup)}", field="backup")
 
 
 def _exponents(q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:

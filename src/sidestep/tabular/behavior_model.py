@@ -14,19 +14,19 @@ pooling pulls a person with few moves towards the others.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import logit
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int, Shaped
 
-from sidestep.errors import InputError, check
+from sidestep._arguments import to_finite, to_integers, to_states
+from sidestep.errors import check, check_choice, check_instance, describe, to_list, to_number
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior
-from sidestep.tabular.graph import check_states
 from sidestep.tabular.tasks import Task, with_state_costs
 
 LEARNABLE = ("beta", "lapse", "discount")
@@ -175,10 +175,10 @@ def behavior_model(
     learn: Sequence[str] = (),
     *,
     discount: float | None = None,
-    person: Int[Array | np.ndarray, " tasks"] | None = None,
-    features: Float[Array | np.ndarray, "#states #actions features"] | None = None,
-    reward_weights: Float[np.ndarray, " features"] | None = None,
-    aimed_at: Int[Array | np.ndarray, "states actions"] | None = None,
+    person: Shaped[ArrayLike, "..."] | Sequence[int] | None = None,
+    features: Shaped[ArrayLike, "..."] | Sequence[Any] | None = None,
+    reward_weights: Shaped[ArrayLike, "..."] | Sequence[float] | None = None,
+    aimed_at: Shaped[ArrayLike, "..."] | Sequence[Any] | None = None,
 ) -> BehaviorModel:
     """Return a model of agents that behave as `behavior` describes, except for what is learned.
 
@@ -209,30 +209,30 @@ def behavior_model(
         >>> round(float(behavior_model(Behavior(BoltzmannAverage(), 7.0), learn=["beta"]).behavior_of().beta), 3)
         7.0
     """
-    unknown = [name for name in learn if name not in LEARNABLE]
-    check(not unknown, f"expected some of {LEARNABLE}, found {unknown}", field="learn")
+    check_instance(behavior, Behavior, "behavior")
+    for name in to_list(learn, str, "learn", least=0):
+        check_choice(name, LEARNABLE, "learn")
     if person is not None:
-        numbered = np.array_equal(np.unique(person), np.arange(np.max(person) + 1))
-        check(numbered, "expected persons numbered from 0, each with a task", field="person")
-        person = to_jax(person, jnp.int32)
+        own = np.asarray(to_integers(person, "person", ("tasks",), least=0))
+        numbered = own.size and np.array_equal(np.unique(own), np.arange(own.max() + 1))
+        check(numbered, f"expected persons numbered from 0, each with a task, found {describe(person)}", field="person")
+        person = to_jax(own, jnp.int32)
     log_beta = logit_lapse = logit_discount = weights = cost_parameters = None
     if "beta" in learn or person is not None:
         log_beta = jnp.full(1 if person is None else int(np.max(person)) + 1, jnp.log(behavior.beta))
     if "lapse" in learn:
         logit_lapse = logit(jnp.asarray(_INITIAL_LAPSE if behavior.lapse is None else behavior.lapse))
     if "discount" in learn:
-        if discount is None or not 0 < discount < 1:
-            raise InputError(f"to be learned, it must start between 0 and 1: found {discount}", field="discount")
-        logit_discount = logit(jnp.asarray(discount, jnp.result_type(float)))
+        begin = to_number(discount, "discount", above=0, below=1)
+        logit_discount = logit(jnp.asarray(begin, jnp.result_type(float)))
     if features is not None:
-        finite = features.ndim == 3 and np.isfinite(features).all()
-        check(finite, "expected finite numbers of shape (states, actions, features)", field="features")
-        initial = np.zeros(features.shape[-1]) if reward_weights is None else np.asarray(reward_weights)
-        complete = initial.shape == features.shape[-1:] and np.isfinite(initial).all()
-        check(complete, f"expected {features.shape[-1]} finite numbers, found {initial}", field="reward_weights")
-        weights, features = (to_jax(each, jnp.result_type(float)) for each in (initial, features))
+        features = to_jax(to_finite(features, "features", ("states", "actions", "features")), jnp.result_type(float))
+        count = features.shape[-1]
+        initial = np.zeros(count) if reward_weights is None else to_finite(reward_weights, "reward_weights", (count,))
+        weights = to_jax(initial, jnp.result_type(float))
     if aimed_at is not None:
-        check_states(np.asarray(aimed_at), len(aimed_at), "aimed_at")
-        cost_parameters, aimed_at = to_jax(np.full(len(aimed_at), _COST_MEAN)), to_jax(aimed_at, jnp.int32)
+        states = len(np.asarray(aimed_at))
+        aims = to_states(aimed_at, states, "aimed_at", (states, "actions"))
+        cost_parameters, aimed_at = to_jax(np.full(states, _COST_MEAN)), to_jax(aims, jnp.int32)
     start = BehaviorParameters(log_beta, logit_lapse, logit_discount, weights, cost_parameters)
     return BehaviorModel(behavior, start, start, person, features, aimed_at)

@@ -51,6 +51,22 @@ def check_persons(behavior: Behavior | BehaviorModel | None, tasks: int) -> None
         check(own == tasks, message, field="person")
 
 
+def check_features(behavior: Behavior | BehaviorModel | None, world: Graph) -> None:
+    """Raise `InputError` unless the features and aims of a behavior model are of the world of a graph.
+
+    Args:
+        behavior: The behavior.
+        world: The graph of a model.
+    """
+    if isinstance(behavior, BehaviorModel):
+        shape = world.states, world.actions
+        for field in ("features", "aimed_at"):
+            own = getattr(behavior, field)
+            axes = shape if own is None else own.shape[:2]
+            fits = all(axis in (1, size) for axis, size in zip(axes, shape, strict=True))
+            check(fits, f"expected {shape} states and actions, or 1 instead, found {axes}", field=field)
+
+
 def check_behavior(behavior: Behavior | BehaviorModel, *, learned: bool = False) -> None:
     """Raise `InputError` unless something is a behavior.
 
@@ -74,7 +90,9 @@ def check_task(task: Task, world: Graph, field: str = "task") -> None:
     states = task.terminal.shape[-1]
     message = f"expected a task of the model's {world.states} states, found one of {states}"
     check(states == world.states, message, field=field)
-    own = [("rewards", task.reward.shape[-2:], (world.states, world.actions))]
+    own: list[tuple[str, tuple[int, ...], tuple[int, ...]]] = [
+        ("rewards", task.reward.shape[-2:], (world.states, world.actions))
+    ]
     if task.outcome_reward is not None:
         own.append(("rewards of outcomes", task.outcome_reward.shape[-3:], world.successors.shape))
     for what, axes, expected in own:

@@ -13,7 +13,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
-from sidestep.errors import check
+from sidestep._arguments import to_integers, to_mask
+from sidestep.errors import check, check_instance
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.grid import Cell, Grid
 
@@ -71,12 +72,10 @@ def graph(
         >>> graph([[[0], [1]], [[1], [0]]]).states
         2
     """
-    table = np.asarray(successors)
-    message = "expected whole numbers of shape (states, actions, outcomes), found"
-    whole = table.ndim == 3 and table.dtype.kind in "iu"
-    advice = "; for probabilities P[s, a, s′] use `from_dense`" if table.dtype.kind == "f" else ""
-    check(whole, f"{message} {table.dtype} {table.shape}{advice}", field="successors")
-    check(table.size, f"{message} shape {table.shape}: at least one of each is needed", field="successors")
+    what = "states, or `from_dense` for probabilities P[s, a, s′]"
+    table = to_integers(successors, "successors", ("states", "actions", "outcomes"), least=0, what=what)
+    message = f"expected at least one state, action and outcome, found shape {table.shape}"
+    check(table.size, message, field="successors")
     check_states(table, len(table), "successors")
     made = Graph(to_jax(table, np.int32), to_jax(np.ones((1, 1))))
     return made if available is None else with_available(made, available)
@@ -92,9 +91,7 @@ def with_available(world: Graph, available: Shaped[ArrayLike, "..."] | Sequence[
     Raises:
         InputError: For another shape or type, and for a state without an available action.
     """
-    mask, shape = np.asarray(available), (world.states, world.actions)
-    message = f"expected booleans of shape {shape}, found {mask.dtype} {mask.shape}"
-    check(mask.shape == shape and mask.dtype == bool, message, field="available")
+    mask = np.asarray(to_mask(available, "available", (world.states, world.actions)))
     without = np.flatnonzero(~mask.any(axis=1))[:1]
     message = f"expected an action in every state, found none in state {without}"
     check(not len(without), message, field="available")
@@ -128,6 +125,7 @@ def grid_graph(grid: Grid) -> Graph:
         >>> grid_graph(Grid.unknown(rows=1, columns=2)).successors[0, 3].tolist()  # from the left cell to the right
         [1, 0]
     """
+    check_instance(grid, Grid, "grid")
     return Graph(to_jax(grid_successors(grid), np.int32), to_jax(grid.lengths[None]))
 
 

@@ -19,7 +19,14 @@ from sidestep.errors import check
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
-from sidestep.tabular.checks import check_behavior, check_demonstrations, check_model, check_persons, is_traced
+from sidestep.tabular.checks import (
+    check_behavior,
+    check_demonstrations,
+    check_features,
+    check_model,
+    check_persons,
+    is_traced,
+)
 from sidestep.tabular.demonstrations import Demonstrations, next_power_of_two, pad_to_power_of_two
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.proper import check_proper
@@ -130,6 +137,7 @@ def check_likelihood(
     check_behavior(behavior, learned=True)
     check_demonstrations(demonstrations, model.graph)
     agents = as_behavior_model(behavior)
+    check_features(behavior, model.graph)
     check_persons(behavior, len(demonstrations.tasks.terminal))
     if not is_traced(model, demonstrations, behavior):
         check_proper(agents.tasks_of(demonstrations.tasks), agents.behavior_of(), model.graph, options.horizon)

@@ -19,7 +19,7 @@ from sidestep.errors import NotConverged, check, check_instance, to_count
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior, HardMax, tied_where_lost
 from sidestep.tabular.behavior_model import BehaviorModel
-from sidestep.tabular.checks import check_behavior, check_model, check_task, is_traced
+from sidestep.tabular.checks import check_behavior, check_features, check_model, check_task, is_traced
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.proper import check_proper
 from sidestep.tabular.solve import Solution, SolveOptions, solve
@@ -141,6 +141,7 @@ def plan(
     check(not tasks, f"expected one task, found a stack of {tasks}", field="task")
     if behavior is not None:
         check_behavior(behavior, learned=True)
+        check_features(behavior, model.graph)
     agent = behavior or Behavior(HardMax())
     if isinstance(agent, BehaviorModel):
         task, agent = agent.tasks_of(task), agent.behavior_of(person)
@@ -268,7 +269,11 @@ def roll_out(
     if not is_traced(policy):
         numbers = np.asarray(policy)
         rows = np.flatnonzero(~(np.isclose(numbers.sum(axis=1), 1, atol=1e-4) & (numbers >= 0).all(axis=1)))[:1]
-        check(not len(rows), f"expected probabilities that sum to one in every state, not so in {rows}", field="policy")
+        check(
+            not len(rows),
+            f"expected probabilities that sum to one in every state, found other ones in state {rows}",
+            field="policy",
+        )
     states = to_jax(to_states(starts, world.graph.states, "starts"), np.int32)
     return _roll_out(to_key(key), world, policy, terminal, states, max_moves)
 

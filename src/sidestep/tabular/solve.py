@@ -19,10 +19,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.errors import check, check_count
+from sidestep.errors import check_choice, check_instance, to_count
 from sidestep.tabular.backups import Backup, Behavior, Gradient
 from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
-from sidestep.tabular.checks import check_behavior, check_model, check_persons, check_task, is_traced
+from sidestep.tabular.checks import check_behavior, check_features, check_model, check_persons, check_task, is_traced
 from sidestep.tabular.implicit import fixed_point
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.proper import check_proper
@@ -65,14 +65,14 @@ class SolveOptions(eqx.Module):
     """
 
     gradient: Gradient = eqx.field(static=True, default="exact")
-    horizon: int | None = eqx.field(static=True, default=None, converter=lambda n: None if n is None else int(n))
+    horizon: int | None = eqx.field(static=True, default=None)
     solver: base.Solver | None = None
 
     def __check_init__(self) -> None:
-        known = self.gradient in ("exact", "fixed_policy")
-        check(known, f"expected 'exact' or 'fixed_policy', found {self.gradient!r}", field="gradient")
+        check_choice(self.gradient, ("exact", "fixed_policy"), "gradient")
         if self.horizon is not None:
-            check_count(self.horizon, 1, "horizon")
+            to_count(self.horizon, "horizon")
+        check_instance(self.solver, (base.Solver, type(None)), "solver")
 
     def solver_for(self, backup: Backup, states: int) -> base.Solver:
         """Return `solver`, or without one the default for a problem of that many states.
@@ -171,10 +171,12 @@ def solve(
         points: Christianson, "Reverse accumulation and attractive fixed points" (1994).
     """
     options = options or SolveOptions()
+    check_instance(options, SolveOptions, "options")
     check_behavior(behavior, learned=True)
     agents = as_behavior_model(behavior)
     check_model(model)
     check_task(task, model.graph)
+    check_features(behavior, model.graph)
     if task.terminal.ndim == 2:
         check_persons(behavior, len(task.terminal))
     if not is_traced(model, task, behavior):

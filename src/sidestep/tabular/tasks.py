@@ -19,7 +19,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
-from sidestep.errors import InputError, check, check_positive
+from sidestep._arguments import to_finite, to_floats, to_mask
+from sidestep.errors import InputError, check, check_instance, check_positive, describe, to_list, to_number
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.grid import Cell, Grid
@@ -71,23 +72,21 @@ def task(
         >>> task(np.array([-1.0, -1.0, 5.0]), 0.9, np.array([False, False, True])).reward.shape
         (3, 1)
     """
-    rewards, ends = np.asarray(reward), np.asarray(terminal)
-    check(
-        rewards.ndim in (1, 2, 3) and ends.shape == rewards.shape[:1] and ends.dtype == bool and rewards.size,
-        "expected shapes (states,), (states, actions) or (states, actions, states) and booleans (states,), found "
-        f"{rewards.shape} and {ends.dtype} {ends.shape}",
-        field="reward, terminal",
-    )
-    numbers = rewards.dtype.kind in "fiu" and np.isfinite(rewards).all()
-    check(numbers, f"expected finite numbers, found {_example_of(rewards)}", field="reward")
+    shapes = ("states",), ("states", "actions"), ("states", "actions", "states")
+    rewards = np.asarray(to_finite(reward, "reward", *shapes))
+    check(rewards.size, f"expected rewards, found shape {rewards.shape}", field="reward")
+    ends = np.asarray(to_mask(terminal, "terminal", rewards.shape[:1]))
     check_discount(discount)
     rewards = rewards.astype(jnp.result_type(float))
     if rewards.ndim == 1:
         return _task(rewards[:, None], rewards, ends, discount)
     if rewards.ndim == 2:
         return _task(rewards, np.zeros(1), ends, discount)
-    message = "expected the graph of the model beside reward, terminal, for a reward R(s, a, s′)"
-    check(isinstance(world, Graph), message, field="world")
+    check(
+        isinstance(world, Graph),
+        "expected `world`, the graph of the model, for R(s, a, s′); found none",
+        field="reward",
+    )
     assert world is not None
     shape = world.states, world.actions, world.states
     check(rewards.shape == shape, f"expected R(s, a, s′) of shape {shape}, found {rewards.shape}", field="reward")
@@ -105,13 +104,6 @@ def with_outcome_reward(made: Task, rewards: Float[ArrayLike, "states actions ou
         rewards: R(s, a, s′ₖ) of every outcome k.
     """
     return replace(made, outcome_reward=to_jax(np.asarray(rewards), jnp.result_type(float)))
-
-
-def _example_of(array: np.ndarray) -> str:
-    """Return the first entry that is not a finite number, or the type where none is a number."""
-    if array.dtype.kind not in "fiu":
-        return f"type {array.dtype}"
-    return str(array[~np.isfinite(array)][:1])
 
 
 def reach(
@@ -138,6 +130,7 @@ def reach(
         3
     """
     check_discount(discount)
+    check_instance(world, (Grid, Graph), "world")
     terminal = np.arange(_states_of(world)) == state_at(world, goal, "goal")
     if step_cost is None:
         check(discount < 1, "a goal that pays 1 needs a discount below 1 (or give a step cost)", field="discount")
@@ -161,11 +154,9 @@ def stack_tasks(tasks: Sequence[Task]) -> Task:
         >>> stack_tasks([reach(grid, 0), reach(grid, 2)]).terminal.shape
         (2, 3)
     """
-    check(len(tasks), "expected at least one task, found none", field="tasks")
+    tasks = to_list(tasks, Task, "tasks")
     for index, each in enumerate(tasks):
-        single = isinstance(each, Task) and each.terminal.ndim == 1
-        kind = "a stack of tasks" if isinstance(each, Task) else type(each).__name__
-        check(single, f"expected a Task, found {kind} at position {index}", field="tasks")
+        check(each.terminal.ndim == 1, f"expected single tasks, found a stack of tasks at {index}", field="tasks")
     sizes = sorted({len(each.terminal) for each in tasks})
     check(len(sizes) == 1, f"expected tasks of one world, found worlds of {sizes} states", field="tasks")
     if any(each.outcome_reward is not None for each in tasks):
@@ -213,7 +204,7 @@ def check_discount(discount: float) -> None:
     Args:
         discount: γ.
     """
-    check(0 < discount <= 1, f"expected a number above 0 and at most 1, found {discount}", field="discount")
+    to_number(discount, "discount", above=0, most=1)
 
 
 def state_at(world: Grid | Graph, place: int | tuple[float, float], field: str) -> int:
@@ -231,13 +222,14 @@ def state_at(world: Grid | Graph, place: int | tuple[float, float], field: str) 
         InputError: For a place that is outside the world or in a known obstacle.
     """
     states = _states_of(world)
-    if not isinstance(place, (int, np.integer)):
+    if not isinstance(place, (int, np.integer)) or isinstance(place, bool):
         if isinstance(world, Graph):
-            raise InputError(f"on a graph the {field} is a state, not a position", field=field)
-        position = np.asarray([place], dtype=np.float64)
-        on_map = position.shape == (1, 2) and world.contains(position)[0]
+            message = f"expected a state (on a graph the {field} is a state, not a position)"
+            raise InputError(f"{message}, found {describe(place)}", field=field)
+        position = np.asarray(to_floats(place, field, (2,)), np.float64)[None]
+        on_map = world.contains(position)[0]
         check(on_map, f"expected a position on the map, {world.extent()}, found {place}", field=field)
-        place = world.state(place)
+        place = world.state((float(position[0, 0]), float(position[0, 1])))
     check(0 <= place < states, f"expected a state in 0…{states - 1}, found {place}", field=field)
     if isinstance(world, Grid):
         x, y = world.centers(np.array([place]))[0]

@@ -9,23 +9,9 @@ Add `*LATER` to the cases of `test_wrong_calls`, or move the rows, as soon as a 
 from types import SimpleNamespace
 
 import jax.numpy as jnp
-import numpy as np
 
 import sidestep as ss
-from helpers.wrong_calls.small import (
-    BEHAVIOR,
-    DEMOS,
-    GRID,
-    INF,
-    KEY,
-    MODEL,
-    NAN,
-    OTHER_MODEL,
-    OTHER_TASK,
-    TASK,
-    WALKS,
-    labeled,
-)
+from helpers.wrong_calls.small import INF, labeled
 from sidestep.continuous import Lattice, reach_region
 
 
@@ -37,105 +23,7 @@ def table(transitions):
 
 
 LOOP = {0: [(1.0, 1, 0.0, True)]}
-GRAPH = ss.graph(np.array([[[0, 1]], [[1, 0]]]))
-POLICY = jnp.full((20, 4), 0.25)
 LATER = [
-    *labeled("backups", [
-        ("beta of text", lambda: ss.Behavior(ss.BoltzmannAverage(), beta="7"), "beta"),
-        ("beta of an array", lambda: ss.Behavior(ss.BoltzmannAverage(), beta=jnp.ones(3)), "beta"),
-        ("beta NaN", lambda: ss.Behavior(ss.BoltzmannAverage(), beta=NAN), "beta"),
-        ("beta None", lambda: ss.Behavior(ss.BoltzmannAverage(), beta=None), "beta"),
-        ("the class of a backup", lambda: ss.Behavior(ss.BoltzmannAverage), "backup"),
-        ("the name of a backup", lambda: ss.plan(MODEL, TASK, ss.Behavior("boltzmann", beta=5.0)), "backup"),
-        ("no backup", lambda: ss.Behavior(None), "backup"),
-        ("lapse of text", lambda: ss.Behavior(ss.HardMax(), lapse="0.1"), "lapse"),
-        ("lapse of an array", lambda: ss.Behavior(ss.HardMax(), lapse=np.zeros(2)), "lapse"),
-        ("lapse 1", lambda: ss.Behavior(ss.HardMax(), lapse=1), "lapse"),
-        ("a tie of text", lambda: ss.HardMax(tie="0"), "tie"),
-    ]),
-    *labeled("tasks", [
-        ("a step cost of text", lambda: ss.reach(GRID, 3, step_cost="1"), "step_cost"),
-        ("a goal of text", lambda: ss.reach(GRID, ("a", "b")), "goal"),
-        ("a goal of a fraction", lambda: ss.reach(GRID, 3.5), "goal"),
-        ("a goal True", lambda: ss.reach(GRID, True), "goal"),
-        ("a goal None", lambda: ss.reach(GRID, None), "goal"),
-        ("a discount of text", lambda: ss.reach(GRID, 3, discount="0.9"), "discount"),
-        ("a discount NaN", lambda: ss.reach(GRID, 3, discount=NAN), "discount"),
-        ("reach in a model", lambda: ss.reach(MODEL, 3), "world"),
-        ("a reward of text", lambda: ss.task(np.array(["a", "b"]), 0.9, np.array([False, True])), "reward"),
-        ("a reward of three axes", lambda: ss.task(np.zeros((2, 1, 1)), 0.9, np.array([False, True])), "reward"),
-        ("terminal states by number", lambda: ss.task(np.zeros(2), 0.9, [1]), "terminal"),
-        ("a task of another world", lambda: ss.plan(MODEL, ss.task(np.zeros(7), 0.9, np.arange(7) == 3)), "task"),
-        ("stack_tasks of two worlds", lambda: ss.stack_tasks([TASK, OTHER_TASK]), "tasks"),
-        ("stack_tasks of one task", lambda: ss.stack_tasks(TASK), "tasks"),
-        ("stack_tasks of states", lambda: ss.stack_tasks([3]), "tasks"),
-    ]),
-    *labeled("graphs", [
-        ("graph of floats", lambda: ss.graph(np.array([[[0.5]]])), "successors"),
-        ("graph of two axes", lambda: ss.graph(np.zeros((2, 2), int)), "successors"),
-        ("graph of text", lambda: ss.graph("graph"), "successors"),
-        ("graph, another state", lambda: ss.graph([[[1]]]), "successors"),
-        ("grid_graph of an array", lambda: ss.grid_graph(np.zeros((2, 2), int)), "grid"),
-        ("road_network of three places", lambda: ss.road_network(np.array([[0, 1, 2]]), np.array([1.0, 1.0, 1.0])), "links"),
-        ("road_network, logits", lambda: ss.road_network(np.array([[0, 1]]), np.array([1.0, 1.0]), np.zeros(5)), "logits"),
-        ("road_network, a length 0", lambda: ss.road_network([[0, 1]], [0.0]), "lengths"),
-        ("road_network, NaN", lambda: ss.road_network([[0, 1]], [NAN]), "lengths"),
-        ("road_network, fractions", lambda: ss.road_network([[0.5, 1]], [1.0]), "links"),
-        ("closed of a grid", lambda: ss.closed(GRID), "model"),
-        ("TabularModel, NaN", lambda: ss.TabularModel(GRAPH, jnp.full((2, 1, 2), NAN)), "logits"),
-        ("TabularModel, another shape", lambda: ss.TabularModel(GRAPH, jnp.zeros((2, 2))), "logits"),
-        ("TabularModel, numbers for a mask", lambda: ss.TabularModel(GRAPH, jnp.zeros((2, 1, 2)), jnp.ones((2, 1, 2))), "possible"),
-        ("TabularModel of an array", lambda: ss.TabularModel(np.zeros((2, 1, 2), int), jnp.zeros((2, 1, 2))), "graph"),
-        ("TiedModel, floats", lambda: ss.TiedModel(GRAPH, np.zeros((2, 1, 2))), "index"),
-        ("TiedModel, NaN", lambda: ss.TiedModel(GRAPH, np.zeros((2, 1, 2), int), NAN), "logits"),
-        ("TiedModel, below IMPOSSIBLE", lambda: ss.TiedModel(GRAPH, np.full((2, 1, 2), -3)), "index"),
-        ("with_parameters of another shape", lambda: MODEL.with_parameters(jnp.zeros(3)), "parameters"),
-    ]),
-    *labeled("solve", [
-        ("horizon of a fraction", lambda: ss.fit(MODEL, DEMOS, BEHAVIOR, options=ss.SolveOptions(horizon=2.5)), "horizon"),
-        ("horizon 0", lambda: ss.SolveOptions(horizon=0), "horizon"),
-        ("horizon of text", lambda: ss.SolveOptions(horizon="2"), "horizon"),
-        ("the class of a solver", lambda: ss.SolveOptions(solver=ss.Jacobi), "solver"),
-        ("the name of a solver", lambda: ss.SolveOptions(solver="jacobi"), "solver"),
-        ("a gradient of a list", lambda: ss.SolveOptions(gradient=["exact"]), "gradient"),
-        ("Jacobi, tolerance", lambda: ss.Jacobi(tolerance="0"), "tolerance"),
-        ("GaussSeidel, tolerance NaN", lambda: ss.GaussSeidel(tolerance=NAN), "tolerance"),
-        ("solve, a grid", lambda: ss.solve(GRID, TASK, BEHAVIOR), "model"),
-        ("solve, a backup", lambda: ss.solve(MODEL, TASK, ss.HardMax()), "behavior"),
-        ("solve, a state", lambda: ss.solve(MODEL, 3, BEHAVIOR), "task"),
-        ("check_proper, actions", lambda: ss.check_proper(TASK, BEHAVIOR, "4"), "actions"),
-        ("log_likelihood of another world", lambda: ss.log_likelihood(OTHER_MODEL, DEMOS, BEHAVIOR), "demonstrations"),
-        ("log_likelihood of walks", lambda: ss.log_likelihood(MODEL, WALKS, BEHAVIOR), "demonstrations"),
-        ("log_likelihood of a misspelled term", lambda: ss.log_likelihood(MODEL, DEMOS, BEHAVIOR, terms=("action",)), "terms"),
-        ("log_policies of another world", lambda: ss.log_policies(OTHER_MODEL, DEMOS, BEHAVIOR), "demonstrations"),
-    ]),
-    *labeled("planning", [
-        ("plan of two tasks", lambda: ss.plan(MODEL, ss.stack_tasks([TASK, TASK])), "task"),
-        ("plan of a grid", lambda: ss.plan(GRID, TASK), "model"),
-        ("plan of a goal", lambda: ss.plan(MODEL, 3), "task"),
-        ("plan with a backup", lambda: ss.plan(MODEL, TASK, ss.HardMax()), "behavior"),
-        ("roll_out, another policy", lambda: ss.roll_out(KEY, MODEL, jnp.ones((3, 4)), TASK.terminal, jnp.array([0]), 3), "policy"),
-        ("roll_out, no distribution", lambda: ss.roll_out(KEY, MODEL, 2 * POLICY, TASK.terminal, jnp.array([0]), 3), "policy"),
-        ("roll_out, a state that is not there", lambda: ss.roll_out(KEY, MODEL, POLICY, TASK.terminal, jnp.array([99]), 3), "starts"),
-        ("roll_out, moves", lambda: ss.roll_out(KEY, MODEL, POLICY, TASK.terminal, jnp.array([0]), 2.5), "max_moves"),
-        ("roll_out, a seed", lambda: ss.roll_out(0, MODEL, POLICY, TASK.terminal, jnp.array([0]), 3), "key"),
-        ("simulate, a state that is not there", lambda: ss.simulate(KEY, MODEL, [TASK], [np.array([999])]), "starts"),
-        ("simulate, fractions", lambda: ss.simulate(KEY, MODEL, [TASK], [np.array([0.5])]), "starts"),
-        ("simulate, a seed", lambda: ss.simulate(0, MODEL, [TASK], [np.array([0])]), "key"),
-        ("simulate, too few starts", lambda: ss.simulate(KEY, MODEL, [TASK], []), "starts"),
-        ("simulate, one task without a list", lambda: ss.simulate(KEY, MODEL, TASK, [np.array([0])]), "tasks"),
-        ("simulate, moves", lambda: ss.simulate(KEY, MODEL, [TASK], [np.array([0])], max_moves=-1), "max_moves"),
-    ]),
-    *labeled("behavior_model", [
-        ("no person", lambda: ss.behavior_model(BEHAVIOR, person=np.array([], int)), "person"),
-        ("persons by name", lambda: ss.behavior_model(BEHAVIOR, person=["anna"]), "person"),
-        ("features of other states", lambda: ss.fit(MODEL, DEMOS, ss.behavior_model(BEHAVIOR, features=np.zeros((7, 4, 1))), optimizer=ss.LBFGS(max_iterations=2)), "features"),
-        ("features of two axes", lambda: ss.behavior_model(BEHAVIOR, features=np.zeros((7, 4))), "features"),
-        ("weights of other features", lambda: ss.behavior_model(BEHAVIOR, features=np.zeros((1, 4, 1)), reward_weights=[1.0, 2.0]), "reward_weights"),
-        ("one name without a tuple", lambda: ss.behavior_model(BEHAVIOR, "beta"), "learn"),
-        ("a discount of text", lambda: ss.behavior_model(BEHAVIOR, ("discount",), discount="0.9"), "discount"),
-        ("a backup", lambda: ss.behavior_model(ss.HardMax()), "behavior"),
-    ]),
     *labeled("from_gymnasium", [
         ("no state", lambda: ss.from_gymnasium(table({})), "state"),
         ("a state that is missing", lambda: ss.from_gymnasium(table({0: LOOP, 2: LOOP})), "state"),
@@ -153,18 +41,3 @@ LATER = [
         ("a lattice upside down", lambda: Lattice(jnp.ones(2), jnp.zeros(2), (5, 5)), "high"),
     ]),
 ]  # fmt: skip
-
-
-RIGHT_LATER = {
-    "graph of a list": lambda: ss.graph([[[0]]]).states == 1,
-    "road_network of lists": lambda: ss.road_network([[0, 1]], [1.0, 1.0]).graph.states == 2,
-    "road_network of integers": lambda: ss.road_network([[0, 1]], [1, 2], 0).parameters.shape == (2,),
-    "TiedModel of a list": lambda: ss.TiedModel(GRAPH, [[[-1, 0]], [[-1, 0]]], [0]).parameters.tolist() == [0],
-    "TabularModel of lists": lambda: ss.TabularModel(GRAPH, [[[0, 0]], [[0, 0]]]).parameters.shape == (2, 1, 2),
-    "Behavior of integers": lambda: ss.Behavior(ss.BoltzmannAverage(), 5, 0).beta == 5,
-    "task of lists": lambda: ss.task([0, 1], 1, [False, True]).terminal.tolist() == [False, True],
-    "reach of NumPy's numbers": lambda: ss.reach(GRID, np.int8(3), discount=1, step_cost=np.int64(1)).discount == 1,
-    "simulate from a list": lambda: len(ss.simulate(KEY, MODEL, (TASK,), [[0]], BEHAVIOR)) == 1,
-    "behavior_model of a list": lambda: len(ss.behavior_model(BEHAVIOR, person=[0, 1]).person) == 2,
-}
-"""Calls that must work then."""

@@ -97,6 +97,7 @@ def _(model: SlipperyGrid) -> Barriers:
 def _(model: TiedModel) -> Barriers:
     index, successors = np.asarray(model.index), np.asarray(model.graph.successors)
     states = np.arange(len(index))[:, None]
+    check(not np.asarray(model.fixed).any(), "expected fixed logits of 0, found others", field="model")
     message = "expected outcomes of a `walled_grid` or `road_network`, a move and staying, found others"
     check(index.shape[-1] == 2 and (successors[..., 1] == states).all(), message, field="model")
     move, stay = index[..., 0], index[..., 1]

@@ -8,9 +8,12 @@ import abc
 from typing import TypeVar
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sidestep._typing import FloatTree
+from sidestep.errors import check
 from sidestep.tabular.graph import Graph
 
 _Model = TypeVar("_Model", bound="TransitionModel")
@@ -41,6 +44,11 @@ class TransitionModel(eqx.Module):
         """Return the same model with other parameters.
 
         Args:
-            parameters: θ, of the same structure.
+            parameters: θ, of the same structure and shapes.
+
+        Raises:
+            InputError: For another structure or other shapes.
         """
+        own, shapes = (jax.tree.map(jnp.shape, each) for each in (self.parameters, parameters))
+        check(own == shapes, f"expected parameters of shapes {own}, found {shapes}", field="parameters")
         return eqx.tree_at(lambda model: model.parameters, self, parameters)

@@ -4,21 +4,26 @@ Every outcome k of action a in state s has a logit, and its probability is the s
 
     T_θ(s, a, s′_k) = exp l(s, a, k) / Σ_j exp l(s, a, j).
 
-In a `TabularModel` each l is a parameter of its own. In a `TiedModel` l(s, a, k) = θ[index(s, a, k)]: outcomes with the
-same index share a parameter, so that observations in one place inform all others. An outcome that is not learned has
-l = 0; the other one of two then has probability σ(θ).
+In a `TabularModel` each l is a parameter of its own; the outcomes of *known* actions are not learned. In a `TiedModel`
+l(s, a, k) = θ[index(s, a, k)]: outcomes with the same index share a parameter, so that observations in one place inform
+all others. An outcome that is not learned has a fixed logit, 0 by default; the other one of two then has probability
+σ(θ).
 
 The index decides what is shared: the rule that a color stands for, whether a machine enters a terrain, the slip of a
 whole lake, the wall between two cells, a closed link of a road network.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
-from sidestep.errors import check
+from sidestep._arguments import to_finite, to_floats, to_integers, to_logits, to_mask
+from sidestep.errors import InputError, check, check_instance
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.models.base import TransitionModel
@@ -27,7 +32,7 @@ Logits = Float[Array | np.ndarray, "..."] | float
 """Logits of a model: one number for all of them, or one for each."""
 
 FIXED, IMPOSSIBLE = -1, -2
-"""Entries of an index: an outcome with a logit of 0 that is not learned, and an impossible outcome."""
+"""Entries of an index: an outcome with a fixed logit, which is not learned, and an impossible outcome."""
 
 
 def logit_array(logits: Logits, shape: tuple[int, ...]) -> Float[Array, "..."]:
@@ -46,7 +51,8 @@ def logit_array(logits: Logits, shape: tuple[int, ...]) -> Float[Array, "..."]:
 
 
 def _check_each_action_has_an_outcome(possible: Bool[np.ndarray, "states actions outcomes"], field: str) -> None:
-    check(possible.any(axis=-1).all(), "expected a possible outcome for every state and action", field=field)
+    without = np.argwhere(~possible.any(axis=-1))[:1].tolist()
+    check(not without, f"expected a possible outcome of every action, found none at {without}", field=field)
 
 
 class TabularModel(TransitionModel):
@@ -54,36 +60,98 @@ class TabularModel(TransitionModel):
 
     Attributes:
         graph: The states that each action can lead to.
-        parameters: Logits; the probabilities are their softmax over outcomes.
+        parameters: Logits; the probabilities are their softmax over outcomes. Where some actions are known, those of
+            the others only, one row for each, in the order of states and actions.
         possible: Whether each outcome can happen; the others have probability 0.
+        known: Whether the probabilities of an action are known, and so not learned; None where none are.
+        fixed: The logits of all outcomes where some are known; those of known actions count.
 
     Example:
         >>> from sidestep.tabular.graph import graph
-        >>> TabularModel(graph(np.array([[[0, 1]], [[1, 0]]])), jnp.zeros((2, 1, 2))).probabilities()[0, 0].tolist()
+        >>> TabularModel(graph([[[0, 1]], [[1, 0]]]), jnp.zeros((2, 1, 2))).probabilities()[0, 0].tolist()
         [0.5, 0.5]
+        >>> TabularModel(graph([[[0, 1]], [[1, 0]]]), jnp.zeros((2, 1, 2)), known=[[True], [False]]).parameters.shape
+        (1, 2)
     """
 
     graph: Graph
-    parameters: Float[Array, "states actions outcomes"]
+    parameters: Float[Array, "states actions outcomes"] | Float[Array, "learned outcomes"]
     possible: Bool[Array, "states actions outcomes"]
+    known: Bool[Array, "states actions"] | None
+    fixed: Float[Array, "states actions outcomes"] | None
 
     def __init__(
         self,
         graph: Graph,
-        logits: Float[Array, "states actions outcomes"],
-        possible: Bool[Array, "states actions outcomes"] | None = None,
+        logits: Shaped[ArrayLike, "..."] | Sequence[Any],
+        possible: Shaped[ArrayLike, "..."] | Sequence[Any] | None = None,
+        known: Shaped[ArrayLike, "..."] | Sequence[Any] | None = None,
     ):
-        """Raise `InputError` for shapes that differ from the graph's or an action without a possible outcome."""
-        self.graph, self.parameters = graph, logits
-        self.possible = to_jax(np.ones(logits.shape, dtype=bool)) if possible is None else possible
-        same_shapes = logits.shape == self.possible.shape == graph.successors.shape
-        check(same_shapes, f"expected the graph's shape {graph.successors.shape}", field="logits, possible")
-        if not isinstance(self.possible, Tracer):
-            _check_each_action_has_an_outcome(np.asarray(self.possible), "possible")
+        """Make a model with logits and masks of the graph's shape.
+
+        Raises:
+            InputError: For other shapes and types, NaN, and an action without a possible outcome.
+        """
+        check_instance(graph, Graph, "graph")
+        shape = tuple(graph.successors.shape)
+        mask = np.ones(shape, bool) if possible is None else to_mask(possible, "possible", shape)
+        if not isinstance(mask, Tracer):
+            _check_each_action_has_an_outcome(np.asarray(mask), "possible")
+        self.graph, self.possible = graph, to_jax(mask)
+        own = to_floats(logits, "logits", shape)
+        if not isinstance(own, Tracer):
+            missing = np.argwhere(np.isnan(np.asarray(own)))[:1].tolist()
+            check(not missing, f"expected numbers, found nan at {missing}", field="logits")
+        every = logit_array(own, shape)
+        if known is None:
+            self.parameters, self.known, self.fixed = every, None, None
+        else:
+            rows = np.asarray(to_mask(known, "known", shape[:2]))
+            self.parameters, self.known, self.fixed = every[~rows], to_jax(rows), every
 
     def probabilities(self) -> Float[Array, "states actions outcomes"]:
         """Return the softmax of the logits over the possible outcomes."""
-        return jax.nn.softmax(jnp.where(self.possible, self.parameters, -jnp.inf), axis=-1)
+        logits = self.parameters
+        if self.known is not None and self.fixed is not None:
+            # the number of each learned action among them
+            row = jnp.cumsum(~self.known.ravel()).reshape(self.known.shape) - 1
+            learned = logits[row] if len(logits) else self.fixed
+            logits = jnp.where(self.known[..., None], self.fixed, learned)
+        return jax.nn.softmax(jnp.where(self.possible, logits, -jnp.inf), axis=-1)
+
+
+def tabular_model(
+    world: Graph,
+    probabilities: Shaped[ArrayLike, "..."] | Sequence[Any],
+    known: Shaped[ArrayLike, "..."] | Sequence[Any] | bool = False,
+) -> TabularModel:
+    """Return a model with these probabilities of outcomes.
+
+    Args:
+        world: The graph.
+        probabilities: T(s, a, s′ₖ) of each outcome k of the graph; outcomes with 0 are impossible, also for a fit.
+        known: Whether each action's probabilities are known, and so not learned; one boolean for all. With True there
+            is nothing to learn but the behavior.
+
+    Raises:
+        InputError: For another shape, numbers below 0, and rows that do not sum to one.
+
+    Example:
+        >>> from sidestep.tabular.graph import graph
+        >>> model = tabular_model(graph([[[0, 1]], [[1, 0]]]), [[[0.25, 0.75]], [[1.0, 0.0]]], known=True)
+        >>> model.probabilities().tolist(), model.parameters.shape
+        ([[[0.25, 0.75]], [[1.0, 0.0]]], (0, 2))
+    """
+    check_instance(world, Graph, "world")
+    shape = tuple(world.successors.shape)
+    table = np.asarray(to_finite(probabilities, "probabilities", shape, least=0))
+    wrong = np.argwhere(~np.isclose(table.sum(axis=-1), 1, rtol=0, atol=1e-6))[:1]
+    for state, action in wrong.tolist():
+        message = f"expected a sum of 1 for action {action} of state {state}, found {table[state, action].sum():g}"
+        raise InputError(message, field="probabilities")
+    mask = np.full(shape[:2], known) if isinstance(known, bool) else known
+    logits = np.log(np.where(table > 0, table, 1))
+    return TabularModel(world, logits, table > 0, known=None if known is False else mask)
 
 
 class TiedModel(TransitionModel):
@@ -92,11 +160,13 @@ class TiedModel(TransitionModel):
     Attributes:
         graph: The states that each action can lead to.
         parameters: θ, one logit for each index.
-        index: The index of each outcome's logit; `FIXED` for a logit of 0, `IMPOSSIBLE` for an impossible outcome.
+        index: The index of each outcome's logit; `FIXED` for a logit that is not learned, `IMPOSSIBLE` for an
+            impossible outcome.
+        fixed: The logits of fixed outcomes; an axis of length 1 holds for all.
 
     Example:
         >>> from sidestep.tabular.graph import graph
-        >>> slippery = TiedModel(graph(np.array([[[0, 1]], [[1, 0]]])), np.array([[[FIXED, 0]], [[FIXED, 0]]]))
+        >>> slippery = TiedModel(graph([[[0, 1]], [[1, 0]]]), [[[FIXED, 0]], [[FIXED, 0]]])
         >>> slippery.probabilities()[:, 0, 1].tolist()  # both by the same logit, 0
         [0.5, 0.5]
     """
@@ -104,25 +174,36 @@ class TiedModel(TransitionModel):
     graph: Graph
     parameters: Float[Array, " logits"]
     index: Int[Array, "states actions outcomes"]
+    fixed: Float[Array, "#states #actions #outcomes"]
 
-    def __init__(self, graph: Graph, index: Int[Array | np.ndarray, "states actions outcomes"], logits: Logits = 0.0):
-        """Make a model with logits: one number for all, or one for each index.
+    def __init__(
+        self,
+        graph: Graph,
+        index: Shaped[ArrayLike, "..."] | Sequence[Any],
+        logits: Shaped[ArrayLike, "..."] | Sequence[float] = 0.0,
+        fixed: Shaped[ArrayLike, "..."] | Sequence[Any] = 0.0,
+    ):
+        """Make a model with logits: one number for all, or one for each index; and likewise those that are fixed.
 
         Raises:
-            InputError: For an index of another shape than the graph's, below `IMPOSSIBLE` or beyond the logits, and
-                for an action without a possible outcome.
+            InputError: For an index of another shape than the graph's, below `IMPOSSIBLE` or beyond the logits, NaN,
+                and for an action without a possible outcome.
         """
-        same_shape = index.shape == graph.successors.shape
-        check(same_shape, f"expected the graph's shape {graph.successors.shape}, found {index.shape}", field="index")
-        index = np.asarray(index)
-        count = max(int(index.max(initial=FIXED)) + 1, 0)
-        parameters = logit_array(logits, np.shape(logits) or (count,))
-        in_range = index.min() >= IMPOSSIBLE and count <= len(parameters)
-        check(in_range, f"expected {IMPOSSIBLE}…{len(parameters) - 1}", field="index")
-        _check_each_action_has_an_outcome(index != IMPOSSIBLE, "index")
-        self.graph, self.parameters, self.index = graph, parameters, to_jax(index, np.int32)
+        check_instance(graph, Graph, "graph")
+        shape = tuple(graph.successors.shape)
+        numbers = np.asarray(to_integers(index, "index", shape, least=IMPOSSIBLE))
+        count = max(int(numbers.max(initial=FIXED)) + 1, 0)
+        own = logits if isinstance(logits, Tracer) else to_floats(logits, "logits", (), ("logits",))
+        parameters = logit_array(to_logits(own, max(count, *np.shape(own), 0)), np.shape(own) or (count,))
+        message = f"expected {IMPOSSIBLE}…{len(parameters) - 1}, found {count - 1}"
+        check(count <= len(parameters), message, field="index")
+        _check_each_action_has_an_outcome(numbers != IMPOSSIBLE, "index")
+        constants = np.asarray(to_finite(fixed, "fixed", (), shape))
+        self.graph, self.parameters, self.index = graph, parameters, to_jax(numbers, np.int32)
+        self.fixed = to_jax(constants.reshape(constants.shape or (1, 1, 1)), jnp.result_type(float))
 
     def probabilities(self) -> Float[Array, "states actions outcomes"]:
         """Return the softmax of the shared logits over the possible outcomes."""
-        learned = jnp.where(self.index >= 0, self.parameters[jnp.maximum(self.index, 0)], 0.0)
+        fixed = self.fixed.astype(self.parameters.dtype)
+        learned = jnp.where(self.index >= 0, self.parameters[jnp.maximum(self.index, 0)], fixed)
         return jax.nn.softmax(jnp.where(self.index == IMPOSSIBLE, -jnp.inf, learned), axis=-1)

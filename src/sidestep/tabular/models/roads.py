@@ -5,20 +5,24 @@ agent stays on l. Links have different numbers of turns; a missing turn is an ac
 without any turn has one action, which stays there and is as long as all links together.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Shaped
 
-from sidestep.errors import check
+from sidestep._arguments import to_finite, to_integers, to_logits
+from sidestep.errors import check, check_instance
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph, with_available
-from sidestep.tabular.models.categorical import FIXED, IMPOSSIBLE, Logits, TiedModel, logit_array
+from sidestep.tabular.models.categorical import FIXED, IMPOSSIBLE, TiedModel, logit_array
 
 
 def road_network(
-    turns: Int[np.ndarray, "turns 2"],
-    lengths: Float[np.ndarray, " links"],
-    logits: Logits = -2.0,
+    turns: Shaped[ArrayLike, "..."] | Sequence[Any],
+    lengths: Shaped[ArrayLike, "..."] | Sequence[float],
+    logits: Shaped[ArrayLike, "..."] | Sequence[float] = -2.0,
     *,
     by_turn: bool = False,
 ) -> TiedModel:
@@ -41,28 +45,28 @@ def road_network(
         >>> road_network(np.array([[0, 1], [1, 0]]), np.ones(2)).graph.states
         2
     """
-    links = len(lengths)
-    check(np.isfinite(lengths).all() and (lengths > 0).all(), "expected finite numbers above 0", field="lengths")
-    between_links = len(turns) and turns.min() >= 0 and turns.max() < links
-    different = between_links and len(np.unique(turns, axis=0)) == len(turns)
-    check(different, f"expected different turns between links 0…{links - 1}", field="turns")
-    order = np.argsort(turns[:, 0], kind="stable")
-    begin, onto = turns[order].T
+    sizes = np.asarray(to_finite(lengths, "lengths", ("links",), above=0))
+    links = len(sizes)
+    pairs = np.asarray(to_integers(turns, "turns", ("turns", 2), least=0, most=links - 1, what="links"))
+    message = f"expected at least one turn, and each once, found {len(pairs)} turns"
+    check(len(pairs) and len(np.unique(pairs, axis=0)) == len(pairs), message, field="turns")
+    order = np.argsort(pairs[:, 0], kind="stable")
+    begin, onto = pairs[order].T
     first = np.searchsorted(begin, begin)
-    action = np.arange(len(turns)) - first
+    action = np.arange(len(pairs)) - first
     successors = np.repeat(np.arange(links), (action.max() + 1) * 2).reshape(links, -1, 2)
     successors[begin, action, 0] = onto
     index = np.full(successors.shape, IMPOSSIBLE)
     index[..., 1] = FIXED
     index[begin, action, 0] = FIXED
     index[begin, action, 1] = order if by_turn else onto
-    costs, available = np.full(successors.shape[:2], lengths.sum()), np.zeros(successors.shape[:2], bool)
-    costs[begin, action] = lengths[onto]
+    costs, available = np.full(successors.shape[:2], sizes.sum()), np.zeros(successors.shape[:2], bool)
+    costs[begin, action] = sizes[onto]
     available[begin, action] = True
     available[~available.any(axis=1), 0] = True
     graph = with_available(Graph(to_jax(successors, np.int32), to_jax(costs)), available)
-    count = len(turns) if by_turn else links
-    return TiedModel(graph, index, logit_array(logits, (count,)))
+    count = len(pairs) if by_turn else links
+    return TiedModel(graph, index, logit_array(to_logits(logits, count), (count,)))
 
 
 def closed(model: TiedModel) -> Float[Array, " logits"]:
@@ -78,4 +82,5 @@ def closed(model: TiedModel) -> Float[Array, " logits"]:
         >>> closed(road_network(np.array([[0, 1], [1, 0]]), np.ones(2), logits=0.0)).tolist()
         [0.5, 0.5]
     """
+    check_instance(model, TiedModel, "model")
     return jax.nn.sigmoid(model.parameters)

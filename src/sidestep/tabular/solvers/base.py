@@ -51,6 +51,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Scalar
 
+from sidestep._arguments import to_finite
+from sidestep.errors import to_count
 from sidestep.tabular.backups import Backup, Gradient
 
 Beta = Float[Scalar, ""]
@@ -211,6 +213,12 @@ class Solver(eqx.Module):
 
     tolerance: eqx.AbstractVar[Tolerance]
     max_sweeps: eqx.AbstractVar[int]
+
+    def check_settings(self) -> None:
+        """Raise `InputError` for a tolerance or a number of sweeps below 0."""
+        if self.tolerance is not None:
+            to_finite(self.tolerance, "tolerance", (), least=0)
+        to_count(self.max_sweeps, "max_sweeps", 0)
 
     @abc.abstractmethod
     def cold_start(self, states: int, dtype: jnp.dtype) -> WarmStart:

@@ -67,6 +67,9 @@ class GaussSeidel(base.Solver):
     max_sweeps: int = eqx.field(default=5_000, static=True)
     max_region_sweeps: int = eqx.field(default=100, static=True)
 
+    def __check_init__(self) -> None:
+        self.check_settings()
+
     def cold_start(self, states: int, dtype: jnp.dtype) -> WarmStart:
         """Return a start without values, adjoint and order."""
         return WarmStart(jnp.full(states, -jnp.inf, dtype), jnp.zeros(states, dtype), _no_order(states))

@@ -67,6 +67,9 @@ class Jacobi(base.Solver):
     tolerance: base.Tolerance = None
     max_sweeps: int = eqx.field(default=20_000, static=True)
 
+    def __check_init__(self) -> None:
+        self.check_settings()
+
     def cold_start(self, states: int, dtype: jnp.dtype) -> WarmStart:
         """Return a start without values and adjoint; an order is not used."""
         values, adjoint = np.full(states, -np.inf, dtype), np.zeros(states, dtype)
