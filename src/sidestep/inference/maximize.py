@@ -113,6 +113,8 @@ class Maximum(NamedTuple):
 _REUSE = 2e-5
 """The largest change of all contributions together that an approximate evaluation reuses (a fraction of the objective).
 """
+_ROUNDING = 64
+"""The error of the objective by rounding, in units of its last digit."""
 _PARTIAL = 0.01
 """The largest change of a contribution, as a fraction of it, for which only the states that mattered are solved."""
 
@@ -150,7 +152,7 @@ def maximize(
         x, state, history = evaluator.load(saver, x, state)
     while True:
         point = evaluator.evaluate(x)
-        progress = Progress(len(history), *point.terms.tolist(), gradient=float(np.abs(point.gradient).max()))
+        progress = Progress(len(history), *point.terms.tolist(), gradient=float(np.abs(point.gradient).max(initial=0.0)))
         if progress.iteration == 0:
             _check_start(objective.problem, progress, evaluator.solves)
         if not np.isfinite(progress).all():
@@ -177,8 +179,11 @@ def maximize(
         elif evaluator.tighten():
             history.pop()
         else:
+            measure, limit = optimizer.measure.format(optimizer.convergence(point.gradient, state)), evaluator.resolution
+            if status is None and optimizer.expected_gain(x, point.gradient, state) <= limit:
+                status = Status.CONVERGED
+                measure += f", and what is left to gain is below the precision of the objective, {limit:.1g} nats"
             status = status or (Status.NO_ASCENT_STEP if x.dtype == np.float64 else Status.PRECISION_LIMIT)
-            measure = optimizer.measure.format(optimizer.convergence(point.gradient, state))
             message = "; ".join(filter(None, (f"{status.value}: {measure}", status.advice)))
             return Maximum(evaluator.parameters(x), tuple(history), status, message, evaluator.solves_at(x))
 
@@ -219,6 +224,13 @@ class _Evaluator:
         self.solves: list[SolveSummary] = []
         self.contributions: list[Contribution] = []
         self.scale = 0.0
+
+    @property
+    def resolution(self) -> float:
+        """Return the smallest change of the objective that its numbers and the tolerance of the solves resolve."""
+        problem = self.objective.problem
+        dtype = jax.eval_shape(problem.model.probabilities).dtype
+        return max(float(problem.solver.tolerance_for(dtype)), _ROUNDING * float(np.finfo(dtype).eps)) * self.scale
 
     def parameters(self, x: Vector) -> Parameters:
         return jax.device_put(self.unravel(x))

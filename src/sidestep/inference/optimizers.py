@@ -102,7 +102,21 @@ class Optimizer(eqx.Module):
             state: The present state.
         """
         del state
-        return float(np.abs(gradient).max())
+        return float(np.abs(gradient).max(initial=0.0))
+
+    def expected_gain(self, x: Vector, gradient: Vector, state: Tree) -> float:
+        """Return how much lower the least loss is than that at x, as far as the optimizer knows its curvature.
+
+        Args:
+            x: The present point.
+            gradient: The gradient of the loss there.
+            state: The present state.
+
+        Returns:
+            Nats; infinite where the optimizer knows no curvature.
+        """
+        del x, gradient, state
+        return float("inf")
 
     def terminate(self, gradient: Vector, state: Tree) -> bool:
         """Return whether the optimizer has converged at a point with this gradient.
@@ -154,6 +168,12 @@ class LBFGS(Optimizer):
             if best is not None:
                 return best, updated
         return None
+
+
+    def expected_gain(self, x: Vector, gradient: Vector, state: Tree) -> float:
+        """Return the gain of a Newton step with the estimated curvature, half its first-order gain."""
+        direction, _ = _lbfgs_direction(self.memory_size, gradient, state, x)
+        return float(np.asarray(direction, np.float64) @ np.asarray(gradient, np.float64)) / 2
 
 
 class Adam(Optimizer):
