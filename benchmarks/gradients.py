@@ -62,8 +62,8 @@ from benchmarks.scaling import Problem, World, draw, take
 from sidestep.errors import NotConverged
 from sidestep.tabular.forward_gradients import forward_gradient
 from sidestep.tabular.models import TabularModel
-from sidestep.tabular.solve import SolveOptions, solve
-from sidestep.tabular.solvers.base import DecisionProcess, action_values, at_fixed_policy
+from sidestep.tabular.solve import SolveOptions, decision_process, solve
+from sidestep.tabular.solvers.base import DecisionProcess, advantages, at_fixed_policy
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 
 __all__ = ["Options", "draw", "measure", "show"]
@@ -110,8 +110,7 @@ def problem_of(world: World, model: str, backup: str, options: Options) -> Probl
 def process_of(problem: Problem, parameters: Array) -> DecisionProcess:
     """Return the one task under the model at some parameters."""
     model, task = problem.model.with_parameters(parameters), jax.tree.map(lambda x: x[0], problem.demonstrations.tasks)
-    inputs = (task.reward, task.terminal_reward, task.terminal, task.discount)
-    return DecisionProcess(model.graph.successors, model.probabilities(), *inputs)
+    return decision_process(model, model.probabilities(), task)
 
 
 def one_backup(problem: Problem, parameters: Array, values: Array) -> Array:
@@ -120,7 +119,9 @@ def one_backup(problem: Problem, parameters: Array, values: Array) -> Array:
     q = process.action_values(values)
     if problem.solving.gradient == "exact":
         return process.with_terminal_rewards(behavior.backup.value(q, behavior.beta))
-    return process.with_terminal_rewards(at_fixed_policy(behavior.backup, behavior.beta, q))
+    return process.with_terminal_rewards(
+        at_fixed_policy(behavior.backup, behavior.beta, q, process.available_actions())
+    )
 
 
 def log_likelihood(problem: Problem, parameters: Array, values: Array) -> Array:
@@ -128,7 +129,8 @@ def log_likelihood(problem: Problem, parameters: Array, values: Array) -> Array:
     model, demos = problem.model.with_parameters(parameters), problem.demonstrations
     states, task = demos.states, jax.tree.map(lambda leaf: leaf[0], demos.tasks)
     after = values[model.graph.successors[states]]
-    q = action_values(values[states], after, model.probabilities()[states], task.reward, task.discount)
+    rest = task.reward, model.graph.available, task.discount
+    q = advantages(values[states], after, model.probabilities()[states], *rest)
     return jnp.sum(jnp.take_along_axis(problem.behavior.log_policy(q), demos.actions[:, None], axis=-1))
 
 

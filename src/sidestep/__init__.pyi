@@ -64,12 +64,8 @@ from .tabular.likelihood import (
     log_likelihood as log_likelihood,
     log_policies as log_policies,
 )
-from .tabular.solve import (
-    Solution as Solution,
-    SolveOptions as SolveOptions,
-    check_proper as check_proper,
-    solve as solve,
-)
+from .tabular.proper import check_proper as check_proper
+from .tabular.solve import Solution as Solution, SolveOptions as SolveOptions, solve as solve
 from .tabular.solvers.gauss_seidel import GaussSeidel as GaussSeidel
 from .tabular.solvers.jacobi import Jacobi as Jacobi
 

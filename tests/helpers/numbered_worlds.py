@@ -20,6 +20,7 @@ def some_map(rows: int = 20, columns: int = 21, seed: int = 0) -> ObstacleGrid:
 def host_process(model: TransitionModel, task: Task) -> HostProcess:
     """A task under a model, as NumPy arrays."""
     arrays = (model.graph.successors, model.probabilities(), task.reward, task.terminal_reward, task.terminal)
+    arrays = (*arrays, model.graph.available)
     return HostProcess(*map(np.asarray, arrays), discount=np.float64(task.discount))
 
 
@@ -32,4 +33,4 @@ def numbered_process(model: TransitionModel, task: Task, order: Int[np.ndarray, 
     """A task under a model as the sweeps read it, its states numbered in an order."""
     position = inverse_permutation(order)
     assert position is not None
-    return number_process(host_process(model, task), order, position)[0]
+    return number_process(host_process(model, task), order, position, np.ones(len(order), bool))[0]

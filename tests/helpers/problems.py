@@ -50,30 +50,39 @@ def solve_with(solver: Solver, model: TransitionModel, task: Task, behavior: Beh
 
 
 NAMES = list(BACKUPS)
+EVERYTHING = jnp.ones((1, 1), bool)  # all actions are available
 
 
-def plain_policy(q, beta):
-    """π ∝ exp βQ."""
-    odds = jnp.exp(beta * (q - jax.lax.stop_gradient(q.max(axis=-1, keepdims=True))))
+def plain_policy(q, beta, available=EVERYTHING):
+    """π ∝ exp βQ over the available actions."""
+    odds = plain_odds(q, beta, available)
     return odds / odds.sum(axis=-1, keepdims=True)
 
 
-def plain_backup(name, q, beta):
+def plain_odds(q, beta, available=EVERYTHING):
+    """The odds exp β(Q − max Q) of the available actions, 0 for the others."""
+    best = jax.lax.stop_gradient(jnp.where(available, q, -jnp.inf).max(axis=-1, keepdims=True))
+    return jnp.where(available, jnp.exp(beta * jnp.where(available, q - best, 0)), 0)
+
+
+def plain_backup(name, q, beta, available=EVERYTHING):
     """V = B(Q), from the table in DESIGN section 1; `name` may be a traced index into `NAMES`."""
-    best = jax.lax.stop_gradient(q.max(axis=-1))
-    total = jnp.exp(beta * (q - best[..., None])).sum(axis=-1)
+    count = jnp.broadcast_to(available, q.shape).sum(axis=-1)
+    masked = jnp.where(available, q, -jnp.inf)
+    best = jax.lax.stop_gradient(masked.max(axis=-1))
+    total = plain_odds(q, beta, available).sum(axis=-1)
     values = {
         # not `max`, which has no gradient where a compiler rounds its argument twice and none equals the best
-        "hard max": jnp.take_along_axis(q, q.argmax(axis=-1)[..., None], axis=-1)[..., 0],
-        "Boltzmann": (plain_policy(q, beta) * q).sum(axis=-1),
+        "hard max": jnp.take_along_axis(q, masked.argmax(axis=-1)[..., None], axis=-1)[..., 0],
+        "Boltzmann": (plain_policy(q, beta, available) * q).sum(axis=-1),
         "log-sum-exp": best + jnp.log(total) / beta,
-        "mellowmax": best + jnp.log(total / q.shape[-1]) / beta,
+        "mellowmax": best + jnp.log(total / count) / beta,
     }
     return values[name] if isinstance(name, str) else jnp.stack([values[each] for each in NAMES])[name]
 
 
-def plain_values(name, transitions, task: Task, beta, sweeps: int):
-    """(V, Q) after some sweeps of value iteration from 0, differentiable through every sweep."""
+def plain_values(name, transitions, task: Task, beta, sweeps: int, available=EVERYTHING):
+    """(V, Q) of acting `sweeps` times, by value iteration from 0, differentiable through every sweep."""
 
     def q_of(values):
         return task.reward + task.discount * jnp.einsum("sat,t->sa", transitions, values)
@@ -82,10 +91,11 @@ def plain_values(name, transitions, task: Task, beta, sweeps: int):
         return jnp.where(task.terminal, task.terminal_reward, values)
 
     def sweep(values, _):
-        return ended(plain_backup(name, q_of(values), beta)), None
+        return ended(plain_backup(name, q_of(values), beta, available)), None
 
-    values, _ = jax.lax.scan(sweep, ended(jnp.zeros(len(transitions))), length=sweeps)
-    return values, q_of(values)
+    after, _ = jax.lax.scan(sweep, ended(jnp.zeros(len(transitions))), length=sweeps - 1)
+    q = q_of(after)
+    return ended(plain_backup(name, q, beta, available)), q
 
 
 def dense_obstacles(theta, rows: int, columns: int, connectivity: int):
@@ -132,6 +142,10 @@ class Problem(NamedTuple):
     @property
     def actions(self) -> int:
         return self.model.graph.actions
+
+    @property
+    def available(self):
+        return self.model.graph.available
 
 
 def obstacle_problem(connectivity, rows=3, columns=4, seed=0) -> Problem:

@@ -45,7 +45,10 @@ def sampled_chains(problem: BarrierProblem, sweeps: int, heat: float = 1.0) -> l
 
 def problem_of(one: BarrierWorld, behavior: BehaviorModel | None = None, **settings: Any) -> BarrierProblem:
     agents = behavior or behavior_model(one.behavior)
-    return barrier_problem(barriers_of(one.model), one.demonstrations, agents, one.prior, **settings)
+    available = one.model.graph.available
+    return barrier_problem(
+        barriers_of(one.model), one.demonstrations, agents, one.prior, available=available, **settings
+    )
 
 
 def values_of(one: BarrierWorld, closed: np.ndarray, behaviors: list[Behavior]) -> np.ndarray:

@@ -174,7 +174,7 @@ def test_behavior_model_of_wrong_arguments_raises():
         ({"person": np.array([0, 2])}, r"'person': expected persons numbered from 0"),
         ({"features": features * np.nan}, r"'features': expected finite numbers"),
         ({"features": features, "reward_weights": np.full(1, np.inf)}, r"'reward_weights': expected 1 finite numbers"),
-        ({"aimed_at": np.full((30, 4), 30)}, r"'aimed_at': expected states 0…29"),
+        ({"aimed_at": np.full((30, 4), 30)}, r"'aimed_at': expected states in 0…29"),
     ]
     for arguments, message in refused:
         with pytest.raises(InputError, match=message):

@@ -160,7 +160,8 @@ def demonstrated(graph: str) -> Demonstrations:
     for task in (0, 1, 1, 0):
         states, actions = [problem.states - 1], []
         while len(actions) < 6 and states[-1] != problem.goal:
-            actions.append(int(rng.integers(problem.actions)))
+            usable = np.broadcast_to(problem.model.graph.available, successors.shape[:2])[states[-1]]
+            actions.append(int(rng.choice(np.flatnonzero(usable))))
             likely = probabilities[states[-1], actions[-1]]
             states.append(int(rng.choice(successors[states[-1], actions[-1]][likely > 0])))
         trajectories.append(Trajectory(np.array(states), np.array(actions), task))
@@ -169,12 +170,12 @@ def demonstrated(graph: str) -> Demonstrations:
 
 def unrolled_log_likelihood(graph: str, sweeps: int):
     """Eqs. 1 and 6, written out plainly."""
-    demos = demonstrated(graph)
+    demos, available = demonstrated(graph), EVERY[graph].available
 
     def total(kind, parameters):
         transitions = EVERY[graph].dense(parameters)
-        q = jax.vmap(lambda task: plain_values(kind, transitions, task, BETA, sweeps)[1])(demos.tasks)
-        log_policy = jnp.log(plain_policy(q, BETA))[demos.task, demos.states, demos.actions]
+        q = jax.vmap(lambda task: plain_values(kind, transitions, task, BETA, sweeps, available)[1])(demos.tasks)
+        log_policy = jnp.log(plain_policy(q, BETA, available)[demos.task, demos.states, demos.actions])
         return jnp.sum(log_policy + jnp.log(transitions[demos.states, demos.actions, demos.next_states]))
 
     return total
@@ -229,7 +230,7 @@ def forward_program(dense, parameters, task: Task, horizon):
     """
     transitions = dense(parameters)
     slope = jax.jacobian(dense)(parameters).reshape(*transitions.shape, -1)
-    start, sweeps = (0, horizon) if horizon else (ENOUGH, ENOUGH)
+    sweeps = horizon or ENOUGH
 
     def d_q_of(values, d_values):
         through_model = slope.transpose(0, 1, 3, 2) @ values
@@ -243,10 +244,13 @@ def forward_program(dense, parameters, task: Task, horizon):
             values = jnp.where(task.terminal, task.terminal_reward, plain_backup(kind, q, BETA))
             return values, jnp.where(task.terminal[:, None], 0, d_values)
 
-        values, _ = plain_values(kind, transitions, task, BETA, start)
-        nothing = jnp.zeros((len(transitions), slope.shape[-1]))
-        values, d_values = jax.lax.fori_loop(0, sweeps, step, (values, nothing))
-        return d_values, d_q_of(values, d_values), task.reward + task.discount * transitions @ values
+        values = jnp.where(task.terminal, task.terminal_reward, 0.0)
+        if not horizon:
+            values, _ = plain_values(kind, transitions, task, BETA, ENOUGH)
+        # Q of an agent that acts n times is by the values of acting n − 1 times
+        after = jax.lax.fori_loop(0, sweeps - 1, step, (values, jnp.zeros((len(transitions), slope.shape[-1]))))
+        d_values = step(0, after)[1]
+        return d_values, d_q_of(*after), task.reward + task.discount * transitions @ after[0]
 
     return jax.vmap(one)(jnp.arange(len(NAMES)))
 

@@ -60,16 +60,26 @@ def test_log_likelihood_of_a_corridor_equals_the_value_by_hand(terms, actions, t
     assert float(likelihood.total) == pytest.approx(actions + transitions, rel=1e-9)
 
 
-def test_log_likelihood_at_horizon_1_equals_the_value_by_hand():
-    """Horizon 1: V = 0 at 0, v = γ(1−p) at 1 and 1 at the goal; Q looks one action further."""
+def corridor_actions_of(horizon: int) -> float:
+    return float(corridor_likelihood(terms=("actions",), options=SolveOptions(horizon=horizon)).actions)
+
+
+def test_log_likelihood_at_horizon_1_is_that_of_myopic_agents():
+    """One action ahead there is only the goal, beside state 1; from state 0 all four actions are worth nothing."""
+    right, left, stay = 0.5 * 3 / 4, 0.0, 0.0
+    at_1 = np.log(2 * np.exp(BETA * stay) + np.exp(BETA * left) + np.exp(BETA * right))
+    assert corridor_actions_of(1) == pytest.approx(BETA * right - at_1 - 3 * np.log(4), rel=1e-12)
+
+
+def test_log_likelihood_at_horizon_2_equals_the_value_by_hand():
+    """After one action the values are 0 at 0, v = γ(1−p) at 1 and 1 at the goal; Q looks one action further."""
     v = 0.5 * 3 / 4
     right, stay = 0.5 * v * 3 / 4, 0.0
     at_0 = np.log(3 * np.exp(BETA * stay) + np.exp(BETA * right))
     stay_1, left_1, right_1 = 0.5 * v, 0.5 * v / 4, 0.5 * (3 / 4 + v / 4)
     at_1 = np.log(2 * np.exp(BETA * stay_1) + np.exp(BETA * left_1) + np.exp(BETA * right_1))
     expected = BETA * (stay + 2 * right + right_1) - 3 * at_0 - at_1
-    likelihood = corridor_likelihood(terms=("actions",), options=SolveOptions(horizon=1))
-    assert float(likelihood.actions) == pytest.approx(expected, rel=1e-12)
+    assert corridor_actions_of(2) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.slow

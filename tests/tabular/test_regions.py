@@ -138,6 +138,7 @@ def test_vjp_with_a_region_above_the_tolerance_is_nan(name):
         wanted.reward,
         wanted.terminal_reward,
         wanted.terminal,
+        problem.model.graph.available,
         wanted.discount,
     )
     error = float(jnp.abs(cost) / jnp.abs(adjoint * values).sum())

@@ -17,12 +17,12 @@ from helpers.problems import BACKUPS, plain_backup, random_problem, solve_jit, s
 from sidestep.errors import ImproperTask, InputError
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.demonstrations import Trajectory, gather
-from sidestep.tabular.graph import graph, walkable_graph
+from sidestep.tabular.graph import graph, grid_graph, walkable_graph
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.likelihood import log_likelihood
 from sidestep.tabular.models import ObstacleGrid, TabularModel, true_model
-from sidestep.tabular.solve import SolveOptions, check_proper, solve
-from sidestep.tabular.solvers.base import neg_inf
+from sidestep.tabular.proper import check_proper
+from sidestep.tabular.solve import SolveOptions, solve
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import Task, reach, stack_tasks, task, with_state_costs
@@ -279,7 +279,7 @@ def test_solve_gradient_without_convergence_is_nan():
 
 @each_backup
 def test_solve_enclosed_cells_at_discount_1_have_no_effect_on_others(name):
-    """Two cells behind known walls are worth about `neg_inf`; the others and the gradient do not notice."""
+    """Two cells behind known walls are worth −∞; the others and the gradient do not notice."""
     known = np.full((4, 5), Cell.UNKNOWN, dtype=np.int64)
     known[:3, 2] = known[2, :3] = Cell.OCCUPIED
     grid = Grid(known, connectivity=8)
@@ -287,7 +287,7 @@ def test_solve_enclosed_cells_at_discount_1_have_no_effect_on_others(name):
     wanted = reach(grid, 19, discount=1.0, step_cost=1.0)
     result = solution_and_gradient(ObstacleGrid(grid), jnp.zeros(grid.size), wanted, agent(name))
     values, slope = np.asarray(result[0].values), np.asarray(result[1])
-    assert (values[enclosed] <= 0.9 * neg_inf(jnp.dtype(jnp.float64))).all()
+    assert np.isneginf(values[enclosed]).all()
     others = np.setdiff1d(np.arange(grid.size), [*enclosed, *walls])
     assert (values[others] > -100).all()
     assert np.isfinite(slope).all()
@@ -313,20 +313,23 @@ def test_check_proper_of_log_sum_exp_with_a_low_cost_raises(name, cost, refused)
     for each in (tasks[1], stack_tasks(tasks)):
         if refused:
             with pytest.raises(ImproperTask, match="log-sum-exp"):
-                check_proper(each, behavior, actions=4)
+                check_proper(each, behavior, grid_graph(grid))
         else:
-            check_proper(each, behavior, actions=4)
-    check_proper(tasks[0], behavior, actions=4)
-    check_proper(tasks[1], behavior, actions=4, horizon=3)
+            check_proper(each, behavior, grid_graph(grid))
+    check_proper(tasks[0], behavior, grid_graph(grid))
+    check_proper(tasks[1], behavior, grid_graph(grid), horizon=3)
 
 
 def test_check_proper_at_discount_1_without_end_or_cost_raises():
+    world = graph(np.tile([[[1], [2]]], (3, 1, 1)))
     nowhere = task(np.full(3, -1.0), 1.0, np.zeros(3, dtype=bool))
     with pytest.raises(ImproperTask, match="terminal"):
-        check_proper(nowhere, agent("hard max"), actions=2)
-    one_free = task(np.array([[-1.0, 0.0], [-1.0, -1.0], [0.0, 0.0]]), 1.0, np.arange(3) == 2)
+        check_proper(nowhere, agent("hard max"), world)
+    one_free = task(np.array([[0.0, -1.0], [-1.0, -1.0], [0.0, 0.0]]), 1.0, np.arange(3) == 2)
     with pytest.raises(ImproperTask, match="cost"):
-        check_proper(one_free, agent("hard max"), actions=2)
+        check_proper(one_free, agent("hard max"), world)
+    free_end = task(np.array([[-1.0, 0.0], [-1.0, 5.0], [0.0, 0.0]]), 1.0, np.arange(3) == 2)
+    check_proper(free_end, agent("hard max"), world)
 
 
 def test_solve_with_horizon_0_raises():

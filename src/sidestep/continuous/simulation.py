@@ -19,7 +19,8 @@ from sidestep.continuous.tasks import ContinuousTask, batch_tasks, check_tasks, 
 from sidestep.errors import NotConverged, check, check_count
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory
-from sidestep.tabular.solve import SolveOptions, check_proper, solve
+from sidestep.tabular.proper import check_proper
+from sidestep.tabular.solve import SolveOptions, solve
 
 
 def simulate_trajectories(
@@ -72,7 +73,7 @@ def simulate_trajectories(
         fits = np.isfinite(own).all() and np.shape(own)[1:] == real.noise.shape
         check(fits, f"expected rows of {len(real.noise)} finite numbers", source=f"starts of task {index}")
         table = agent.tabular_task(task)
-        check_proper(table, agent.behavior, len(actions))
+        check_proper(table, agent.behavior, model.graph)
         solution = solve(model, table, agent.behavior, options=options)
         if not solution.converged:
             raise NotConverged(f"values did not converge for task {index}: a finer lattice or a smaller β may help")
@@ -109,7 +110,7 @@ def gather_trajectories(trajectories: Sequence[Trajectory], tasks: Sequence[Cont
     check(trajectories, "expected at least one trajectory", field="trajectories")
     for row, trajectory in enumerate(trajectories, start=1):
         _check_trajectory(trajectory, trajectories[0], len(tasks), row)
-    states, actions, task = zip(*trajectories, strict=True)
+    states, actions, task, _ = zip(*trajectories, strict=True)
     parts = [each[:-1] for each in states], actions, [each[1:] for each in states]
     moves = (to_jax(np.concatenate(part)) for part in parts)
     lengths = [len(each) for each in actions]
@@ -123,7 +124,7 @@ def gather_trajectories(trajectories: Sequence[Trajectory], tasks: Sequence[Cont
 
 def _check_trajectory(trajectory: Trajectory, first: Trajectory, tasks: int, row: int) -> None:
     """Refuse a trajectory that is inconsistent, or has other shapes than the first."""
-    states, actions, task = trajectory
+    states, actions, task, _ = trajectory
     shape, action = np.shape(first.states)[1:], np.shape(first.actions)[1:]
     expect = partial(check, source="trajectory", row=row)
     fits = len(states) == len(actions) + 1 > 1 and np.shape(states)[1:] == shape

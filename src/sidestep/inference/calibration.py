@@ -26,10 +26,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sidestep.errors import NotConverged, check, check_instance, to_list
-from sidestep.inference.arguments import check_evidence
 from sidestep.tabular.backups import Behavior
-from sidestep.tabular.demonstrations import Demonstrations, pad_to_power_of_two
-from sidestep.tabular.likelihood import visited_action_values
+from sidestep.tabular.behavior_model import BehaviorModel
+from sidestep.tabular.demonstrations import Demonstrations
+from sidestep.tabular.likelihood import check_likelihood, padded_for, visited_advantages
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import SolveOptions, solve
 
@@ -56,14 +56,18 @@ class ScoreStatistics(NamedTuple):
 
 
 def score_statistics(
-    model: TransitionModel, demonstrations: Demonstrations, behavior: Behavior, *, options: SolveOptions | None = None
+    model: TransitionModel,
+    demonstrations: Demonstrations,
+    behavior: Behavior | BehaviorModel,
+    *,
+    options: SolveOptions | None = None,
 ) -> ScoreStatistics:
     """Return the scores of moves under a model that was learned from other trajectories.
 
     Args:
         model: The learned transition model.
         demonstrations: Held-out trajectories; moves of weight 0 are left out.
-        behavior: The behavior that the scores are of.
+        behavior: The behavior that the scores are of; a `BehaviorModel` has the β of each person.
         options: As for `solve`.
 
     Returns:
@@ -84,11 +88,10 @@ def score_statistics(
         >>> scores.score.shape
         (2,)
     """
-    check_evidence(model, demonstrations, behavior)
-    check_instance(behavior, Behavior, "behavior")
     check_instance(options, (SolveOptions, type(None)), "options")
-    padded = pad_to_power_of_two(demonstrations)
-    converged, *numbers = _scores(model, padded, behavior, options)
+    check_likelihood(model, demonstrations, behavior, options or SolveOptions())
+    padded, agents = padded_for(demonstrations, behavior)
+    converged, *numbers = _scores(model, padded, agents, options)
     if not bool(converged):
         raise NotConverged("the values of a task did not converge: a smaller β may help")
     counts = np.asarray(padded.weights) > 0
@@ -97,17 +100,24 @@ def score_statistics(
 
 @eqx.filter_jit
 def _scores(
-    model: TransitionModel, demonstrations: Demonstrations, behavior: Behavior, options: SolveOptions | None
+    model: TransitionModel, demonstrations: Demonstrations, agents: BehaviorModel, options: SolveOptions | None
 ) -> tuple[Bool[Array, ""], Float[Array, " moves"], Float[Array, " moves"], Float[Array, " moves"]]:
     """Return whether all values converged, and of each move: u, Σ_a π u² and log π(a | s)."""
-    solution = solve(model, demonstrations.tasks, behavior, options=options)
-    q = visited_action_values(model, demonstrations, solution.values)
-    log_policy, scores = jax.jvp(
-        lambda log_beta: Behavior(behavior.backup, jnp.exp(log_beta), behavior.lapse).log_policy(q),
-        (jnp.log(behavior.beta),),
-        (jnp.ones_like(behavior.beta),),
-    )
-    information = jnp.sum(jnp.exp(log_policy) * scores**2, axis=-1)
+    solution = solve(model, demonstrations.tasks, agents, options=options)
+    moves = eqx.tree_at(lambda each: each.tasks, demonstrations, agents.tasks_of(demonstrations.tasks))
+    q, behavior = visited_advantages(model, moves, solution.values_after), agents.behavior_of()
+    available = jnp.broadcast_to(model.graph.available, (model.graph.states, model.graph.actions))[moves.states]
+    betas = agents.betas(len(solution.values))[moves.task]
+
+    def of_move(beta: Array, q: Array, available: Array) -> tuple[Array, Array]:
+        return jax.jvp(
+            lambda log_beta: Behavior(behavior.backup, jnp.exp(log_beta), behavior.lapse).log_policy(q, available),
+            (jnp.log(beta),),
+            (jnp.ones_like(beta),),
+        )
+
+    log_policy, scores = jax.vmap(of_move)(betas, q, available)
+    information = jnp.sum(jnp.where(jnp.isneginf(log_policy), 0, jnp.exp(log_policy) * scores**2), axis=-1)
     chosen = jnp.arange(len(q)), demonstrations.actions
     return solution.converged.all(), scores[chosen], information, log_policy[chosen]
 

@@ -50,7 +50,9 @@ class Evidence(NamedTuple):
     """The tasks and the moves that were observed.
 
     Attributes:
-        reward: R(s, a) of each task; an axis of length 1 holds for all states or all actions.
+        reward: R(s, a) of each task; an axis of length 1 holds for all states or all actions. −∞ for actions that are
+            not available.
+        choosable: The number of available actions in each state.
         solved: Whether each task goes on in each state and a terminal state can be reached from there.
         discount, beta, lapse, tolerance: Of each task; the tolerance is one of values.
         choice_row: The row of `choices` for each task and state; −1 where no action was observed.
@@ -61,6 +63,7 @@ class Evidence(NamedTuple):
     """
 
     reward: np.ndarray
+    choosable: np.ndarray
     solved: np.ndarray
     discount: np.ndarray
     beta: np.ndarray
@@ -159,8 +162,11 @@ def _transition_log_likelihood(s, actions, width, probs, evidence):  # pragma: n
 
 
 @part(fastmath=_FAST)
-def _choice_log_likelihood(actions, lapse, beta, counts, advantages):  # pragma: no cover
-    """Return the log-likelihood of the observed choices in a state from the advantages of its actions."""
+def _choice_log_likelihood(actions, available, lapse, beta, counts, advantages):  # pragma: no cover
+    """Return the log-likelihood of the observed choices in a state from the advantages of its actions.
+
+    `available` is the number of actions that lapses choose from.
+    """
     best = advantages[0]
     for a in range(1, actions):
         best = max(best, advantages[a])
@@ -172,7 +178,7 @@ def _choice_log_likelihood(actions, lapse, beta, counts, advantages):  # pragma:
         if counts[a] > 0:
             chosen = beta * (advantages[a] - best) - np.log(total)
             if lapse > 0:
-                chosen = np.log((1 - lapse) * np.exp(max(chosen, -700.0)) + lapse / actions)
+                chosen = np.log((1 - lapse) * np.exp(max(chosen, -700.0)) + lapse / available)
             result += counts[a] * chosen
     return result
 
@@ -219,7 +225,8 @@ def chain_kernels(actions: int, width: int) -> ChainKernels:
             repeat_value = fill(task, s, world, evidence, chain, neg_inf, scratch)
             value = neg_inf
             if repeat_value > reachable_above:
-                value = _own_root(actions, backup, old, repeat_value, reachable_above, neg_inf, scratch)
+                guess = old if old > reachable_above else repeat_value
+                value = _own_root(actions, backup, evidence.choosable[s], guess, repeat_value, scratch)
             if work.logged[task, s] != work.counters[PROPOSAL]:
                 at = work.counters[LOGGED]
                 work.log_task[at], work.log_state[at], work.log_value[at] = task, s, old
@@ -242,7 +249,8 @@ def chain_kernels(actions: int, width: int) -> ChainKernels:
         for a in range(actions):
             scratch.advantages[a] = scratch.exit_values[a] - scratch.exit_weights[a] * chain.values[task, s]
         counts = evidence.choices[evidence.choice_row[task, s]]
-        return _choice_log_likelihood(actions, evidence.lapse[task], evidence.beta[task], counts, scratch.advantages)
+        rules = evidence.choosable[s], evidence.lapse[task], evidence.beta[task]
+        return _choice_log_likelihood(actions, *rules, counts, scratch.advantages)
 
     @part(fastmath=_FAST)
     def refresh_probs(s, world, chain):  # pragma: no cover

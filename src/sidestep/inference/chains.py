@@ -7,9 +7,8 @@ sweep, by the solver of `sidestep.tabular.solvers.values`, and followed by local
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from sidestep.errors import InputError, NotConverged, check, check_instance, to_count
 from sidestep.inference.arguments import check_evidence
@@ -25,8 +24,8 @@ from sidestep.tabular.grid import Cell
 from sidestep.tabular.likelihood import ALL_TERMS, Terms
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.models.barriers import NO_BARRIER, Barriers, barriers_of
-from sidestep.tabular.solve import check_proper
-from sidestep.tabular.solvers.base import SolveResult, WarmStart, neg_inf
+from sidestep.tabular.proper import check_proper
+from sidestep.tabular.solvers.base import SolveResult, WarmStart
 from sidestep.tabular.solvers.gauss_seidel import KERNELS
 from sidestep.tabular.solvers.native import HostProcess, NativeBackup, NativeEquation
 from sidestep.tabular.solvers.values import solve_values
@@ -35,8 +34,11 @@ PASSING = (0.997, 0.003)
 """The probability that an open barrier, and a closed one, lets an agent pass."""
 _FRESH_SWEEPS = 10
 """The number of sweeps after which all states are solved again, from the values at hand."""
-NEG_INF = neg_inf(jnp.dtype(float))
-"""The value of states from which a task cannot end."""
+NEG_INF = -1e200
+"""The value of states from which a task cannot end.
+
+As barriers open and close these values return to finite ones; closed barriers pass rarely, so no finite value is near.
+"""
 _TOLERANCE = 7e-4
 """The change of β V that is passed on (nats)."""
 _FINER = 0.01
@@ -83,6 +85,7 @@ class BarrierProblem:
         backup: The number of the backup, and the part of the best value within which actions tie.
         terminal: Where each task ends.
         terminal_reward: What each task pays there.
+        available: Whether each action is available in each state.
     """
 
     barriers: Barriers
@@ -94,6 +97,7 @@ class BarrierProblem:
     backup: tuple[int, float]
     terminal: Bool[np.ndarray, "tasks states"]
     terminal_reward: Float[np.ndarray, "tasks #states"]
+    available: Bool[np.ndarray, "states actions"]
 
     @property
     def kernels(self) -> ChainKernels:
@@ -165,7 +169,7 @@ class BarrierProblem:
             reward, discount = self.evidence.reward[task], np.float64(self.evidence.discount[task])
             ends, pays = self.terminal[task], self.terminal_reward[task]
             backup = NativeBackup(kind, np.float64(self.evidence.beta[task]), np.float64(tie))
-            process = HostProcess(successors, probabilities, reward, pays, ends, discount)
+            process = HostProcess(successors, probabilities, reward, pays, ends, self.available, discount)
             values[:] = _solved(NativeEquation(process, backup, np.float64(_EXACT)))
 
     def refresh(self, chain: Chain, work: Workspace) -> None:
@@ -245,9 +249,9 @@ def problem_of(
     agents = behavior if isinstance(behavior, BehaviorModel) else behavior_model(behavior)
     barriers = barriers_of(model)
     check_prior(barriers, prior)
-    check_proper(demonstrations.tasks, agents.behavior_of(), model.graph.actions)
+    check_proper(demonstrations.tasks, agents.behavior_of(), model.graph)
     run: Any = {"seed": seed, "tempering": tempering, "terms": terms}
-    return barrier_problem(barriers, demonstrations, agents, prior, **run), agents
+    return barrier_problem(barriers, demonstrations, agents, prior, available=model.graph.available, **run), agents
 
 
 def barrier_problem(
@@ -256,6 +260,7 @@ def barrier_problem(
     agents: BehaviorModel,
     prior: BinaryMRF | HierarchicalMRF,
     *,
+    available: Bool[Array | np.ndarray, "#states #actions"],
     seed: int = 0,
     tempering: float = 1.0,
     terms: Terms = ALL_TERMS,
@@ -267,11 +272,16 @@ def barrier_problem(
         demonstrations: The moves and tasks.
         agents: The behavior of the agents.
         prior: The prior of the barriers.
+        available: Whether each action is available in each state.
         seed: The seed of the chains that find the prior's log Z.
         tempering: The weight of the actions' log-likelihood, in (0, 1].
         terms: The parts of the likelihood that count.
     """
     tasks = agents.tasks_of(demonstrations.tasks)
+    message = "expected rewards R(s, a), found R(s, a, s′), which depends on the barriers"
+    check(tasks.outcome_reward is None, message, field="tasks")
+    shape = barriers.successors.shape[:2]
+    mask, reward = np.broadcast_to(np.asarray(available), shape), np.array(tasks.reward, np.float64)
     terminal, discount = np.array(tasks.terminal), np.array(tasks.discount, np.float64)
     persons = [None] * len(terminal) if agents.person is None else np.asarray(agents.person).tolist()
     behaviors = [agents.behavior_of(person) for person in persons]
@@ -294,7 +304,8 @@ def barrier_problem(
     weight = tempering if "actions" in terms else 0.0
     beta = np.array([float(each.beta) for each in behaviors])
     evidence = Evidence(
-        reward=np.array(tasks.reward, np.float64),
+        reward=reward if mask.all() else np.where(mask, reward, -np.inf),
+        choosable=mask.sum(axis=1),
         solved=_solvable(barriers, terminal, discount),
         discount=discount,
         beta=beta,
@@ -315,7 +326,7 @@ def barrier_problem(
     hierarchical = as_hierarchical(prior)
     normalizers = evidence_normalizers(hierarchical, barriers.known, free, seed)
     native = KERNELS[type(backup)], tie
-    return BarrierProblem(barriers, world, evidence, hierarchical, normalizers, free, native, terminal, rewards)
+    return BarrierProblem(barriers, world, evidence, hierarchical, normalizers, free, native, terminal, rewards, mask)
 
 
 def check_prior(barriers: Barriers, prior: BinaryMRF | HierarchicalMRF) -> None:
@@ -346,16 +357,17 @@ def _outcomes(barriers: Barriers, world: World, passing: np.ndarray) -> tuple[np
 def _solved(equation: NativeEquation) -> Float[np.ndarray, " states"]:
     """Return the values of a task, solved from nothing."""
     process, states = equation.process, len(equation.process.terminal)
-    worst = np.broadcast_to(process.reward.max(axis=-1), states)[~process.terminal].min(initial=0.0)
+    best = np.where(process.available, process.reward, -np.inf).max(axis=-1)
+    worst = best[~process.terminal].min(initial=0.0)
     # as `base.lower_bound`
-    bound = np.float64(worst / (1 - process.discount) if process.discount < 1 else NEG_INF)
+    bound = np.float64(worst / (1 - process.discount) if process.discount < 1 else -np.inf)
     arrays: Any = np.empty(states), np.empty(states, np.int32), *(np.empty((), kind) for kind in (int, float, bool))
-    start: Any = np.full(states, NEG_INF), np.zeros(0), np.full(states, -1, np.int32)
+    start: Any = np.full(states, -np.inf), np.zeros(0), np.full(states, -1, np.int32)
     result = SolveResult(*arrays)
     solve_values(_MAX_SWEEPS, result, equation, bound, WarmStart(*start), np.ones(states, bool))
     if not result.converged:
         raise NotConverged(f"the values of a task did not converge in {_MAX_SWEEPS} sweeps")
-    return arrays[0]
+    return np.where(np.isneginf(arrays[0]), NEG_INF, arrays[0])
 
 
 def _grouped(keys: np.ndarray, items: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:

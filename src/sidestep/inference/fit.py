@@ -26,11 +26,12 @@ from sidestep.inference.objective import Objective, Parameters, Problem, SolveSu
 from sidestep.inference.optimizers import LBFGS, Adam, Optimizer
 from sidestep.inference.priors import Normal, Prior
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
-from sidestep.tabular.behavior_model import BehaviorModel, behavior_model
+from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import ALL_TERMS, Terms
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.solve import SolveOptions, check_proper
+from sidestep.tabular.proper import check_proper
+from sidestep.tabular.solve import SolveOptions
 
 if TYPE_CHECKING:
     from sidestep.inference.information import Information
@@ -220,7 +221,7 @@ def fit(
     check_evidence(model, demonstrations, behavior, tempering, terms)
     optimizer, options, prior = optimizer or LBFGS(), options or SolveOptions(), prior or Normal()
     _check_settings(optimizer, options, prior, memory, mesh, large_map, report)
-    behavior = behavior_model(behavior) if isinstance(behavior, Behavior) else behavior
+    behavior = as_behavior_model(behavior)
     solver = options.solver_for(behavior.behavior.backup, model.graph.states)
     options = SolveOptions(options.gradient, options.horizon, solver)
     problem = Problem(model, behavior, demonstrations, prior, tuple(terms), options, tempering)
@@ -270,8 +271,4 @@ def _check_problem(problem: Problem, optimizer: Optimizer) -> None:
     message = "the fixed-policy gradient of the Boltzmann average belongs to no objective: expected Adam(), or 'exact'"
     message += f", found {type(optimizer).__name__}"
     check(has_objective or isinstance(optimizer, Adam), message, field="gradient")
-    tasks = len(demos.tasks.terminal)
-    persons = tasks if behavior.person is None else len(behavior.person)
-    message = f"expected the person of each of the {tasks} tasks (see split_by_person), found {persons} persons"
-    check(persons == tasks, message, field="person")
-    check_proper(behavior.tasks_of(demos.tasks), behavior.behavior_of(), graph.actions, options.horizon)
+    check_proper(behavior.tasks_of(demos.tasks), behavior.behavior_of(), graph, options.horizon)

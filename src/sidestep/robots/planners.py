@@ -28,12 +28,12 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from sidestep.errors import check
 from sidestep.tabular.backups import HardMax
 from sidestep.tabular.graph import moves_into
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid
 from sidestep.tabular.planning import followed, plan
-from sidestep.tabular.solvers.base import reachable_above
 from sidestep.tabular.tasks import Task
 
 Starts = Int[np.ndarray, " starts"]
@@ -206,9 +206,10 @@ def replanning_lengths(
 
 def _first_belief(model: ObstacleGrid, values: Float[Array, " states"], task: Task, goal: int) -> BeliefState:
     """Return what a robot believes before its first bump."""
+    check(task.outcome_reward is None, "expected rewards R(s, a), found R(s, a, s′)", field="task")
     known = np.asarray(values)
     tolerance = max(HardMax().tie, 64 * float(np.finfo(known.dtype).eps))
-    initial_values = np.where(known > reachable_above(known.dtype), known, -np.inf).astype(np.float64)
+    initial_values = known.astype(np.float64)
     on_map = moves_into(model.blank)[..., 0] < len(initial_values)
     success = np.where(on_map, np.asarray(model.probabilities(), dtype=np.float64)[..., 0], 0.0)
     reward = np.array(np.broadcast_to(task.reward, success.shape), dtype=np.float64)

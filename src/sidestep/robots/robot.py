@@ -14,6 +14,7 @@ in the model in which all visited cells are free. The moves are charged independ
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import equinox as eqx
@@ -85,4 +86,4 @@ def risk_averse_task(model: ObstacleGrid, goal: int, bump_cost: float = BUMP_COS
     probabilities, successors = np.asarray(model.probabilities()), np.asarray(model.graph.successors)
     fails = np.where(successors == np.arange(len(successors))[:, None, None], probabilities, 0).sum(axis=-1)
     bumps = bump_cost * fails * (1 - fails + _FURTHER_BUMPS * fails)
-    return Task(to_jax(np.asarray(task.reward) - bumps), task.terminal_reward, task.terminal, task.discount)
+    return replace(task, reward=to_jax(np.asarray(task.reward) - bumps))

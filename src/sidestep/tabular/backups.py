@@ -7,7 +7,9 @@
 | `LogSumExp`        | (1/β) log Σ_a exp βQ(a)        | π                     | π                    |
 | `Mellowmax`        | (1/β) log mean_a exp βQ(a)     | π                     | π                    |
 
-with π(a) ∝ exp βQ(a), which is the policy under every backup (eqs. 2 and 3). Weights always sum to one.
+with π(a) ∝ exp βQ(a), which is the policy under every backup (eqs. 2 and 3). Weights always sum to one. An action with
+Q(a) = −∞ has the weight 0, and sums leave it out; so do derivatives. The mean of the mellowmax is over the available
+actions, those with Q(a) = −∞ among them that are available.
 Equation numbers are those of the behavior-aware modeling paper; mellowmax is from Asadi & Littman (2017), the
 log-sum-exp from Ziebart's maximum causal entropy (2010).
 """
@@ -20,8 +22,9 @@ from typing import ClassVar, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Scalar
+from jaxtyping import Array, Bool, Float, Scalar
 
 from sidestep.errors import InputError, check, check_positive
 from sidestep.tabular.arrays import to_jax
@@ -31,6 +34,7 @@ Gradient = Literal["exact", "fixed_policy"]
 
 Values = Float[Array, "*states"]
 ActionValues = Float[Array, "*states actions"]
+Available = Bool[Array, "*#states actions"]
 Number = float | Float[Array, ""]
 
 
@@ -44,12 +48,13 @@ class Backup(eqx.Module):
     above_maximum: ClassVar[bool] = False
 
     @abc.abstractmethod
-    def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
+    def value(self, q: ActionValues, beta: Float[Scalar, ""], available: Available | None = None) -> Values:
         """Return V = B(q) over the last axis, differentiable in both arguments with the exact gradient.
 
         Args:
-            q: Q of the actions, on the last axis.
+            q: Q of the actions, on the last axis; −∞ for actions that are never taken, but not for all of a state.
             beta: The inverse temperature β, above 0.
+            available: Whether each action is available; by default all are. Q of the others is −∞.
 
         Returns:
             V of each state, in units of reward.
@@ -77,7 +82,7 @@ class Backup(eqx.Module):
         Returns:
             The weight of each action, at least 0; they sum to one.
         """
-        return jax.nn.softmax(beta * _below_best(q), axis=-1)
+        return jax.nn.softmax(_exponents(q, beta), axis=-1)
 
     def bonus(self, entropy: Values, actions: int | None, beta: Float[Scalar, ""]) -> Values:
         """Return V − Σ_a π(a) Q(a), from the policy's entropy; 0 by default.
@@ -111,11 +116,12 @@ class HardMax(Backup):
 
     tie: float = eqx.field(default=4e-12, static=True)
 
-    def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
+    def value(self, q: ActionValues, beta: Float[Scalar, ""], available: Available | None = None) -> Values:
         """Return the best action's value."""
+        del available
         best = jax.lax.stop_gradient(q.max(axis=-1))
         weights = jax.lax.stop_gradient(self.weights(q, beta))
-        return best + jnp.sum(weights * (q - jax.lax.stop_gradient(q)), axis=-1)
+        return best + jnp.sum(weights * _zero_with_gradient(q), axis=-1)
 
     def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
         """Return one over the number of best actions, for each of them."""
@@ -142,13 +148,14 @@ class BoltzmannAverage(Backup):
         True
     """
 
-    def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
+    def value(self, q: ActionValues, beta: Float[Scalar, ""], available: Available | None = None) -> Values:
         """Return the average of the actions' values under π."""
-        return jnp.sum(self.fixed_policy_weights(q, beta) * q, axis=-1)
+        del available
+        return jnp.sum(self.fixed_policy_weights(q, beta) * _finite(q), axis=-1)
 
     def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
         """Return π(1 + β(Q − V)), eq. 8: the effect of an action's value directly and through its probability."""
-        policy = self.fixed_policy_weights(q, beta)
+        policy, q = self.fixed_policy_weights(q, beta), _finite(q)
         value = jnp.sum(policy * q, axis=-1, keepdims=True)
         return policy * (1 + beta * (q - value))
 
@@ -166,10 +173,11 @@ class LogSumExp(Backup):
 
     above_maximum: ClassVar[bool] = True
 
-    def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
+    def value(self, q: ActionValues, beta: Float[Scalar, ""], available: Available | None = None) -> Values:
         """Return the soft maximum, above the maximum by at most log(actions)/β."""
+        del available
         best = jax.lax.stop_gradient(q.max(axis=-1))
-        return best + jax.nn.logsumexp(beta * _below_best(q), axis=-1) / beta
+        return best + jax.nn.logsumexp(_exponents(q, beta), axis=-1) / beta
 
     def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
         """Return π: eq. 9 is exact here."""
@@ -192,11 +200,12 @@ class Mellowmax(Backup):
         Asadi and Littman, "An alternative softmax operator for reinforcement learning" (2017).
     """
 
-    def value(self, q: ActionValues, beta: Float[Scalar, ""]) -> Values:
+    def value(self, q: ActionValues, beta: Float[Scalar, ""], available: Available | None = None) -> Values:
         """Return a soft maximum between the mean and the maximum."""
         best = jax.lax.stop_gradient(q.max(axis=-1))
         # log mean exp, without adding 1 to what may be far smaller
-        mean = jnp.mean(jnp.expm1(beta * _below_best(q)), axis=-1)
+        excess = jnp.expm1(_exponents(q, beta))
+        mean = jnp.mean(excess, axis=-1) if available is None else jnp.mean(excess, axis=-1, where=available)
         return best + jnp.log1p(mean) / beta
 
     def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
@@ -224,18 +233,18 @@ class Behavior(eqx.Module):
     """How agents act: the backup that they value states with, their inverse temperature and their lapses.
 
     The probability of an action is ∝ exp(β Q(s, a)) (eqs. 2 and 3). With probability `lapse` agents take a uniformly
-    random action instead; the values of states do not account for that.
+    random available action instead; the values of states do not account for that.
 
     Attributes:
-        backup: The value of a state from the values of its actions.
+        backup: The value of a state from the values of its actions: a `Backup`, its class, or a name in `BACKUPS`.
         beta: The inverse temperature β, above 0, in units of one over reward.
         lapse: The fraction of random actions, at least 0 and below 1; None for none.
 
     Raises:
-        InputError: For β ≤ 0 or not finite, and for a lapse out of its range.
+        InputError: For something else than a backup, for β ≤ 0 or not finite, and for a lapse out of its range.
 
     Example:
-        >>> float(Behavior(BoltzmannAverage(), beta=5.0).beta)
+        >>> float(Behavior("boltzmann", beta=5.0).beta)
         5.0
 
     References:
@@ -247,36 +256,94 @@ class Behavior(eqx.Module):
     beta: Float[Array, ""]
     lapse: Float[Array, ""] | None
 
-    def __init__(self, backup: Backup, beta: Number = 10.0, lapse: Number | None = None):
-        self.backup = backup
-        self.beta = to_jax(beta, jnp.result_type(float))
-        self.lapse = None if lapse is None else to_jax(lapse, jnp.result_type(float))
+    def __init__(self, backup: Backup | type[Backup] | str, beta: Number = 10.0, lapse: Number | None = None):
+        self.backup = backup_of(backup)
+        self.beta = _one_number(beta, "beta")
+        self.lapse = None if lapse is None else _one_number(lapse, "lapse")
         if not isinstance(self.beta, Tracer):
             check_positive(float(self.beta), "beta")
         if self.lapse is not None and not isinstance(self.lapse, Tracer):
             valid = 0 <= float(self.lapse) < 1
             check(valid, f"expected a probability, at least 0 and below 1, found {lapse}", field="lapse")
 
-    def log_policy(self, q: ActionValues) -> ActionValues:
-        """Return log π(a | s) from action values.
+    def log_policy(self, q: ActionValues, available: Available | None = None) -> ActionValues:
+        """Return log π(a | s) from action values; −∞ for actions that are never taken.
 
         Args:
-            q: Q(s, a), with actions on the last axis.
+            q: Q(s, a), with actions on the last axis; −∞ for actions that are never taken. Where all of a state are,
+                all available ones are equally probable.
+            available: Whether each action is available; by default all are.
 
         Returns:
             Log-probabilities, of the shape of `q`.
         """
-        chosen = jax.nn.log_softmax(self.beta.astype(q.dtype) * _below_best(q), axis=-1)
+        exponents = _exponents(tied_where_lost(q, available), self.beta.astype(q.dtype))
+        chosen = jax.nn.log_softmax(exponents, axis=-1)
         if self.lapse is None:
             return chosen
         lapse = self.lapse.astype(q.dtype)
-        return jnp.logaddexp(chosen + jnp.log1p(-lapse), jnp.log(lapse / q.shape[-1]))
+        count = q.shape[-1] if available is None else available.sum(axis=-1, keepdims=True)
+        with_lapse = jnp.logaddexp(chosen + jnp.log1p(-lapse), jnp.log(lapse / count))
+        return with_lapse if available is None else jnp.where(available, with_lapse, -jnp.inf)
 
 
-def _below_best(q: ActionValues) -> ActionValues:
-    """Return q − max q, with the gradient of q.
+def tied_where_lost(q: ActionValues, available: Available | None = None) -> ActionValues:
+    """Return q, but 0 for the available actions of a state in which no action has a finite value: all are as good.
+
+    Args:
+        q: Q(s, a), with actions on the last axis.
+        available: Whether each action is available; by default all are.
+    """
+    tied = jnp.zeros_like(q) if available is None else jnp.where(available, jnp.zeros_like(q), -jnp.inf)
+    return jnp.where(jnp.isneginf(q).all(axis=-1, keepdims=True), tied, q)
+
+
+def backup_of(backup: Backup | type[Backup] | str) -> Backup:
+    """Return a backup from an instance, its class, or its name in `BACKUPS`.
+
+    Args:
+        backup: One of these.
+
+    Raises:
+        InputError: For anything else.
+    """
+    if isinstance(backup, str) and backup in BACKUPS:
+        return BACKUPS[backup]()
+    made = backup() if isinstance(backup, type) and issubclass(backup, Backup) else backup
+    if isinstance(made, Backup):
+        return made
+    raise InputError(f"expected a backup, or one of {', '.join(BACKUPS)}, found {backup!r}", field="backup")
+
+
+def _one_number(value: Number, field: str) -> Float[Array, ""]:
+    """Return a number as an array without axes; a traced one as it is."""
+    if isinstance(value, Tracer):
+        return jnp.asarray(value, jnp.result_type(float))
+    number = np.asarray(value)
+    single = number.shape == () and number.dtype.kind in "fiu"
+    what = repr(value) if number.dtype.kind not in "fiu" else f"shape {number.shape}"
+    check(single, f"expected a number, found {what}", field=field)
+    return to_jax(value, jnp.result_type(float))
+
+
+def _exponents(q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
+    """Return β (q − max q), with the gradient of βq; −∞ for actions that are never taken, without a gradient.
 
     All backups move with a constant. Were q multiplied by β before the maximum is subtracted, large values could be
     rounded once with and once without a fused multiply-add, and the exponential of the difference would overflow.
     """
-    return q - jax.lax.stop_gradient(q.max(axis=-1, keepdims=True))
+    best = jax.lax.stop_gradient(q.max(axis=-1, keepdims=True))
+    # NaN stays: it is no mask
+    never = jnp.isneginf(q)
+    return jnp.where(never, -jnp.inf, beta * jnp.where(never, 0, q - best))
+
+
+def _finite(q: ActionValues) -> ActionValues:
+    """Return q, and 0 instead of −∞; an infinite number times a weight of 0 would be NaN."""
+    return jnp.where(jnp.isneginf(q), 0, q)
+
+
+def _zero_with_gradient(q: ActionValues) -> ActionValues:
+    """Return zeros that have the gradient of q."""
+    finite = _finite(q)
+    return finite - jax.lax.stop_gradient(finite)

@@ -13,6 +13,7 @@ pooling pulls a person with few moves towards the others.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -118,6 +119,16 @@ class BehaviorModel(eqx.Module):
             lapse = jax.nn.sigmoid(logit_lapse)
         return Behavior(self.behavior.backup, beta, lapse)
 
+    def betas(self, tasks: int) -> Float[Array, " tasks"]:
+        """Return β of each task: that of its person, or of a typical one where persons are not distinguished.
+
+        Args:
+            tasks: Their number.
+        """
+        if self.person is None or self.parameters.log_beta is None:
+            return jnp.broadcast_to(self.behavior_of().beta, (tasks,))
+        return jnp.exp(self.parameters.log_beta[self.person])
+
     def tasks_of(self, tasks: Task) -> Task:
         """Return tasks with the agents' discount, reward weights and costs.
 
@@ -134,7 +145,7 @@ class BehaviorModel(eqx.Module):
             reward = reward + self.features @ self.parameters.reward_weights
         if self.parameters.logit_discount is not None:
             discount = jnp.broadcast_to(jax.nn.sigmoid(self.parameters.logit_discount), discount.shape)
-        return Task(reward, tasks.terminal_reward, tasks.terminal, discount)
+        return replace(tasks, reward=reward, discount=discount)
 
     def log_density(self) -> Float[Array, ""]:
         """Return the logarithm of the prior density of the parameters, in nats, without its constant."""
@@ -148,6 +159,15 @@ class BehaviorModel(eqx.Module):
             if value is not None and mean is not None:
                 deviations.append(jnp.atleast_1d((value - mean) / std))
         return -0.5 * jnp.sum(jnp.concatenate(deviations) ** 2)
+
+
+def as_behavior_model(behavior: Behavior | BehaviorModel) -> BehaviorModel:
+    """Return a behavior model, or from a behavior one in which nothing is learned.
+
+    Args:
+        behavior: Either.
+    """
+    return behavior if isinstance(behavior, BehaviorModel) else behavior_model(behavior)
 
 
 def behavior_model(

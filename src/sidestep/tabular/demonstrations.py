@@ -29,6 +29,7 @@ class Trajectory(NamedTuple):
         states: s₁ … s_{τ+1}; integers in discrete worlds, vectors in continuous ones.
         actions: a₁ … a_τ; indices where there are finitely many actions, vectors otherwise.
         task: The index of the task that the agent pursued.
+        truncated: Whether the agent was stopped by a limit of moves, before its task ended.
 
     Example:
         >>> Trajectory(np.array([0, 1, 2]), np.array([3, 3]), task=0).task
@@ -38,6 +39,7 @@ class Trajectory(NamedTuple):
     states: Shaped[np.ndarray, "moves+1 *state"]
     actions: Shaped[np.ndarray, "moves *action"]
     task: int
+    truncated: bool = False
 
 
 class Demonstrations(eqx.Module, Generic[Tasks]):
@@ -198,7 +200,7 @@ def to_trajectories(
     """
 
     def checked(trajectory: Trajectory) -> Trajectory:
-        path, acted, task = trajectory
+        path, acted, task, truncated = trajectory
         own = to_count(task, "task", 0, len(terminal) - 1)
         states = to_states(path, terminal.shape[1], "states")
         last = None if actions is None else actions - 1
@@ -207,7 +209,7 @@ def to_trajectories(
             raise InputError(f"expected moves and one state more, found {len(taken)} and {len(states)}")
         message = "expected a trajectory that ends in the first terminal state, found one that goes on"
         check(not terminal[own, states[:-1]].any(), f"{message} after a terminal state of its task", field="states")
-        return Trajectory(states, taken, own)
+        return Trajectory(states, taken, own, truncated)
 
     results = []
     for row, trajectory in enumerate(trajectories, start=1):
@@ -225,7 +227,7 @@ def flatten(trajectories: Sequence[Trajectory], tasks: Task) -> Demonstrations[T
         trajectories: At least one, each with at least one move.
         tasks: The tasks that `Trajectory.task` counts through, stacked.
     """
-    paths, actions, task = zip(*trajectories, strict=True)
+    paths, actions, task, _ = zip(*trajectories, strict=True)
     lengths = [len(taken) for taken in actions]
     states, next_states = flat_moves([path[:-1] for path in paths]), flat_moves([path[1:] for path in paths])
     of_moves, number = (flat_moves([np.repeat(each, lengths)]) for each in (task, np.arange(len(lengths))))

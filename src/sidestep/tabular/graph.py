@@ -2,14 +2,16 @@
 
 A graph lists, for every state s and action a, the states that may follow: `successors[s, a, k]`, k = 0…K−1 the
 *outcomes*. A transition model gives each outcome its probability; the graph itself holds none. Outcomes may repeat a
-state (their probabilities add up) and an outcome may be the state itself.
+state (their probabilities add up) and an outcome may be the state itself. States may have different sets of actions:
+an action that is not *available* in a state is never taken there, neither by a policy nor by a lapse.
 """
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
 from sidestep.errors import check
 from sidestep.tabular.arrays import to_jax
@@ -26,6 +28,7 @@ class Graph(eqx.Module):
         successors: The state, in 0…states − 1, that outcome k of action a in state s leads to.
         lengths: The length of each action, for tasks that charge by length; in cell sides on grids. An axis of length 1
             holds for all states or all actions.
+        available: Whether an action can be taken in a state, of shape (states, actions); of shape (1, 1) where all can.
 
     Example:
         >>> from sidestep.tabular.grid import Grid
@@ -36,6 +39,7 @@ class Graph(eqx.Module):
 
     successors: Int[Array, "states actions outcomes"]
     lengths: Float[Array, "#states #actions"]
+    available: Bool[Array, "#states #actions"] = eqx.field(default_factory=lambda: to_jax(np.ones((1, 1), bool)))
 
     @property
     def states(self) -> int:
@@ -48,22 +52,53 @@ class Graph(eqx.Module):
         return self.successors.shape[1]
 
 
-def graph(successors: Int[np.ndarray, "states actions outcomes"]) -> Graph:
+def graph(
+    successors: Shaped[ArrayLike, "..."] | Sequence[Any],
+    available: Shaped[ArrayLike, "..."] | Sequence[Any] | None = None,
+) -> Graph:
     """Return a graph from a table of successors, in which every action has length 1.
 
     Args:
-        successors: The state that each outcome of each action leads to.
+        successors: The state that each outcome of each action leads to; whole numbers, as an array or nested lists.
+        available: Whether each action can be taken in each state; by default all can. The successors of an action that
+            cannot be taken have no meaning, but must be states.
 
     Raises:
-        InputError: For an empty table or a successor that is not a state.
+        InputError: For an empty table, a successor that is not a whole number or not a state, and a state without an
+            available action.
 
     Example:
-        >>> graph(np.array([[[0], [1]], [[1], [0]]])).states
+        >>> graph([[[0], [1]], [[1], [0]]]).states
         2
     """
-    check(successors.size, "expected at least one state, action and outcome", field="successors")
-    check_states(successors, len(successors), "successors")
-    return Graph(to_jax(successors, np.int32), to_jax(np.ones((1, 1))))
+    table = np.asarray(successors)
+    message = "expected whole numbers of shape (states, actions, outcomes), found"
+    whole = table.ndim == 3 and table.dtype.kind in "iu"
+    advice = "; for probabilities P[s, a, s′] use `from_dense`" if table.dtype.kind == "f" else ""
+    check(whole, f"{message} {table.dtype} {table.shape}{advice}", field="successors")
+    check(table.size, f"{message} shape {table.shape}: at least one of each is needed", field="successors")
+    check_states(table, len(table), "successors")
+    made = Graph(to_jax(table, np.int32), to_jax(np.ones((1, 1))))
+    return made if available is None else with_available(made, available)
+
+
+def with_available(world: Graph, available: Shaped[ArrayLike, "..."] | Sequence[Any]) -> Graph:
+    """Return a graph in which only some actions can be taken.
+
+    Args:
+        world: The graph.
+        available: Whether each action can be taken in each state.
+
+    Raises:
+        InputError: For another shape or type, and for a state without an available action.
+    """
+    mask, shape = np.asarray(available), (world.states, world.actions)
+    message = f"expected booleans of shape {shape}, found {mask.dtype} {mask.shape}"
+    check(mask.shape == shape and mask.dtype == bool, message, field="available")
+    without = np.flatnonzero(~mask.any(axis=1))[:1]
+    message = f"expected an action in every state, found none in state {without}"
+    check(not len(without), message, field="available")
+    return Graph(world.successors, world.lengths, to_jax(mask if not mask.all() else np.ones((1, 1), bool)))
 
 
 def check_states(numbers: Int[np.ndarray, "..."], states: int, field: str) -> None:
@@ -74,7 +109,8 @@ def check_states(numbers: Int[np.ndarray, "..."], states: int, field: str) -> No
         states: The number of states.
         field: The argument, for the message.
     """
-    check(np.all((numbers >= 0) & (numbers < states)), f"expected states 0…{states - 1}", field=field)
+    wrong = numbers[(numbers < 0) | (numbers >= states)][:1]
+    check(not len(wrong), f"expected states in 0…{states - 1}, found {wrong}", field=field)
 
 
 def grid_graph(grid: Grid) -> Graph:

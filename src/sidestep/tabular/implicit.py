@@ -27,7 +27,10 @@ from sidestep.tabular.solvers.jacobi import Jacobi
 
 Rows = Float[Array, "visited actions outcomes"]
 Constants = tuple
-"""What is not differentiated: successors, terminal states, the solver, its order, the region, the visited states."""
+"""What is not differentiated.
+
+Successors, terminal states, available actions; the solver, its order, the region, the visited states.
+"""
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -58,7 +61,7 @@ def _with_tangents(
 ) -> tuple[base.Values, Rows]:
     """Return the same as `fixed_point`; its derivatives are directional ones."""
     del backup, gradient
-    return values, constants[2].gather_rows(inputs.probabilities, constants[-1])
+    return values, constants[3].gather_rows(inputs.probabilities, constants[-1])
 
 
 @_with_tangents.defjvp
@@ -99,7 +102,7 @@ def _pull_back(
     adjoint: Array,
 ) -> tuple[base.Cotangents, base.Values]:
     """Return λᵀ ∂F/∂φ and λ."""
-    solver, order, region = constants[2:5]
+    solver, order, region = constants[3:6]
     equation, start = _equation(backup, constants, inputs), base.WarmStart(values, adjoint, order)
     by, result = solver.vjp(equation, gradient, cotangent, start, region)
     return by, result.values
@@ -122,8 +125,8 @@ def _pull_back_jvp(backup: Backup, gradient: Gradient, primals: tuple, tangents:
 
 
 def _equation(backup: Backup, constants: Constants, inputs: base.Cotangents) -> base.BellmanEquation:
-    successors, terminal = constants[:2]
-    process = base.DecisionProcess(successors, *inputs[:3], terminal, inputs.discount)
+    successors, terminal, available = constants[:3]
+    process = base.DecisionProcess(successors, *inputs[:3], terminal, available, inputs.discount)
     return base.BellmanEquation(process, backup, inputs.beta)
 
 
@@ -136,4 +139,4 @@ def _second_order(
 
 
 def _linear_solver(constants: Constants) -> Jacobi:
-    return Jacobi(tolerance=constants[2].tolerance)
+    return Jacobi(tolerance=constants[3].tolerance)

@@ -9,6 +9,7 @@ Agents plan with the dynamics that they know, so both terms depend on θ: the *a
 from typing import Literal, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -17,10 +18,13 @@ from jaxtyping import Array, Bool, Float, Int
 from sidestep.errors import check
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior
+from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
+from sidestep.tabular.checks import check_behavior, check_demonstrations, check_model, check_persons, is_traced
 from sidestep.tabular.demonstrations import Demonstrations, next_power_of_two, pad_to_power_of_two
 from sidestep.tabular.models import TransitionModel
+from sidestep.tabular.proper import check_proper
 from sidestep.tabular.solve import Solution, SolveOptions, solve
-from sidestep.tabular.solvers.base import WarmStart, action_values
+from sidestep.tabular.solvers.base import WarmStart, advantages
 from sidestep.tabular.tasks import Task
 
 Term = Literal["actions", "transitions"]
@@ -54,7 +58,7 @@ class LogLikelihood(NamedTuple):
 def log_likelihood(
     model: TransitionModel,
     demonstrations: Demonstrations,
-    behavior: Behavior,
+    behavior: Behavior | BehaviorModel,
     *,
     terms: Terms = ALL_TERMS,
     options: SolveOptions | None = None,
@@ -64,7 +68,7 @@ def log_likelihood(
     Args:
         model: The transition model; differentiable in its parameters θ.
         demonstrations: Moves and tasks. One compiled function serves demonstrations of many lengths.
-        behavior: The policy that values of actions lead to; after a fit, `fit.behavior.behavior_of(person)`.
+        behavior: The policy that values of actions lead to; after a fit, `fit.behavior`.
         terms: The terms that count, "actions", "transitions" or both.
         options: How values are computed; by default `SolveOptions()`.
 
@@ -72,7 +76,8 @@ def log_likelihood(
         Both terms. The actions' term is NaN if the values of a task did not converge.
 
     Raises:
-        InputError: For a `BehaviorModel`, which has a behavior of each person.
+        InputError: For demonstrations of another world, or with actions that are not available, and for other terms.
+        ImproperTask: For tasks without values.
 
     Example:
         >>> from sidestep.tabular.backups import BoltzmannAverage
@@ -89,18 +94,71 @@ def log_likelihood(
     References:
         Equations 1 and 6 of the behavior-aware modeling paper.
     """
-    message = "expected a Behavior; a BehaviorModel has one of each person: `behavior_of(person)`"
-    check(isinstance(behavior, Behavior), message, field="behavior")
-    return _log_likelihood(model, pad_to_power_of_two(demonstrations), behavior, terms, options or SolveOptions())
+    options = options or SolveOptions()
+    check_terms(terms)
+    check_likelihood(model, demonstrations, behavior, options)
+    padded, agents = padded_for(demonstrations, behavior)
+    return _log_likelihood(model, padded, agents, terms, options)
+
+
+def check_terms(terms: Terms) -> None:
+    """Raise `InputError` unless terms are "actions", "transitions" or both.
+
+    Args:
+        terms: The terms.
+    """
+    known = isinstance(terms, (tuple, list)) and len(terms) > 0 and set(terms) <= set(ALL_TERMS)
+    check(known, f"expected one or both of {ALL_TERMS} in a tuple, found {terms!r}", field="terms")
+
+
+def check_likelihood(
+    model: TransitionModel, demonstrations: Demonstrations, behavior: Behavior | BehaviorModel, options: SolveOptions
+) -> None:
+    """Raise an error unless demonstrations have a likelihood under a model.
+
+    Args:
+        model: The transition model.
+        demonstrations: Moves and tasks.
+        behavior: The agents'.
+        options: How values are computed.
+
+    Raises:
+        InputError: For arguments of another kind, or of different worlds.
+        ImproperTask: For tasks without values.
+    """
+    check_model(model)
+    check_behavior(behavior, learned=True)
+    check_demonstrations(demonstrations, model.graph)
+    agents = as_behavior_model(behavior)
+    check_persons(behavior, len(demonstrations.tasks.terminal))
+    if not is_traced(model, demonstrations, behavior):
+        check_proper(agents.tasks_of(demonstrations.tasks), agents.behavior_of(), model.graph, options.horizon)
+
+
+def padded_for(
+    demonstrations: Demonstrations, behavior: Behavior | BehaviorModel
+) -> tuple[Demonstrations, BehaviorModel]:
+    """Return demonstrations padded to powers of two, and a behavior model with a person of each padded task.
+
+    Args:
+        demonstrations: Moves and tasks.
+        behavior: The agents'.
+    """
+    padded, agents = pad_to_power_of_two(demonstrations), as_behavior_model(behavior)
+    if agents.person is None:
+        return padded, agents
+    missing = len(padded.tasks.terminal) - len(agents.person)
+    person = to_jax(np.pad(np.asarray(agents.person), (0, missing)))
+    return padded, eqx.tree_at(lambda each: each.person, agents, person)
 
 
 @eqx.filter_jit
 def _log_likelihood(
-    model: TransitionModel, demonstrations: Demonstrations, behavior: Behavior, terms: Terms, options: SolveOptions
+    model: TransitionModel, demonstrations: Demonstrations, agents: BehaviorModel, terms: Terms, options: SolveOptions
 ) -> LogLikelihood:
     actions = transitions = jnp.zeros((), model.probabilities().dtype)
     if "actions" in terms:
-        each = _log_policies(model, demonstrations, behavior, options)
+        each = _log_policies(model, demonstrations, agents, options)
         actions = jnp.sum(each * demonstrations.weights.astype(each.dtype))
     if "transitions" in terms:
         transitions = arrival_log_likelihood(model, _arrivals(demonstrations))
@@ -108,7 +166,11 @@ def _log_likelihood(
 
 
 def log_policies(
-    model: TransitionModel, demonstrations: Demonstrations, behavior: Behavior, *, options: SolveOptions | None = None
+    model: TransitionModel,
+    demonstrations: Demonstrations,
+    behavior: Behavior | BehaviorModel,
+    *,
+    options: SolveOptions | None = None,
 ) -> Float[Array, " moves"]:
     """Return log π_θ(a | s) of every move; NaN if the values of a task did not converge.
 
@@ -132,18 +194,29 @@ def log_policies(
         >>> log_policies(true_model(grid), shown, Behavior(HardMax(), 50.0)).shape
         (2,)
     """
-    padded = pad_to_power_of_two(demonstrations)
-    return _first(_log_policies(model, padded, behavior, options or SolveOptions()), len(demonstrations))
+    options = options or SolveOptions()
+    check_likelihood(model, demonstrations, behavior, options)
+    padded, agents = padded_for(demonstrations, behavior)
+    return _first(_log_policies(model, padded, agents, options), len(demonstrations))
 
 
 @eqx.filter_jit
 def _log_policies(
-    model: TransitionModel, demonstrations: Demonstrations, behavior: Behavior, options: SolveOptions
+    model: TransitionModel, demonstrations: Demonstrations, agents: BehaviorModel, options: SolveOptions
 ) -> Float[Array, " moves"]:
-    solution = solve(model, demonstrations.tasks, behavior, options=options)
-    q = visited_action_values(model, demonstrations, solution.values)
+    moves = eqx.tree_at(lambda each: each.tasks, demonstrations, agents.tasks_of(demonstrations.tasks))
+    behavior, task = agents.behavior_of(), moves.task
+    solution = solve(model, demonstrations.tasks, agents, options=options)
+    q = visited_advantages(model, moves, solution.values_after)
+    betas = agents.betas(solution.values.shape[0])[task]
+
+    def of_move(beta: Array, q: Array, state: Array, action: Array) -> Array:
+        own = Behavior(behavior.backup, beta, behavior.lapse)
+        return _log_policy(model, own, q[None], state[None], action[None])[0]
+
     # a factor, so that the gradient is NaN too
-    return _log_policy(behavior, q, demonstrations.actions) * jnp.where(solution.converged.all(), 1.0, jnp.nan)
+    each = jax.vmap(of_move)(betas, q, moves.states, moves.actions)
+    return each * jnp.where(solution.converged.all(), 1.0, jnp.nan)
 
 
 class Choices(NamedTuple):
@@ -187,8 +260,10 @@ def choice_log_likelihood(
         The log-likelihood, NaN if the values did not converge, and the solution.
     """
     solution = solve(model, task, behavior, options=options, start=start, visited=choices.states, region=region)
-    q = solution.action_values
-    total = jnp.sum(choices.counts.astype(q.dtype) * _log_policy(behavior, q, choices.actions))
+    q = solution.advantages
+    each = _log_policy(model, behavior, q, choices.states, choices.actions)
+    # those that do not count may be impossible
+    total = jnp.sum(jnp.where(choices.counts > 0, choices.counts.astype(q.dtype) * each, 0))
     return total * jnp.where(solution.converged, 1.0, jnp.nan), solution
 
 
@@ -257,21 +332,26 @@ def arrival_log_likelihood(model: TransitionModel, arrivals: Arrivals) -> Float[
     return jnp.sum(each * arrivals.counts.astype(each.dtype))
 
 
-def visited_action_values(
+def visited_advantages(
     model: TransitionModel, demonstrations: Demonstrations, values: Float[Array, "tasks states"]
 ) -> Float[Array, "moves actions"]:
-    """Return Q(s, a) of the state before each move, from the values of all tasks.
+    """Return Q(s, a) − V(s) of the state before each move, from the values of all tasks.
 
     Args:
         model: The transition model.
         demonstrations: Moves and tasks.
-        values: V of each task.
+        values: V of each task after an action (`Solution.values_after`).
     """
     tasks, task, states = demonstrations.tasks, demonstrations.task, demonstrations.states
     after = values[task[:, None, None], model.graph.successors[states]]
+    probabilities, available = model.probabilities()[states], model.graph.available
     reward = tasks.reward[task, states if tasks.reward.shape[1] > 1 else 0].astype(values.dtype)
+    if tasks.outcome_reward is not None:
+        of_outcomes = tasks.outcome_reward[task, states if tasks.outcome_reward.shape[1] > 1 else 0]
+        reward = reward + jnp.sum(probabilities * of_outcomes.astype(values.dtype), axis=-1)
+    mask = available[states if len(available) > 1 else jnp.zeros_like(states)]
     discount = tasks.discount[task, None].astype(values.dtype)
-    return action_values(values[task, states], after, model.probabilities()[states], reward, discount)
+    return advantages(values[task, states], after, probabilities, reward, mask, discount)
 
 
 def transition_probabilities(model: TransitionModel, moves: Demonstrations) -> Float[Array, " moves"]:
@@ -296,9 +376,15 @@ def _transition_probabilities(model: TransitionModel, moves: Arrivals) -> Float[
 
 
 def _log_policy(
-    behavior: Behavior, q: Float[Array, "visits actions"], actions: Int[Array, " visits"]
+    model: TransitionModel,
+    behavior: Behavior,
+    q: Float[Array, "visits actions"],
+    states: Int[Array, " visits"],
+    actions: Int[Array, " visits"],
 ) -> Float[Array, " visits"]:
-    return jnp.take_along_axis(behavior.log_policy(q), actions[:, None], axis=-1)[:, 0]
+    available = model.graph.available
+    mask = available[states] if len(available) > 1 else None
+    return jnp.take_along_axis(behavior.log_policy(q, mask), actions[:, None], axis=-1)[:, 0]
 
 
 def _first(each: Float[Array, " padded"], count: int) -> Float[Array, " moves"]:

@@ -4,19 +4,25 @@ A plan knows only the model it was made with. Followed in another one, such as t
 the model did not know: the move fails, and an optimal plan repeats it forever. `roll_out` shows that.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, Shaped
 
+from sidestep._arguments import to_key, to_states
 from sidestep._programs import keep_program
-from sidestep.errors import NotConverged, check
-from sidestep.tabular.backups import Behavior, HardMax
+from sidestep.errors import NotConverged, check, check_instance, to_count
+from sidestep.tabular.arrays import to_jax
+from sidestep.tabular.backups import Behavior, HardMax, tied_where_lost
+from sidestep.tabular.behavior_model import BehaviorModel
+from sidestep.tabular.checks import check_behavior, check_model, check_task, is_traced
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.solve import Solution, SolveOptions, check_proper, solve
+from sidestep.tabular.proper import check_proper
+from sidestep.tabular.solve import Solution, SolveOptions, solve
 from sidestep.tabular.solvers.base import is_reachable
 from sidestep.tabular.tasks import Task
 
@@ -94,20 +100,28 @@ def followed(
 
 
 def plan(
-    model: TransitionModel, task: Task, behavior: Behavior | None = None, *, options: SolveOptions | None = None
+    model: TransitionModel,
+    task: Task,
+    behavior: Behavior | BehaviorModel | None = None,
+    *,
+    person: int | None = None,
+    options: SolveOptions | None = None,
 ) -> Plan:
     """Return the optimal plan for a task under a model, or with `behavior` the plan of an agent that behaves like that.
 
     Args:
         model: The transition model.
         task: One task.
-        behavior: The agent's, π ∝ exp βQ; None for the optimal policy.
+        behavior: The agent's, π ∝ exp βQ; None for the optimal policy. With a `BehaviorModel`, such as that of a fit,
+            the task has its discount, reward weights and costs.
+        person: The person that plans, where a `BehaviorModel` distinguishes them; by default a typical one.
         options: How values are computed; by default `SolveOptions()`.
 
     Returns:
         The probabilities of actions and the intended next state of every state, with the values.
 
     Raises:
+        InputError: For a task of another world or a stack of tasks, and a person that does not exist.
         ImproperTask: For a task that has no values.
         NotConverged: If the values do not converge.
 
@@ -119,8 +133,21 @@ def plan(
         >>> plan(ObstacleGrid(grid), reach(grid, 3)).path_from(0).tolist()
         [0, 1, 2, 3]
     """
-    options, agent = options or SolveOptions(), behavior or Behavior(HardMax())
-    check_proper(task, agent, model.graph.actions, options.horizon)
+    options = options or SolveOptions()
+    check_instance(options, SolveOptions, "options")
+    check_model(model)
+    check_task(task, model.graph)
+    tasks = task.terminal.shape[:-1]
+    check(not tasks, f"expected one task, found a stack of {tasks}", field="task")
+    if behavior is not None:
+        check_behavior(behavior, learned=True)
+    agent = behavior or Behavior(HardMax())
+    if isinstance(agent, BehaviorModel):
+        task, agent = agent.tasks_of(task), agent.behavior_of(person)
+    else:
+        message = f"expected none without a BehaviorModel, found {person!r}"
+        check(person is None, message, field="person")
+    check_proper(task, agent, model.graph, options.horizon)
     made = _plan(model, task, agent, behavior is None, options)
     solution = made.solution
     if not bool(solution.converged):
@@ -134,15 +161,31 @@ def plan(
 @keep_program
 def _plan(model: TransitionModel, task: Task, behavior: Behavior, optimal: bool, options: SolveOptions) -> Plan:
     solution = solve(model, task, behavior, options=options)
-    q = solution.action_values
-    policy = behavior.backup.fixed_policy_weights(q, behavior.beta) if optimal else jnp.exp(behavior.log_policy(q))
+    available = jnp.broadcast_to(model.graph.available, solution.action_values.shape)
+    q, advantages = (tied_where_lost(each, available) for each in (solution.action_values, solution.advantages))
+    policy = (
+        behavior.backup.fixed_policy_weights(q, behavior.beta)
+        if optimal
+        else jnp.exp(behavior.log_policy(advantages, available))
+    )
     states = jnp.arange(model.graph.states)
-    best = jnp.argmax(policy, axis=-1)
+    best = _first_best(policy, advantages)
     outcomes = model.graph.successors[states, best]
     elsewhere = jnp.where(outcomes == states[:, None], 0, model.probabilities()[states, best])
     most_probable = jnp.take_along_axis(outcomes, jnp.argmax(elsewhere, axis=-1)[:, None], axis=-1)[:, 0]
     intended = jnp.where(elsewhere.max(axis=-1) > 0, most_probable, states)
     return Plan(policy, intended.astype(jnp.int32), task.terminal, solution)
+
+
+def _first_best(
+    policy: Float[Array, "states actions"], advantages: Float[Array, "states actions"]
+) -> Int[Array, " states"]:
+    """Return the first of the most probable actions; of ties by the precision of Q, the best by its advantage."""
+    tied = policy >= policy.max(axis=-1, keepdims=True)
+    among = jnp.where(tied, advantages, -jnp.inf)
+    largest = among.max(axis=-1, keepdims=True)
+    size = jnp.where(jnp.isneginf(advantages), 0, jnp.abs(advantages)).max(axis=-1, keepdims=True)
+    return jnp.argmax(among >= largest - 64 * jnp.finfo(advantages.dtype).eps * size, axis=-1)
 
 
 class RollOuts(NamedTuple):
@@ -180,13 +223,12 @@ class RollOuts(NamedTuple):
         return jnp.sum((self.actions >= 0) & (self.states[:, 1:] == self.states[:, :-1]), axis=-1)
 
 
-@eqx.filter_jit
 def roll_out(
     key: PRNGKeyArray,
     world: TransitionModel,
     policy: Float[Array, "states actions"],
     terminal: Bool[Array, " states"],
-    starts: Int[Array, " agents"],
+    starts: Shaped[ArrayLike, "..."] | Sequence[int],
     max_moves: int,
 ) -> RollOuts:
     """Return trajectories of agents that follow a policy in a world.
@@ -202,6 +244,10 @@ def roll_out(
     Returns:
         The trajectories, one for each start.
 
+    Raises:
+        InputError: For a start that is not a state, a policy of another shape or with rows that do not sum to one, and
+            a number of moves below 1.
+
     Example:
         >>> from sidestep.tabular.grid import Grid
         >>> from sidestep.tabular.models import true_model
@@ -213,6 +259,29 @@ def roll_out(
         >>> rolled.arrived.tolist()
         [True, True]
     """
+    max_moves = to_count(max_moves, "max_moves")
+    check_model(world)
+    shape = world.graph.states, world.graph.actions
+    fits = jnp.shape(policy) == shape and jnp.shape(terminal) == shape[:1]
+    message = f"expected a policy of shape {shape} and terminal states of shape {shape[:1]}, found "
+    check(fits, f"{message}{jnp.shape(policy)} and {jnp.shape(terminal)}", field="policy, terminal")
+    if not is_traced(policy):
+        numbers = np.asarray(policy)
+        rows = np.flatnonzero(~(np.isclose(numbers.sum(axis=1), 1, atol=1e-4) & (numbers >= 0).all(axis=1)))[:1]
+        check(not len(rows), f"expected probabilities that sum to one in every state, not so in {rows}", field="policy")
+    states = to_jax(to_states(starts, world.graph.states, "starts"), np.int32)
+    return _roll_out(to_key(key), world, policy, terminal, states, max_moves)
+
+
+@eqx.filter_jit
+def _roll_out(
+    key: PRNGKeyArray,
+    world: TransitionModel,
+    policy: Float[Array, "states actions"],
+    terminal: Bool[Array, " states"],
+    starts: Int[Array, " agents"],
+    max_moves: int,
+) -> RollOuts:
     log_policy, log_probabilities = jnp.log(policy), jnp.log(world.probabilities())
 
     def of_agent(key: PRNGKeyArray, start: Int[Array, ""]) -> tuple[Array, Array]:

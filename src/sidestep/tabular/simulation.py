@@ -4,14 +4,17 @@ from collections.abc import Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Int, PRNGKeyArray
+from jaxtyping import ArrayLike, Bool, Int, PRNGKeyArray, Shaped
 
-from sidestep.errors import InputError
-from sidestep.tabular.arrays import to_jax
+from sidestep._arguments import to_key, to_states
+from sidestep.errors import InputError, check, to_count, to_list
 from sidestep.tabular.backups import Behavior
+from sidestep.tabular.behavior_model import BehaviorModel
+from sidestep.tabular.checks import check_model, check_persons
 from sidestep.tabular.demonstrations import Trajectory, next_power_of_two
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.planning import plan, roll_out
+from sidestep.tabular.planning import Plan, plan, roll_out
+from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.tasks import Task
 
 _CHUNK = 128
@@ -22,28 +25,33 @@ def simulate(
     key: PRNGKeyArray,
     world: TransitionModel,
     tasks: Sequence[Task],
-    starts: Sequence[Int[np.ndarray, " _"]],
-    behavior: Behavior | None = None,
+    starts: Sequence[Shaped[ArrayLike, "..."] | Sequence[int]],
+    behavior: Behavior | BehaviorModel | None = None,
     max_moves: int | None = None,
+    *,
+    options: SolveOptions | None = None,
 ) -> list[Trajectory]:
     """Return trajectories of agents that know a world and pursue tasks in it.
 
-    An agent acts until its task ends. For a task without an end, use `plan` and then `roll_out`.
+    An agent acts until its task ends, or until `max_moves` if it is given: continuing tasks need it.
 
     Args:
         key: Of the random choices.
         world: The transition model that the agents plan with and that their moves follow.
         tasks: The tasks that are pursued.
         starts: For each task the states that its agents start in, one agent an entry.
-        behavior: The agents'; None for the optimal policy, with ties broken at random.
-        max_moves: The number of moves after which an agent gives up; by default twice the number of states, and at
-            least 1000.
+        behavior: The agents'; None for the optimal policy, with ties broken at random. A `BehaviorModel`, such as that
+            of a fit, has the discount, reward weights and costs of all agents, and the person of each task.
+        max_moves: The number of moves after which an agent stops; its trajectory is then `truncated`. By default no
+            agent stops before it arrives, and one that has not arrived after twice the number of states, and at least
+            1000 moves, is an error.
+        options: How the agents plan; by default `SolveOptions()`.
 
     Returns:
-        The trajectories, those of the first task first.
+        The trajectories, those of the first task first. An agent that starts in a terminal state makes no move.
 
     Raises:
-        InputError: For an agent that has not arrived after `max_moves`.
+        InputError: For a start that is not a state, and without `max_moves` for an agent that does not arrive.
         ImproperTask: For a task that has no values.
         NotConverged: If the values of a task do not converge.
 
@@ -55,28 +63,54 @@ def simulate(
         >>> [walk] = simulate(jax.random.key(0), true_model(grid), [reach(grid, 2)], [np.array([0])])
         >>> walk.states.tolist()
         [0, 1, 2]
+        >>> [walk] = simulate(jax.random.key(0), true_model(grid), [reach(grid, 2)], [[0]], max_moves=1)
+        >>> walk.states.tolist(), walk.truncated
+        ([0, 1], True)
     """
-    max_moves = max_moves or max(1000, 2 * world.graph.states)
-    trajectories = []
+    check_model(world)
+    tasks, starts = to_list(tasks, Task, "tasks"), to_list(starts, object, "starts")
+    check(len(starts) == len(tasks), f"expected as many as tasks, {len(tasks)}, found {len(starts)}", field="starts")
+    limit = max(1000, 2 * world.graph.states) if max_moves is None else to_count(max_moves, "max_moves")
+    check_persons(behavior, len(tasks))
+    key, trajectories = to_key(key), []
     for index, (task, own) in enumerate(zip(tasks, starts, strict=True)):
-        made, agents = plan(world, task, behavior), len(own)
-        terminal = np.asarray(made.terminal)
-        # with copies of agents up to a power of two, so that one compiled function serves many numbers of agents
-        states = np.resize(own, next_power_of_two(max(agents, 1)))[:, None]
-        actions = np.zeros((len(states), 0), dtype=np.int64)
-        while not (arrived := terminal[states[:agents, -1]]).all() and actions.shape[1] < max_moves:
-            key, chunk_key = jax.random.split(key)
-            moves = min(_CHUNK, max_moves - actions.shape[1])
-            rolled = roll_out(chunk_key, world, made.policy, made.terminal, to_jax(states[:, -1], np.int32), moves)
-            states = np.concatenate([states, np.asarray(rolled.states)[:, 1:]], axis=1)
-            actions = np.concatenate([actions, np.asarray(rolled.actions)], axis=1)
-        if not arrived.all():
+        begin = to_states(own, world.graph.states, f"starts[{index}]")
+        person = _person_of(behavior, index)
+        made = plan(world, task, behavior, person=person, options=options)
+        if not len(begin):
+            continue
+        key, own_key = jax.random.split(key)
+        states, actions, arrived = _followed(own_key, world, made, begin, limit)
+        if max_moves is None and not arrived.all():
             raise InputError(
-                f"an agent from state {int(own[np.argmin(arrived)])} had not arrived after {max_moves} moves: "
-                "expected a goal in reach, a larger β, a step cost with discount 1 for long ways, or more moves",
+                f"an agent from state {int(begin[np.argmin(arrived)])} had not arrived after {limit} moves: "
+                "expected a goal in reach, a larger β, a step cost with discount 1 for long ways, or `max_moves`",
                 source=f"task {index}",
             )
-        for own_states, own_actions in zip(states[:agents], actions[:agents], strict=True):
+        for own_states, own_actions, ended in zip(states, actions, arrived.tolist(), strict=True):
             taken = int((own_actions >= 0).sum())
-            trajectories.append(Trajectory(own_states[: taken + 1], own_actions[:taken], index))
+            trajectories.append(Trajectory(own_states[: taken + 1], own_actions[:taken], index, not ended))
     return trajectories
+
+
+def _person_of(behavior: Behavior | BehaviorModel | None, task: int) -> int | None:
+    """Return the person of a task; None where persons are not distinguished."""
+    person = behavior.person if isinstance(behavior, BehaviorModel) else None
+    return None if person is None else int(np.asarray(person)[task])
+
+
+def _followed(
+    key: PRNGKeyArray, world: TransitionModel, made: Plan, starts: Int[np.ndarray, " agents"], limit: int
+) -> tuple[Int[np.ndarray, "agents moves+1"], Int[np.ndarray, "agents moves"], Bool[np.ndarray, " agents"]]:
+    """Return the states and actions of agents that follow a plan (−1 once they have arrived), and which arrived."""
+    terminal, agents = np.asarray(made.terminal), len(starts)
+    # with copies of agents up to a power of two, so that one compiled function serves many numbers of agents
+    states = np.resize(starts, next_power_of_two(agents))[:, None]
+    actions = np.zeros((len(states), 0), dtype=np.int64)
+    while not terminal[states[:agents, -1]].all() and actions.shape[1] < limit:
+        key, chunk_key = jax.random.split(key)
+        moves = min(_CHUNK, limit - actions.shape[1])
+        rolled = roll_out(chunk_key, world, made.policy, made.terminal, states[:, -1], moves)
+        states = np.concatenate([states, np.asarray(rolled.states)[:, 1:]], axis=1)
+        actions = np.concatenate([actions, np.asarray(rolled.actions)], axis=1)
+    return states[:agents], actions[:agents], terminal[states[:agents, -1]]

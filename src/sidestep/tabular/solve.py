@@ -17,13 +17,15 @@ from typing import cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.errors import ImproperTask, check, check_count
-from sidestep.tabular.backups import Backup, Behavior, Gradient, LogSumExp
+from sidestep.errors import check, check_count
+from sidestep.tabular.backups import Backup, Behavior, Gradient
+from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
+from sidestep.tabular.checks import check_behavior, check_model, check_persons, check_task, is_traced
 from sidestep.tabular.implicit import fixed_point
 from sidestep.tabular.models import TransitionModel
+from sidestep.tabular.proper import check_proper
 from sidestep.tabular.solvers import base
 from sidestep.tabular.solvers.gauss_seidel import KERNELS, GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
@@ -86,8 +88,13 @@ class Solution(eqx.Module):
     """The values of a task under a model, with a leading `tasks` axis for several tasks; made by `solve`.
 
     Attributes:
-        values: V(s); at discount 1, near `solvers.base.neg_inf` (for −∞) where no terminal state can be reached.
-        action_values: Q(s, a) of all states, or of the `visited` ones.
+        values: V(s); at discount 1, −∞ where no policy surely reaches a terminal state.
+        values_after: V of the states that an action leads to, where Q = R + γ Σ T V: `values`, or with a horizon those
+            of acting once less.
+        action_values: Q(s, a) of all states, or of the `visited` ones; −∞ for actions that are not available, and at
+            discount 1 for those that may lead to a state of value −∞.
+        advantages: Q(s, a) − V(s), with V from `values_after`, of the same states; summed as differences, they are
+            exact where values are far larger than their differences. Policies depend on these.
         sweeps: The number of times that each state was solved, on average; the horizon where it is finite.
         residual: The largest relative change in the last sweep; 0 for a finite horizon.
         converged: Whether the residual is within the solver's tolerance.
@@ -104,19 +111,19 @@ class Solution(eqx.Module):
     """
 
     values: Float[Array, "*tasks states"]
+    values_after: Float[Array, "*tasks states"]
     action_values: Float[Array, "*tasks visited actions"]
+    advantages: Float[Array, "*tasks visited actions"]
     sweeps: Int[Array, "*tasks"]
     residual: Float[Array, "*tasks"]
     converged: Bool[Array, "*tasks"]
     start: base.WarmStart
 
 
-# Compiled as a whole: otherwise every call would compile the loops of a solver again.
-@eqx.filter_jit
 def solve(
     model: TransitionModel,
     task: Task,
-    behavior: Behavior,
+    behavior: Behavior | BehaviorModel,
     *,
     options: SolveOptions | None = None,
     start: base.WarmStart | None = None,
@@ -130,7 +137,8 @@ def solve(
     Args:
         model: The transition model.
         task: One task, or several by `stack_tasks`.
-        behavior: The backup that agents value states with, and their β.
+        behavior: The backup that agents value states with, and their β; a `BehaviorModel` also has a discount, reward
+            weights, costs and the β of each task's person.
         options: How the values are computed; by default `SolveOptions()`.
         start: The `start` of an earlier solution of the same task or tasks; by default a cold start. Within the
             region, the solution does not depend on it beyond the tolerance. The gradient with respect to
@@ -143,7 +151,11 @@ def solve(
             use this only where the result is checked later, such as in a line search.
 
     Returns:
-        The solution. Check `converged` before use; `check_proper` tells in advance whether values exist.
+        The solution. Check `converged` before use.
+
+    Raises:
+        InputError: For a task of another world, and parameters that are not finite.
+        ImproperTask: For a task without values (see `check_proper`). Under `jit` this is not checked.
 
     Example:
         >>> from sidestep.tabular.backups import HardMax
@@ -159,44 +171,75 @@ def solve(
         points: Christianson, "Reverse accumulation and attractive fixed points" (1994).
     """
     options = options or SolveOptions()
+    check_behavior(behavior, learned=True)
+    agents = as_behavior_model(behavior)
+    check_model(model)
+    check_task(task, model.graph)
+    if task.terminal.ndim == 2:
+        check_persons(behavior, len(task.terminal))
+    if not is_traced(model, task, behavior):
+        check_proper(agents.tasks_of(task), agents.behavior_of(), model.graph, options.horizon)
+    return _solve(model, task, agents, options, start, visited, region)
+
+
+# Compiled as a whole: otherwise every call would compile the loops of a solver again.
+@eqx.filter_jit
+def _solve(
+    model: TransitionModel,
+    task: Task,
+    agents: BehaviorModel,
+    options: SolveOptions,
+    start: base.WarmStart | None,
+    visited: Int[Array, "*tasks visited"] | None,
+    region: Bool[Array, "*tasks states"] | None,
+) -> Solution:
+    task, behavior = agents.tasks_of(task), agents.behavior_of()
     solver = options.solver_for(behavior.backup, model.graph.states)
     probabilities = model.probabilities()
-    dtype, beta = probabilities.dtype, behavior.beta.astype(probabilities.dtype)
+    dtype = probabilities.dtype
     cold, tasks = solver.cold_start(model.graph.states, dtype), task.terminal.shape[:-1]
     begin = start or jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*tasks, *leaf.shape)), cold)
     everywhere = jnp.ones(task.terminal.shape, dtype=bool) if region is None else region
+    betas = agents.betas(*tasks).astype(dtype) if tasks else behavior.beta.astype(dtype)
 
-    def one(task: Task, start: base.WarmStart, visited: Array | None, region: Array) -> Solution:
+    def one(task: Task, start: base.WarmStart, visited: Array | None, region: Array, beta: Array) -> Solution:
         process = decision_process(model, probabilities, task)
         some = jnp.zeros(0, jnp.int32) if visited is None else visited
         if options.horizon is None:
             equation = base.BellmanEquation(process, behavior.backup, beta)
             inputs, fixed = equation.inputs, jax.lax.stop_gradient((equation.inputs, start))
             result = solver.values(equation.at(fixed[0]), fixed[1], region)
-            constants = (process.successors, process.terminal, solver, result.order, region, some)
+            structure = process.successors, process.terminal, process.available
+            constants = (*structure, solver, result.order, region, some)
             solved = fixed_point(behavior.backup, options.gradient, constants, inputs, result.values, start.adjoint)
             values, rows = cast(tuple[Array, Array], solved)
+            after = values
         else:
-            values = base.finite_horizon(process, behavior.backup, beta, options.horizon, options.gradient)
+            values, after = base.finite_horizon(process, behavior.backup, beta, options.horizon, options.gradient)
             sweeps, residual = jnp.asarray(options.horizon), jnp.asarray(0, values.dtype)
             result = base.SolveResult(values, start.order, sweeps, residual, jnp.isfinite(values).all())
             rows = probabilities[some]
         if visited is None:
-            q = process.action_values(values)
+            here, advantages = after, process.advantages(after)
         else:
-            reward = process.reward[visited] if len(process.reward) > 1 else process.reward
-            after = values[process.successors[visited]]
-            q = base.action_values(values[visited], after, rows, reward, process.discount)
+            parts = process.reward, process.available
+            reward, available = (part[visited] if len(part) > 1 else part for part in parts)
+            here, leads_to = after[visited], after[process.successors[visited]]
+            advantages = base.advantages(here, leads_to, rows, reward, available, process.discount)
+        q = base.finite_or_zero(here)[:, None] + advantages
         next_start = base.WarmStart(jax.lax.stop_gradient(values), start.adjoint, result.order)
-        return Solution(values, q, result.sweeps, result.residual, result.converged, next_start)
+        info = result.sweeps, result.residual, result.converged
+        return Solution(values, after, q, advantages, *info, next_start)
 
-    return (jax.vmap(one) if task.terminal.ndim == 2 else one)(task, begin, visited, everywhere)
+    return (jax.vmap(one) if tasks else one)(task, begin, visited, everywhere, betas)
 
 
 def decision_process(
     model: TransitionModel, probabilities: Float[Array, "states actions outcomes"], task: Task
 ) -> base.DecisionProcess:
     """Return one task under a model with these probabilities, in numbers of their dtype.
+
+    Its rewards are the expected ones, R(s, a) + Σ_s′ T(s, a, s′) R(s, a, s′), with the gradient by the probabilities.
 
     Args:
         model: The transition model.
@@ -205,51 +248,7 @@ def decision_process(
     """
     cast = (leaf.astype(probabilities.dtype) for leaf in (task.reward, task.terminal_reward, task.discount))
     reward, terminal_reward, discount = cast
-    return base.DecisionProcess(model.graph.successors, probabilities, reward, terminal_reward, task.terminal, discount)
-
-
-def check_proper(task: Task, behavior: Behavior, actions: int, horizon: int | None = None) -> None:
-    """Check that the values of every task are finite and unique.
-
-    Tasks with a finite horizon or a discount below 1 are proper. At discount 1 a task needs a terminal state and every
-    action must have a cost; with the log-sum-exp backup one above log(actions)/β, the entropy bonus of an action, as
-    agents otherwise gain by never arriving.
-
-    Args:
-        task: One task or a stack.
-        behavior: Of the agents.
-        actions: The number of actions.
-        horizon: As in `SolveOptions`.
-
-    Raises:
-        InputError: For a task or behavior of another type.
-        ImproperTask: Where values are infinite or not unique.
-
-    Example:
-        >>> from sidestep.tabular.grid import Grid
-        >>> from sidestep.tabular.tasks import reach
-        >>> goal = reach(Grid.unknown(2, 2), 0, discount=1.0, step_cost=1.0)
-        >>> check_proper(goal, Behavior(LogSumExp(), beta=10.0), actions=4)
-    """
-    check(isinstance(task, Task), f"expected a Task, found {type(task).__name__}", field="task")
-    check(isinstance(behavior, Behavior), f"expected a Behavior, found {type(behavior).__name__}", field="behavior")
-    endless = np.atleast_1d(np.asarray(task.discount)) == 1
-    if horizon is not None or not endless.any():
-        return
-    terminal = np.atleast_2d(np.asarray(task.terminal))
-    reward = np.asarray(task.reward).reshape(-1, *task.reward.shape[-2:]).max(axis=-1)
-    acting = np.where(terminal, -np.inf, np.broadcast_to(reward, terminal.shape)).max(axis=-1)
-    if (endless & ~terminal.any(axis=-1)).any():
-        raise ImproperTask("a task with discount 1 needs a terminal state: expected one, or a discount below 1")
-    if (endless & (acting >= 0)).any():
-        raise ImproperTask(
-            "at discount 1 every action must cost something: expected rewards below 0, a discount below 1 (.99, say), "
-            "or for tasks of few actions `SolveOptions(horizon=…)`"
-        )
-    bonus = np.log(actions) / float(behavior.beta)
-    if isinstance(behavior.backup, LogSumExp) and (endless & (acting >= -bonus)).any():
-        raise ImproperTask(
-            f"at discount 1 a log-sum-exp agent with β = {float(behavior.beta):g} and {actions} actions gains "
-            f"log(actions)/β = {bonus:.4g} with every action, so an endless path is worth more than one to the goal: "
-            "expected a step cost above that, a larger β, a discount below 1 or another backup"
-        )
+    if task.outcome_reward is not None:
+        reward = reward + jnp.sum(probabilities * task.outcome_reward.astype(probabilities.dtype), axis=-1)
+    structure = task.terminal, model.graph.available
+    return base.DecisionProcess(model.graph.successors, probabilities, reward, terminal_reward, *structure, discount)

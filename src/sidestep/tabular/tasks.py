@@ -1,17 +1,23 @@
 """Tasks: the goals of agents, each a reward function, a discount and terminal states.
 
-An action a in a state s pays R(s, a). A terminal state ends the task: no action is taken there, it pays its terminal
-reward once. The paper's reward R(s) "1 at the goal and 0 elsewhere" is a terminal reward of 1 at the goal.
+An action a in a state s pays R(s, a), and R(s, a, s′) where the reward depends on what follows:
+
+    Q(s, a) = R(s, a) + Σ_s′ T_θ(s, a, s′) (R(s, a, s′) + γ V(s′)).
+
+A terminal state ends the task: no action is taken there, it pays its terminal reward once. The paper's reward R(s)
+"1 at the goal and 0 elsewhere" is a terminal reward of 1 at the goal.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
 from sidestep.errors import InputError, check, check_positive
 from sidestep.tabular.arrays import to_jax
@@ -27,6 +33,8 @@ class Task(eqx.Module):
         terminal_reward: The reward of terminal states; ignored elsewhere.
         terminal: Where the task ends.
         discount: γ in (0, 1].
+        outcome_reward: R(s, a, s′) of each outcome of the model's graph, beside R(s, a); None for none. An axis of
+            length 1 holds for all states, actions or outcomes.
 
     Example:
         >>> reach(Grid.unknown(rows=1, columns=3), 2, discount=1.0, step_cost=1.0).reward.tolist()
@@ -37,19 +45,24 @@ class Task(eqx.Module):
     terminal_reward: Float[Array, "*tasks #states"]
     terminal: Bool[Array, "*tasks states"]
     discount: Float[Array, "*tasks"]
+    outcome_reward: Float[Array, "*tasks #states #actions #outcomes"] | None = None
 
 
 def task(
-    reward: Float[Array, " states"] | Float[Array, "states actions"] | np.ndarray,
+    reward: Shaped[ArrayLike, "..."] | Sequence[Any],
     discount: float,
-    terminal: Bool[Array, " states"] | np.ndarray,
+    terminal: Shaped[ArrayLike, "..."] | Sequence[bool],
+    *,
+    world: Graph | None = None,
 ) -> Task:
     """Return a task from a complete reward function.
 
     Args:
-        reward: R(s), which terminal states pay too, or R(s, a), with which terminal states pay nothing.
+        reward: R(s), which terminal states pay too, R(s, a), or R(s, a, s′) for every state s′ with `world`; terminal
+            states pay nothing with the last two.
         discount: γ in (0, 1].
         terminal: Whether the task ends in each state.
+        world: The graph of the model, for R(s, a, s′).
 
     Raises:
         InputError: For a reward that is not finite or has another shape, and for a discount outside (0, 1].
@@ -58,19 +71,47 @@ def task(
         >>> task(np.array([-1.0, -1.0, 5.0]), 0.9, np.array([False, False, True])).reward.shape
         (3, 1)
     """
-    reward, terminal = np.asarray(reward), np.asarray(terminal)
+    rewards, ends = np.asarray(reward), np.asarray(terminal)
     check(
-        reward.ndim in (1, 2) and terminal.shape == reward.shape[:1] and terminal.dtype == bool,
-        f"expected shapes (states,) or (states, actions) and booleans (states,), found {reward.shape} and "
-        f"{terminal.dtype} {terminal.shape}",
+        rewards.ndim in (1, 2, 3) and ends.shape == rewards.shape[:1] and ends.dtype == bool and rewards.size,
+        "expected shapes (states,), (states, actions) or (states, actions, states) and booleans (states,), found "
+        f"{rewards.shape} and {ends.dtype} {ends.shape}",
         field="reward, terminal",
     )
-    check(np.isfinite(reward).all(), "expected finite numbers", field="reward")
+    numbers = rewards.dtype.kind in "fiu" and np.isfinite(rewards).all()
+    check(numbers, f"expected finite numbers, found {_example_of(rewards)}", field="reward")
     check_discount(discount)
-    reward = reward.astype(jnp.result_type(float))
-    if reward.ndim == 1:
-        return _task(reward[:, None], reward, terminal, discount)
-    return _task(reward, np.zeros(1), terminal, discount)
+    rewards = rewards.astype(jnp.result_type(float))
+    if rewards.ndim == 1:
+        return _task(rewards[:, None], rewards, ends, discount)
+    if rewards.ndim == 2:
+        return _task(rewards, np.zeros(1), ends, discount)
+    message = "expected the graph of the model beside reward, terminal, for a reward R(s, a, s′)"
+    check(isinstance(world, Graph), message, field="world")
+    assert world is not None
+    shape = world.states, world.actions, world.states
+    check(rewards.shape == shape, f"expected R(s, a, s′) of shape {shape}, found {rewards.shape}", field="reward")
+    successors = np.asarray(world.successors)
+    of_outcomes = np.take_along_axis(rewards, successors, axis=-1)
+    made = _task(np.zeros((1, 1)), np.zeros(1), ends, discount)
+    return with_outcome_reward(made, of_outcomes)
+
+
+def with_outcome_reward(made: Task, rewards: Float[ArrayLike, "states actions outcomes"]) -> Task:
+    """Return a task that also pays R(s, a, s′), one number for each outcome of the model's graph.
+
+    Args:
+        made: One task.
+        rewards: R(s, a, s′ₖ) of every outcome k.
+    """
+    return replace(made, outcome_reward=to_jax(np.asarray(rewards), jnp.result_type(float)))
+
+
+def _example_of(array: np.ndarray) -> str:
+    """Return the first entry that is not a finite number, or the type where none is a number."""
+    if array.dtype.kind not in "fiu":
+        return f"type {array.dtype}"
+    return str(array[~np.isfinite(array)][:1])
 
 
 def reach(
@@ -113,14 +154,23 @@ def stack_tasks(tasks: Sequence[Task]) -> Task:
         tasks: At least one, all in the same world.
 
     Raises:
-        InputError: For no tasks.
+        InputError: For no tasks, something else than single tasks, and tasks of different worlds.
 
     Example:
         >>> grid = Grid.unknown(rows=1, columns=3)
         >>> stack_tasks([reach(grid, 0), reach(grid, 2)]).terminal.shape
         (2, 3)
     """
-    check(tasks, "expected at least one task", field="tasks")
+    check(len(tasks), "expected at least one task, found none", field="tasks")
+    for index, each in enumerate(tasks):
+        single = isinstance(each, Task) and each.terminal.ndim == 1
+        kind = "a stack of tasks" if isinstance(each, Task) else type(each).__name__
+        check(single, f"expected a Task, found {kind} at position {index}", field="tasks")
+    sizes = sorted({len(each.terminal) for each in tasks})
+    check(len(sizes) == 1, f"expected tasks of one world, found worlds of {sizes} states", field="tasks")
+    if any(each.outcome_reward is not None for each in tasks):
+        zero = to_jax(np.zeros((1, 1, 1)))
+        tasks = [replace(each, outcome_reward=zero) if each.outcome_reward is None else each for each in tasks]
 
     def stacked(*leaves: Array) -> Array:
         shape = np.broadcast_shapes(*(leaf.shape for leaf in leaves))
@@ -149,7 +199,7 @@ def with_state_costs(tasks: Task, costs: Float[Array, " states"], aimed_at: Int[
         >>> with_state_costs(reach(grid, 2), jnp.array([0.0, 0.25, 0.0]), aimed_at).reward[0].tolist()
         [0.0, 0.0, 0.0, -0.25]
     """
-    return Task(tasks.reward - costs[aimed_at], tasks.terminal_reward, tasks.terminal, tasks.discount)
+    return replace(tasks, reward=tasks.reward - costs[aimed_at])
 
 
 def _task(reward: np.ndarray, terminal_reward: np.ndarray, terminal: np.ndarray, discount: float) -> Task:

@@ -64,7 +64,7 @@ CASES = [
         ("a checkpoint of a number", lambda: ss.fit(MODEL, DEMOS, BEHAVIOR, checkpoint=3), "checkpoint"),
         ("a checkpoint's interval", lambda: ss.fit(MODEL, DEMOS, BEHAVIOR, checkpoint=ss.Checkpoint("a", min_interval=-1)), "min_interval"),
         ("a checkpoint's fraction", lambda: ss.fit(MODEL, DEMOS, BEHAVIOR, checkpoint=ss.Checkpoint("a", max_fraction=0)), "max_fraction"),
-        ("an action that the model lacks", lambda: ss.fit(MODEL, ss.gather([walk([0, 1], [7])], [TASK]), BEHAVIOR), "actions up to 7"),
+        ("an action that the model lacks", lambda: ss.fit(MODEL, ss.gather([walk([0, 1], [7])], [TASK]), BEHAVIOR), "expected action 0…3 in move 0, found 7"),
     ]),
     *labeled("optimizers", [
         ("LBFGS, tolerance NaN", lambda: ss.LBFGS(max_iterations=2, tolerance=NAN), "tolerance"),

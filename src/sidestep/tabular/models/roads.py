@@ -1,8 +1,8 @@
 """Road networks: states are links, actions are the turns out of a link, and links or turns may be closed.
 
 A turn from link l onto link m succeeds unless m (or the turn itself) is closed, with P(closed) = σ(θ); otherwise the
-agent stays on l. Links have different numbers of turns; a missing turn stays on the link and is as long as all links
-together, so that agents that pay by length do not take it.
+agent stays on l. Links have different numbers of turns; a missing turn is an action that is not available. A link
+without any turn has one action, which stays there and is as long as all links together.
 """
 
 import jax
@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from sidestep.errors import check
 from sidestep.tabular.arrays import to_jax
-from sidestep.tabular.graph import Graph
+from sidestep.tabular.graph import Graph, with_available
 from sidestep.tabular.models.categorical import FIXED, IMPOSSIBLE, Logits, TiedModel, logit_array
 
 
@@ -31,7 +31,8 @@ def road_network(
         by_turn: Whether turns may be closed rather than links.
 
     Returns:
-        The model; action k of a link is the k-th of its turns, in the order of `turns`.
+        The model; action k of a link is the k-th of its turns, in the order of `turns`, and the only available ones
+        are these (`model.graph.available`).
 
     Raises:
         InputError: For turns that repeat or between links that do not exist, and for lengths out of range.
@@ -55,9 +56,11 @@ def road_network(
     index[..., 1] = FIXED
     index[begin, action, 0] = FIXED
     index[begin, action, 1] = order if by_turn else onto
-    costs = np.full(successors.shape[:2], lengths.sum())
+    costs, available = np.full(successors.shape[:2], lengths.sum()), np.zeros(successors.shape[:2], bool)
     costs[begin, action] = lengths[onto]
-    graph = Graph(to_jax(successors, np.int32), to_jax(costs))
+    available[begin, action] = True
+    available[~available.any(axis=1), 0] = True
+    graph = with_available(Graph(to_jax(successors, np.int32), to_jax(costs)), available)
     count = len(turns) if by_turn else links
     return TiedModel(graph, index, logit_array(logits, (count,)))
 

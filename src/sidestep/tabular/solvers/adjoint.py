@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sidestep.tabular.solvers import adjoint_kernels, native
-from sidestep.tabular.solvers.base import Cotangents, SolveResult, WarmStart, neg_inf
+from sidestep.tabular.solvers.base import Cotangents, SolveResult, WarmStart
 
 _COARSEST = 1e-3
 """The first threshold, as a part of the residuals' sum; so that small residuals add up first."""
@@ -52,8 +52,7 @@ def vjp_of_process(
         _fill(residual, result.values, *by)
         native.write_info(result, order, native.SolveInfo(0, residual, bool(total == 0)))
         return
-    reachable_above = number(-((-neg_inf(values.dtype)) ** 0.5))
-    problem = adjoint_kernels.AdjointProblem(equation.backup, exact, values, reachable_above, order, position)
+    problem = adjoint_kernels.AdjointProblem(equation.backup, exact, values, order, position)
     known = np.where(np.isfinite(first), first, number(0))
     actions, outcomes, width = process.kernel_sizes()
     work = _empty_state(process, width, known[order], cotangent[order])
@@ -137,7 +136,7 @@ class _AdjointSolve(NamedTuple):
     def omission_cost(self, region: Bool[np.ndarray, " states"]) -> float:
         """Return the cost of the states outside the region that were not solved, as a part of Σ |λ V|."""
         kernels, process, problem, work = self
-        is_reachable = problem.values > problem.reachable_above
-        size = np.abs(work.adjoint * np.where(is_reachable, problem.values, 0)[problem.order]).sum()
+        finite = np.where(problem.values > -np.inf, problem.values, 0)
+        size = np.abs(work.adjoint * finite[problem.order]).sum()
         cost = kernels.omission_cost(process, problem, work.adjoint, region)
         return float(cost / size) if size > 0 else float(np.inf if cost > 0 else cost)

@@ -28,15 +28,13 @@ class AdjointProblem(NamedTuple):
     Attributes:
         backup: The backup.
         exact: Whether the gradient is the backup's own, or that of the policy held fixed.
-        values: V.
-        reachable_above: The value below which no terminal state can be reached.
+        values: V; −∞ in states that have no part in a gradient.
         order: The states, nearest first; `position` is its inverse.
     """
 
     backup: native.NativeBackup
     exact: bool
     values: np.ndarray
-    reachable_above: np.floating
     order: np.ndarray
     position: np.ndarray
 
@@ -88,8 +86,11 @@ class AdjointKernels(NamedTuple):
 
 
 @native.inlined()
-def differentiate_backup(backup, exact, scratch):  # pragma: no cover
-    """Fill in the weights of the gradient and the policy by action values; return the gradient by β."""
+def differentiate_backup(backup, exact, count, scratch):  # pragma: no cover
+    """Fill in the weights of the gradient and the policy by action values; return the gradient by β.
+
+    Action values are −∞ for actions that are never taken; `count` is the number of available ones.
+    """
     kind, beta, tie, actions = backup.kind, backup.beta, backup.tie, len(scratch.action_values)
     best = scratch.action_values[0]
     for a in range(1, actions):
@@ -104,38 +105,52 @@ def differentiate_backup(backup, exact, scratch):  # pragma: no cover
     average = 0.0 * best
     for a in range(actions):
         scratch.policy[a] /= total
-        average += scratch.policy[a] * (scratch.action_values[a] - best)
+        if scratch.policy[a] > 0:
+            average += scratch.policy[a] * (scratch.action_values[a] - best)
     variance = 0.0 * best
     for a in range(actions):
-        difference, probability = scratch.action_values[a] - best - average, scratch.policy[a]
-        # in this order, because an action that is never taken may be worth all but −∞
-        variance += probability * difference * difference
-        scratch.weights[a] = (
-            probability * (1 + beta * difference) if kind == native.BOLTZMANN and exact else probability
-        )
+        probability = scratch.policy[a]
+        scratch.weights[a] = probability
+        if probability > 0:
+            difference = scratch.action_values[a] - best - average
+            variance += probability * difference * difference
+            if kind == native.BOLTZMANN and exact:
+                scratch.weights[a] = probability * (1 + beta * difference)
     by_beta = 0.0 * best
     if exact and kind == native.BOLTZMANN:
         by_beta = variance
     elif exact and kind != native.HARD_MAX:
-        by_beta = (average - np.log(total / (actions if kind == native.MELLOWMAX else 1)) / beta) / beta
+        by_beta = (average - np.log(total / (count if kind == native.MELLOWMAX else 1)) / beta) / beta
     return by_beta
 
 
 @native.inlined()
+def available_count(available, state, actions):  # pragma: no cover
+    """Return the number of actions that are available in a state."""
+    count = 0
+    for a in range(actions):
+        count += available[state if available.shape[0] > 1 else 0, a if available.shape[1] > 1 else 0]
+    return count
+
+
+@native.inlined()
 def _expected_value(process, values, state, a, outcomes):  # pragma: no cover
-    """Return the expected value after an action, summed as in `action_values`."""
+    """Return the expected value after an action, summed as in `action_values`; −∞ if it may lead to such a state."""
     here = values[state]
     expected = here
     for k in range(outcomes):
         after = process.successors[state, a, k]
-        if after != state:
+        if after != state and process.probabilities[state, a, k] > 0:
             expected += process.probabilities[state, a, k] * (values[after] - here)
     return expected
 
 
 @native.inlined()
 def _action_value(process, values, state, a, outcomes):  # pragma: no cover
-    """Return Q(s, a)."""
+    """Return Q(s, a), −∞ for an action that is not available."""
+    available = process.available
+    if not available[state if available.shape[0] > 1 else 0, a if available.shape[1] > 1 else 0]:
+        return -np.inf
     reward = process.reward[state if process.reward.shape[0] > 1 else 0, a if process.reward.shape[1] > 1 else 0]
     return reward + process.discount * _expected_value(process, values, state, a, outcomes)
 
@@ -144,11 +159,12 @@ def _action_value(process, values, state, a, outcomes):  # pragma: no cover
 def _fill_row(i, row, actions, outcomes, width, process, problem, work, scratch):  # pragma: no cover
     """Fill in the row of the state at position i; zeros if it is terminal or cannot reach a terminal state."""
     state = problem.order[i]
-    is_live = problem.values[state] > problem.reachable_above and not process.terminal[state]
+    is_live = problem.values[state] > -np.inf and not process.terminal[state]
     for a in range(actions):
         action_value = _action_value(process, problem.values, state, a, outcomes) if is_live else 0.0
         scratch.action_values[a] = action_value
-    by_beta = differentiate_backup(problem.backup, problem.exact, scratch)
+    count = available_count(process.available, state, actions)
+    by_beta = differentiate_backup(problem.backup, problem.exact, count, scratch)
     exit_weight, policy_exit = 0.0 * process.discount, 0.0 * process.discount
     for a in range(actions):
         weight, action_exit, m = scratch.weights[a] if is_live else 0.0, 1 - process.discount, 0
@@ -225,12 +241,12 @@ def kernels_for(actions: int, outcomes: int, width: int) -> AdjointKernels:
         cost = 0.0 * process.discount
         for i in range(len(adjoint)):
             state = problem.order[i]
-            is_live = not process.terminal[state] and values[state] > problem.reachable_above
+            is_live = not process.terminal[state] and values[state] > -np.inf
             if region[state] or adjoint[i] == 0 or not is_live:
                 continue
             for a in range(actions):
                 scratch.advantages[a] = _action_value(process, values, state, a, outcomes) - values[state]
-            gain, _ = backed_up(problem.backup, scratch)
+            gain, _ = backed_up(problem.backup, available_count(process.available, state, actions), scratch)
             cost += abs(adjoint[i] * gain)
         return cost
 
@@ -254,11 +270,16 @@ def kernels_for(actions: int, outcomes: int, width: int) -> AdjointKernels:
             by.beta[()] += weight * beta[own]
             for a in range(actions):
                 by_action = weight * weights[own, a]
+                if by_action == 0:
+                    for k in range(outcomes):
+                        by.probabilities[state, a, k] = 0
+                    continue
                 by.reward[state if by.reward.shape[0] > 1 else 0, a if by.reward.shape[1] > 1 else 0] += by_action
                 by.discount[()] += by_action * _expected_value(process, values, state, a, outcomes)
                 for k in range(outcomes):
                     after = process.successors[state, a, k]
-                    if after != state:
+                    # an impossible outcome may lead to a state of value −∞
+                    if after != state and values[after] > -np.inf:
                         difference = values[after] - values[state]
                         by.probabilities[state, a, k] += by_action * process.discount * difference
 

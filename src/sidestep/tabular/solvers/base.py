@@ -37,8 +37,10 @@ and that has to be within the tolerance of Σ |λ(s) V(s)|. This is to first ord
 that is not taken, because λ is 0 there, may have become the best one unseen: so leave states out only in trial points
 that are solved again.
 
-At discount 1 the values of states that cannot reach a terminal state are −∞; they are held at `neg_inf(dtype)`, so low
-that an action which may lead there is never taken.
+**Infinite values.** At discount 1 every action costs something, so the value of a state is −∞ unless some policy surely
+reaches a terminal state from there (`reachability`). An action that may lead to such a state is worth −∞ and is never
+taken. Both are masks: values of −∞ are compared with, and take part in no sum. The same −∞ stands for "not known yet"
+in a start.
 """
 
 import abc
@@ -65,38 +67,59 @@ class DecisionProcess(eqx.Module):
     reward: Float[Array, "#states #actions"]
     terminal_reward: Float[Array, "#states"]
     terminal: Bool[Array, " states"]
+    available: Bool[Array, "#states #actions"]
     discount: Float[Array, ""]
 
     def action_values(self, values: Float[Array, " states"]) -> Float[Array, "states actions"]:
-        """Return Q(s, a) of all states; see `action_values`."""
-        return action_values(values, values[self.successors], self.probabilities, self.reward, self.discount)
+        """Return Q(s, a) = R(s, a) + γ Σ T V (eq. 4) of all states."""
+        return finite_or_zero(values)[:, None] + self.advantages(values)
+
+    def advantages(self, values: Float[Array, " states"]) -> Float[Array, "states actions"]:
+        """Return Q(s, a) − V(s) of all states; see `advantages`."""
+        after = values[self.successors]
+        return advantages(values, after, self.probabilities, self.reward, self.available, self.discount)
+
+    def available_actions(self) -> Bool[Array, "states actions"] | None:
+        """Return which actions are available; None where all are."""
+        is_mask = self.available.shape != (1, 1)
+        return jnp.broadcast_to(self.available, self.successors.shape[:2]) if is_mask else None
 
     def with_terminal_rewards(self, values: Float[Array, " states"]) -> Float[Array, " states"]:
         """Return the values with those of terminal states put in."""
         return jnp.where(self.terminal, self.terminal_reward, values)
 
 
-def action_values(
+def advantages(
     values: Float[Array, " some"],
     values_after: Float[Array, "some actions outcomes"],
     probabilities: Float[Array, "some actions outcomes"],
     reward: Float[Array, "#some #actions"],
+    available: Bool[Array, "#some #actions"],
     discount: Float[Array, "*#some"],
 ) -> Float[Array, "some actions"]:
-    """Return Q(s, a) = R(s, a) + γ Σ T V (eq. 4) of some states, from their values and those of their successors.
+    """Return A(s, a) = Q(s, a) − V(s) of some states, from their values and those of their successors.
 
     Summed as differences from V(s), so that the rounding of probabilities that are nearly 1 does not meet values that
-    are large: where actions mostly fail it would exceed the gradient.
+    are large: where actions mostly fail it would exceed the gradient. A is −∞ for actions that are not available or may
+    lead to a state of value −∞.
     """
-    differences = values_after - values[:, None, None]
-    return reward + discount * (values[:, None] + jnp.sum(probabilities * differences, axis=-1))
+    here, is_lost = finite_or_zero(values)[:, None], jnp.isneginf(values_after)
+    differences = jnp.where(is_lost, 0, values_after - here[..., None])
+    gained = reward + discount * jnp.sum(probabilities * differences, axis=-1) - (1 - discount) * here
+    never = ~available | jnp.any(is_lost & (probabilities > 0), axis=-1)
+    return jnp.where(never, -jnp.inf, gained)
+
+
+def finite_or_zero(values: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return values, and 0 instead of −∞."""
+    return jnp.where(jnp.isneginf(values), 0, values)
 
 
 class WarmStart(NamedTuple):
     """What a solve may start from: what an earlier one of the same task left, under a model nearby.
 
     Attributes:
-        values: V; `neg_inf(dtype)` where unknown.
+        values: V; −∞ where unknown.
         adjoint: λ; 0 where unknown. The gradient of a solution with respect to it is the new λ (see `solve`).
         order: The states by their distance from where the task ends, for solvers that use one; −1 for none yet.
     """
@@ -137,8 +160,9 @@ class BellmanEquation(NamedTuple):
 
     def at(self, inputs: Cotangents) -> "BellmanEquation":
         """Return the equation at another φ."""
-        process = DecisionProcess(self.process.successors, *inputs[:3], self.process.terminal, inputs.discount)
-        return BellmanEquation(process, self.backup, inputs.beta)
+        process = self.process
+        arrays = process.successors, *inputs[:3], process.terminal, process.available
+        return BellmanEquation(DecisionProcess(*arrays, inputs.discount), self.backup, inputs.beta)
 
     def is_live(self, values: Values) -> Bool[Array, " states"]:
         """Return whether each state has actions and finite values; the others have no part in a gradient."""
@@ -146,11 +170,13 @@ class BellmanEquation(NamedTuple):
 
     def backed_up(self, values: Values, gradient: Gradient = "exact") -> Values:
         """Return F(V, φ), 0 in states without finite values; differentiable by the gradient asked for."""
-        live = self.is_live(values)
-        q = jnp.where(live[:, None], self.process.action_values(values), 0)
-        exact = gradient == "exact"
-        backed_up = self.backup.value(q, self.beta) if exact else at_fixed_policy(self.backup, self.beta, q)
-        return self.process.with_terminal_rewards(jnp.where(live, backed_up, 0))
+        live, process = self.is_live(values), self.process
+        q = jnp.where(live[:, None], process.action_values(values), 0)
+        if gradient == "exact":
+            backed_up = self.backup.value(q, self.beta, process.available_actions())
+        else:
+            backed_up = at_fixed_policy(self.backup, self.beta, q, process.available_actions())
+        return process.with_terminal_rewards(jnp.where(live, backed_up, 0))
 
 
 class SolveResult(NamedTuple):
@@ -223,50 +249,45 @@ class Solver(eqx.Module):
 
 def finite_horizon(
     process: DecisionProcess, backup: Backup, beta: Beta, horizon: int, gradient: Gradient
-) -> Float[Array, " states"]:
-    """Return V after `horizon` backups from zero: the value of acting that many times.
+) -> tuple[Values, Values]:
+    """Return V after `horizon` backups from zero, the value of acting that many times, and V after one backup less.
 
-    Differentiable by JAX itself; `gradient` chooses the exact one or that of the policies held fixed.
+    Q of an agent that looks `horizon` actions ahead is R + γ Σ T V with the second. Differentiable by JAX itself;
+    `gradient` chooses the exact one or that of the policies held fixed.
     """
 
-    def step(values: Float[Array, " states"], _: None) -> tuple[Float[Array, " states"], None]:
-        q = process.action_values(values)
+    def back_up(values: Values) -> Values:
+        q, available = process.action_values(values), process.available_actions()
         if gradient == "exact":
-            return process.with_terminal_rewards(backup.value(q, beta)), None
-        return process.with_terminal_rewards(at_fixed_policy(backup, beta, q)), None
+            return process.with_terminal_rewards(backup.value(q, beta, available))
+        return process.with_terminal_rewards(at_fixed_policy(backup, beta, q, available))
 
     start = process.with_terminal_rewards(jnp.zeros(process.terminal.shape, process.probabilities.dtype))
-    return jax.lax.scan(step, start, length=horizon)[0]
-
-
-def neg_inf(dtype: jnp.dtype) -> float:
-    """Return the stand-in for −∞: so low that a step cost more makes no difference to it."""
-    return -1e200 if dtype == jnp.float64 else -1e25
-
-
-def reachable_above(dtype: jnp.dtype) -> float:
-    """Return the number above which values at discount 1 are of states from which a terminal state can be reached."""
-    return -((-neg_inf(dtype)) ** 0.5)
+    after = jax.lax.scan(lambda values, _: (back_up(values), None), start, length=horizon - 1)[0]
+    return back_up(after), after
 
 
 def is_reachable(values: Float[Array, "*states"]) -> Bool[Array, "*states"]:
-    """Return whether a terminal state can be reached, by values at discount 1: whether they are far above `neg_inf`."""
-    return values > reachable_above(values.dtype)
+    """Return whether a terminal state can be reached, by values at discount 1: whether they are above −∞."""
+    return values > -jnp.inf
 
 
-def at_fixed_policy(backup: Backup, beta: Beta, q: Float[Array, "states actions"]) -> Float[Array, " states"]:
+def at_fixed_policy(
+    backup: Backup, beta: Beta, q: Float[Array, "states actions"], available: Bool[Array, "states actions"] | None
+) -> Float[Array, " states"]:
     """Return the backup's value with the gradient of the average under its policy, held fixed (eqs. 9 and 10)."""
-    weights, value = jax.lax.stop_gradient((backup.fixed_policy_weights(q, beta), backup.value(q, beta)))
-    return value + jnp.sum(weights * (q - jax.lax.stop_gradient(q)), axis=-1)
+    weights, value = jax.lax.stop_gradient((backup.fixed_policy_weights(q, beta), backup.value(q, beta, available)))
+    finite = finite_or_zero(q)
+    return value + jnp.sum(weights * (finite - jax.lax.stop_gradient(finite)), axis=-1)
 
 
 def lower_bound(process: DecisionProcess) -> Float[Array, ""]:
-    """Return a lower bound of the values: below discount 1, the best action of the worst state for ever."""
+    """Return a lower bound of the values: below discount 1, the best action of the worst state for ever; else −∞."""
     dtype = process.probabilities.dtype
-    best = jnp.broadcast_to(process.reward.max(axis=-1), process.terminal.shape)
-    worst = jnp.where(process.terminal, jnp.inf, best).min()
+    best = jnp.where(process.available, process.reward, -jnp.inf).max(axis=-1)
+    worst = jnp.where(process.terminal, jnp.inf, jnp.broadcast_to(best, process.terminal.shape)).min()
     worst = jnp.where(jnp.isfinite(worst), worst, 0)
     one_minus_discount = 1 - process.discount
     is_discounted = one_minus_discount > 0
-    bound = jnp.where(is_discounted, worst / jnp.where(is_discounted, one_minus_discount, 1), neg_inf(dtype))
+    bound = jnp.where(is_discounted, worst / jnp.where(is_discounted, one_minus_discount, 1), -jnp.inf)
     return bound.astype(dtype)

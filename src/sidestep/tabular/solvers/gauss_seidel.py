@@ -69,7 +69,7 @@ class GaussSeidel(base.Solver):
 
     def cold_start(self, states: int, dtype: jnp.dtype) -> WarmStart:
         """Return a start without values, adjoint and order."""
-        return WarmStart(jnp.full(states, base.neg_inf(dtype), dtype), jnp.zeros(states, dtype), _no_order(states))
+        return WarmStart(jnp.full(states, -jnp.inf, dtype), jnp.zeros(states, dtype), _no_order(states))
 
     def values(self, equation: BellmanEquation, start: WarmStart, region: Region) -> base.SolveResult:
         """Return V of the fixed point; of all states where the start's values turn out to be of no use."""

@@ -4,8 +4,9 @@ The textbook method (value iteration, Bellman 1957; Puterman, *Markov Decision P
 all values at once by their backups. This one differs:
 
 1. Each state's own equation is solved by a Newton step instead of a backup (see `base`).
-2. At discount 1 values start from −∞ and are computed outwards from the terminal states, as in a shortest-path search;
-   until that is done, an outcome that leads to a state without a value yet counts as staying.
+2. At discount 1 values are computed outwards from the terminal states, as in a shortest-path search: as long as a state
+   has no value yet, an outcome that leads there counts as staying. States without a finite value are known beforehand
+   (`reachability`), and have no part in the sweeps.
 3. Sweeps are damped where they oscillate. Under the Boltzmann average neighbors may alternately be worth more, so that
    values oscillate for ever, and an adjoint grows. So where the largest change has not become smaller for a thousand
    sweeps but changes alternate in sign, the solve starts anew with half the step; then with a quarter, and so on. That
@@ -27,6 +28,7 @@ from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Backup, Gradient
 from sidestep.tabular.solvers import base
 from sidestep.tabular.solvers.base import BellmanEquation, Region, Values, WarmStart
+from sidestep.tabular.solvers.reachability import finite_states
 
 ByAction = Float[Array, "actions states"]
 
@@ -67,30 +69,34 @@ class Jacobi(base.Solver):
 
     def cold_start(self, states: int, dtype: jnp.dtype) -> WarmStart:
         """Return a start without values and adjoint; an order is not used."""
-        values, adjoint = np.full(states, base.neg_inf(dtype), dtype), np.zeros(states, dtype)
+        values, adjoint = np.full(states, -np.inf, dtype), np.zeros(states, dtype)
         return WarmStart(to_jax(values), to_jax(adjoint), to_jax(np.zeros(0, np.int32)))
 
     def values(self, equation: BellmanEquation, start: WarmStart, region: Region) -> base.SolveResult:
         """Return V of the fixed point, of all states whatever the region."""
         del region
         process, backup, beta = equation
-        exits = _exits(process)
+        exits, finite = _exits(process), finite_states(process)
+        is_safe = jnp.all(finite[exits.successors] | (exits.discounted_probs == 0), axis=1)
+        usable = is_safe & process.available.T
         reward = jnp.broadcast_to(process.reward, process.successors.shape[:2]).T
+        available = None if (mask := process.available_actions()) is None else mask.T
 
         def sweep(values: Values) -> tuple[Values, Values]:
             after = values[exits.successors]
-            # γP of the outcomes that leave a state, 0 where they lead to states without a value yet; once no further
-            # state gets a value, those without one cannot reach a terminal state, nor can what leads there
-            known = base.is_reachable(after)
-            frontier = ~base.is_reachable(values) & jnp.any(known & (exits.discounted_probs > 0), axis=(0, 1))
-            probs = jnp.where(known | ~frontier.any(), exits.discounted_probs, 0)
-            exit_values = reward + jnp.sum(probs * after, axis=1)
+            is_known = base.is_reachable(after)
+            probs = jnp.where(is_known, exits.discounted_probs, 0)
+            expected = jnp.sum(probs * jnp.where(is_known, after, 0), axis=1)
+            exit_values = jnp.where(usable, reward + expected, -jnp.inf)
             exit_weights = exits.one_minus_discount + probs.sum(axis=1)
-            solved = process.with_terminal_rewards(_solve_states(backup, beta, exit_values, exit_weights, values))
-            return solved, jnp.maximum(jnp.abs(solved), jnp.abs(exit_values).max(axis=0))
+            choices = exit_values, exit_weights, available
+            solved = process.with_terminal_rewards(_solve_states(backup, beta, *choices, values))
+            largest = jnp.where(usable, jnp.abs(reward + expected), 0).max(axis=0)
+            return solved, jnp.maximum(jnp.where(base.is_reachable(solved), jnp.abs(solved), 0), largest)
 
         known = jnp.where(base.is_reachable(start.values), start.values, base.lower_bound(process))
-        return self._iterate(sweep, process.with_terminal_rewards(known), start.order)
+        begun = jnp.where(finite, process.with_terminal_rewards(known), -jnp.inf)
+        return self._iterate(sweep, begun, start.order)
 
     def vjp(
         self, equation: BellmanEquation, gradient: Gradient, cotangent: Values, start: WarmStart, region: Region
@@ -173,7 +179,9 @@ class Jacobi(base.Solver):
         def step(state: _LoopState) -> _LoopState:
             old = state.result.values
             values, size = sweep(old)
-            change = (values - old) / jnp.maximum(size, smallest_size)
+            # a state may have no value yet, or never have one
+            moved = jnp.where(jnp.isneginf(values) & jnp.isneginf(old), 0, values - old)
+            change = moved / jnp.maximum(size, smallest_size)
             residual = jnp.abs(change).max()
             alternates = jnp.any((change * state.change < 0) & (jnp.abs(state.change) > _LARGE * residual))
             smaller = residual < _PROGRESS * state.smallest
@@ -183,8 +191,8 @@ class Jacobi(base.Solver):
             diverged = jnp.isnan(residual) & jnp.isfinite(state.smallest)
             restart = diverged | ((stalled >= most_stalled) & (oscillations >= _OSCILLATIONS))
             # there is no half step to or from a state that has no value yet
-            damping = jnp.where(base.is_reachable(values) & base.is_reachable(old), state.damping, 1)
-            damped = jnp.where(damping < 1, old + damping * (values - old), values)
+            damping = jnp.where(jnp.isneginf(values) | jnp.isneginf(old), 1, state.damping)
+            damped = jnp.where(damping < 1, old + damping * moved, values)
             left = jnp.where(diverged, jnp.inf, residual)
             sweeps = state.result.sweeps + 1
             return _LoopState(
@@ -253,25 +261,36 @@ def _weights(
 
 
 def _solve_states(
-    backup: Backup, beta: base.Beta, exit_values: ByAction, exit_weights: ByAction, old: Values
+    backup: Backup,
+    beta: base.Beta,
+    exit_values: ByAction,
+    exit_weights: ByAction,
+    available: Bool[Array, "actions states"] | None,
+    old: Values,
 ) -> Values:
     """Return one Newton step on each state's own equation, kept on the right side of the repeat-action value."""
-    bottom = base.neg_inf(old.dtype)
-    repeated = jnp.where(exit_weights > 0, exit_values / jnp.where(exit_weights > 0, exit_weights, 1), bottom)
-    repeat_value = jnp.maximum(repeated.max(axis=0), bottom)
+    never = jnp.isneginf(exit_values) | (exit_weights <= 0)
+    repeated = jnp.where(never, -jnp.inf, exit_values / jnp.where(exit_weights > 0, exit_weights, 1))
+    repeat_value = repeated.max(axis=0)
+    lost = jnp.isneginf(repeat_value)
+    above = jnp.where(lost, 0, repeat_value)
     bounded = jnp.maximum if backup.above_maximum else jnp.minimum
-    start = jnp.where(base.is_reachable(old), bounded(old, repeat_value), repeat_value)
-    advantage = (exit_values - exit_weights * start).T
-    divisor = _divisor(backup.weights(advantage, beta), backup.fixed_policy_weights(advantage, beta), exit_weights)
-    value = backup.value(advantage, beta)
+    start = jnp.where(base.is_reachable(old), bounded(old, above), above)
+    of_states = None if available is None else available.T
+
+    def advantage(values: Values) -> Float[Array, "states actions"]:
+        return jnp.where(lost, 0, exit_values - exit_weights * values).T
+
+    now = advantage(start)
+    divisor = _divisor(backup.weights(now, beta), backup.fixed_policy_weights(now, beta), exit_weights)
+    value = backup.value(now, beta, of_states)
     if backup.above_maximum:
         # from above its root, a convex function's tangent leads below it, and two neighbors that alternate in that
         # never converge: take the secant, which ends above it
-        too_high = (value < 0) & (start > repeat_value)
-        secant = backup.value((exit_values - exit_weights * repeat_value).T, beta) - value
-        divisor = jnp.where(too_high, secant / jnp.where(too_high, start - repeat_value, 1), divisor)
-    solved = bounded(start + value / divisor, repeat_value)
-    return jnp.where(base.is_reachable(repeat_value), jnp.maximum(solved, bottom), bottom)
+        too_high = (value < 0) & (start > above)
+        secant = backup.value(advantage(above), beta, of_states) - value
+        divisor = jnp.where(too_high, secant / jnp.where(too_high, start - above, 1), divisor)
+    return jnp.where(lost, -jnp.inf, bounded(start + value / divisor, above))
 
 
 def _divisor(

@@ -56,6 +56,7 @@ class HostProcess(NamedTuple):
     reward: Float[np.ndarray, "#states #actions"]
     terminal_reward: Float[np.ndarray, "#states"]
     terminal: Bool[np.ndarray, " states"]
+    available: Bool[np.ndarray, "#states #actions"]
     discount: np.floating
 
     def kernel_sizes(self) -> tuple[int, int, int]:

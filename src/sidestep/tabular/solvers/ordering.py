@@ -14,23 +14,30 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
-from sidestep.tabular.solvers.native import HostProcess, NativeFunction, compiled, map_ranges
+from sidestep.tabular.solvers.native import HostProcess, NativeFunction, compiled, inlined, map_ranges
 
 
-def order_by_distance(process: HostProcess) -> Int[np.ndarray, " states"]:
+def order_by_distance(
+    process: HostProcess, finite: Bool[np.ndarray, " states"] | None = None
+) -> Int[np.ndarray, " states"]:
     """Return the states, nearest first; those from which no terminal state can be reached come last.
 
     Without a terminal state they keep their numbers.
+
+    Args:
+        process: The task under a model.
+        finite: Whether each state has a finite value; actions that may lead to the others are not taken.
     """
+    finite = np.ones_like(process.terminal) if finite is None else finite
     if not process.terminal.any():
         return np.arange(len(process.successors), dtype=np.int32)
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import dijkstra
 
     row_starts, sources, costs = _edges_into_states(
-        process.successors, process.probabilities, process.reward, float(process.discount)
+        process.successors, process.probabilities, process.reward, float(process.discount), process.available, finite
     )
     edges = csr_array((costs, sources, row_starts), shape=(len(process.successors), len(process.successors)))
     ends = np.flatnonzero(process.terminal)
@@ -38,15 +45,25 @@ def order_by_distance(process: HostProcess) -> Int[np.ndarray, " states"]:
     return np.argsort(distance, kind="stable").astype(np.int32)
 
 
+@inlined()
+def is_usable(state, a, successors, probabilities, available, finite):  # pragma: no cover
+    """Return whether an action is available, and surely leads to states with finite values."""
+    usable = available[state if available.shape[0] > 1 else 0, a if available.shape[1] > 1 else 0]
+    for k in range(successors.shape[2]):
+        usable &= finite[successors[state, a, k]] or not probabilities[state, a, k] > 0
+    return usable
+
+
 @compiled()
-def _edges_into_states(successors, probabilities, reward, discount):  # pragma: no cover
+def _edges_into_states(successors, probabilities, reward, discount, available, finite):  # pragma: no cover
     """Return the moves into each state as a sparse matrix: where a row starts, the moves' sources, their costs."""
     states, actions, outcomes = successors.shape
-    first = np.zeros(states + 2, np.int32)
+    first, usable = np.zeros(states + 2, np.int32), np.empty((states, actions), np.bool_)
     for state in range(states):
         for a in range(actions):
+            usable[state, a] = is_usable(state, a, successors, probabilities, available, finite)
             for k in range(outcomes):
-                if successors[state, a, k] != state and probabilities[state, a, k] > 0:
+                if usable[state, a] and successors[state, a, k] != state and probabilities[state, a, k] > 0:
                     first[successors[state, a, k] + 2] += 1
     for state in range(states):
         first[state + 2] += first[state + 1]
@@ -56,11 +73,11 @@ def _edges_into_states(successors, probabilities, reward, discount):  # pragma: 
             price = max(-reward[state if reward.shape[0] > 1 else 0, a if reward.shape[1] > 1 else 0], 0.0)
             for k in range(outcomes):
                 after, chance = successors[state, a, k], probabilities[state, a, k]
-                if after != state and chance > 0:
+                if usable[state, a] and after != state and chance > 0:
                     sources[first[after + 1]] = state
                     cost = price / chance + np.log1p((1 - discount) / (discount * chance))
-                    # an edge without cost would not be one
-                    costs[first[after + 1]] = max(cost, 1e-300)
+                    # an edge without cost would not be one, nor one that costs infinitely much
+                    costs[first[after + 1]] = min(max(cost, 1e-300), 1e300)
                     first[after + 1] += 1
     return first[:-1], sources, costs
 
@@ -69,12 +86,13 @@ class NumberedProcess(NamedTuple):
     """A task under a model with its states numbered in an order, without self-loops.
 
     Attributes:
-        successors: The states that outcomes lead to which leave their state; padded with the state itself.
+        successors: The states that possible outcomes lead to which leave their state; padded with the state itself.
         discounted_probs: γP of these outcomes, 0 for the padding.
         self_loop_factor: 1/(1 − γp), p the probability of staying: the discounted number of times that an action is
             taken which is repeated until it succeeds; 0 where that is for ever.
-        reward: R(s, a), with one row if it is the same in all states.
-        terminal: Whether a state is terminal.
+        reward: R(s, a), with one row if it is the same in all states; −∞ for actions that are never taken.
+        choosable: The number of available actions, with one entry if it is the same in all states.
+        terminal: Whether there is nothing to solve: a state is terminal, or has no finite value.
         one_minus_discount: 1 − γ.
         bandwidth: The largest difference between the positions of a state and of one of its successors.
     """
@@ -83,6 +101,7 @@ class NumberedProcess(NamedTuple):
     discounted_probs: np.ndarray
     self_loop_factor: np.ndarray
     reward: np.ndarray
+    choosable: np.ndarray
     terminal: np.ndarray
     one_minus_discount: np.floating
     bandwidth: int
@@ -97,7 +116,10 @@ class NumberingKernels(NamedTuple):
 
 
 def number_process(
-    process: HostProcess, order: Int[np.ndarray, " states"], position: Int[np.ndarray, " states"]
+    process: HostProcess,
+    order: Int[np.ndarray, " states"],
+    position: Int[np.ndarray, " states"],
+    finite: Bool[np.ndarray, " states"],
 ) -> tuple[NumberedProcess, NumberingKernels]:
     """Return the process numbered in an order, and the native code for it; `position` is the order's inverse."""
     kernels = numbering_kernels(*process.kernel_sizes())
@@ -105,13 +127,32 @@ def number_process(
     dtype = process.probabilities.dtype
     successors = np.empty((states, actions, kernels.width), np.int32)
     probs, self_loop_factor = np.empty(successors.shape, dtype), np.empty((states, actions), dtype)
+    available = np.broadcast_to(process.available, (len(process.available), actions))
+    choosable = available.sum(axis=1, dtype=np.int32)
+    choosable = choosable[order] if len(choosable) > 1 else choosable
     reward, terminal = np.broadcast_to(process.reward, (len(process.reward), actions)), np.empty(states, bool)
+    if not (available.all() and finite.all()):
+        reward = np.where(
+            _usable_actions(process.successors, process.probabilities, available, finite), reward, -np.inf
+        )
+        reward = reward.astype(dtype)
     reward = np.ascontiguousarray(reward[order] if len(reward) > 1 else reward)
     reward.flags.writeable = False  # as where it has one row: numba compiles once for each kind of array
-    numbered = NumberedProcess(successors, probs, self_loop_factor, reward, terminal, 1 - process.discount, bandwidth=0)
-    arrays = (order, position, process, numbered)
+    one_minus_discount = 1 - process.discount
+    rest = self_loop_factor, reward, choosable, terminal, one_minus_discount
+    numbered = NumberedProcess(successors, probs, *rest, bandwidth=0)
+    arrays = (order, position, finite, process, numbered)
     bandwidth = max(map_ranges(lambda begin, end: kernels.number_states(begin, end, *arrays), states))
     return numbered._replace(bandwidth=bandwidth), kernels
+
+
+@compiled()
+def _usable_actions(successors, probabilities, available, finite):  # pragma: no cover
+    usable = np.empty(successors.shape[:2], np.bool_)
+    for state in range(len(successors)):
+        for a in range(successors.shape[1]):
+            usable[state, a] = is_usable(state, a, successors, probabilities, available, finite)
+    return usable
 
 
 @cache
@@ -119,19 +160,20 @@ def numbering_kernels(actions: int, outcomes: int, width: int) -> NumberingKerne
     """Return the native code for these numbers; as constants they make it twice as fast."""
 
     @compiled()
-    def number_states(begin, end, order, position, process, numbered):  # pragma: no cover
+    def number_states(begin, end, order, position, finite, process, numbered):  # pragma: no cover
         """Fill in `numbered` for a range of positions; return their bandwidth."""
         bandwidth = 0
         for i in range(begin, end):
             state = order[i]
-            numbered.terminal[i] = process.terminal[state]
+            numbered.terminal[i] = process.terminal[state] or not finite[state]
             for a in range(actions):
                 exit_weight = numbered.one_minus_discount
                 m = 0
                 for k in range(outcomes):
                     after = process.successors[state, a, k]
-                    if after != state:
-                        move = process.discount * process.probabilities[state, a, k]
+                    move = process.discount * process.probabilities[state, a, k]
+                    # an impossible outcome may lead to a state without a finite value
+                    if after != state and move > 0:
                         numbered.successors[i, a, m] = position[after]
                         bandwidth = max(bandwidth, abs(position[after] - i))
                         numbered.discounted_probs[i, a, m] = move
@@ -144,18 +186,19 @@ def numbering_kernels(actions: int, outcomes: int, width: int) -> NumberingKerne
         return bandwidth
 
     @compiled()
-    def greedy_successors(begin, end, numbered, values, neg_inf, greedy_successor):  # pragma: no cover
+    def greedy_successors(begin, end, numbered, values, greedy_successor):  # pragma: no cover
         """Fill in the best successor of states by known values; return how many are farther than their state."""
         count = 0
         for i in range(begin, end):
-            best, leads_to = neg_inf, i
+            best, leads_to = -np.inf, i
             for a in range(actions):
                 for m in range(width):
                     j = numbered.successors[i, a, m]
                     move = numbered.discounted_probs[i, a, m]
-                    worth = values[j] + numbered.reward[i if len(numbered.reward) > 1 else 0, a] / move
-                    if move > 0 and worth > best:
-                        best, leads_to = worth, j
+                    if move > 0:
+                        worth = values[j] + numbered.reward[i if len(numbered.reward) > 1 else 0, a] / move
+                        if worth > best:
+                            best, leads_to = worth, j
             greedy_successor[i] = leads_to
             count += leads_to > i and not numbered.terminal[i]
         return count

@@ -24,7 +24,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sidestep.tabular.solvers import native
-from sidestep.tabular.solvers.base import neg_inf
 from sidestep.tabular.solvers.ordering import NumberedProcess
 from sidestep.tabular.solvers.value_kernels import SweepHistory, sweep_kernel
 
@@ -200,8 +199,8 @@ class SweepLoop:
         self, into: np.ndarray, sweep: _Sweep, positions: np.ndarray, shift_from: int, solve_all: bool = False
     ) -> tuple[float, int]:
         """Solve states in a sweep, without skips in the very first; return the largest change and their number."""
-        kernel, unknown = sweep_kernel(*self.process.discounted_probs.shape[1:]), neg_inf(self.values.dtype)
-        rules = shift_from, solve_all or sweep.number == 1, _SKIP * self.tolerance, self.values.dtype.type(unknown)
+        kernel = sweep_kernel(*self.process.discounted_probs.shape[1:])
+        rules = shift_from, solve_all or sweep.number == 1, _SKIP * self.tolerance
         return kernel(positions, self.backup, self.process, self.values, into, *sweep, *rules)
 
     def _limit_reached(self) -> bool:

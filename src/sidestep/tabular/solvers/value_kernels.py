@@ -64,8 +64,11 @@ class Scratch(NamedTuple):
 
 
 @inlined(fastmath=_FAST)
-def backed_up(backup, scratch):  # pragma: no cover
-    """Return B(A) and the divisor of the Newton step, the larger of Σ w l and Σ π l (see `base`)."""
+def backed_up(backup, count, scratch):  # pragma: no cover
+    """Return B(A) and the divisor of the Newton step, the larger of Σ w l and Σ π l (see `base`).
+
+    A is −∞ for actions that are never taken; `count` is the number of available ones.
+    """
     kind, beta, tie = backup.kind, backup.beta, backup.tie
     best = scratch.advantages[0]
     for a in range(1, len(scratch.advantages)):
@@ -79,10 +82,11 @@ def backed_up(backup, scratch):  # pragma: no cover
         else:
             exponent = beta * difference
             weight = np.exp(exponent) if exponent > _SMALLEST_EXPONENT else 0.0
-        total += weight
-        below += weight * difference
-        exits += weight * scratch.exit_weights[a]
-        product += weight * difference * scratch.exit_weights[a]
+        if weight > 0:
+            total += weight
+            below += weight * difference
+            exits += weight * scratch.exit_weights[a]
+            product += weight * difference * scratch.exit_weights[a]
     scale = 1 / total
     policy_exit = exits * scale
     if kind == HARD_MAX:
@@ -97,7 +101,9 @@ def backed_up(backup, scratch):  # pragma: no cover
     excess = 0.0 * best
     for a in range(len(scratch.advantages)):
         excess += np.expm1(beta * (scratch.advantages[a] - best))
-    return best + np.log1p(excess / len(scratch.advantages)) / beta, policy_exit
+    # those that are not available have added −1 each
+    excess += len(scratch.advantages) - count
+    return best + np.log1p(excess / count) / beta, policy_exit
 
 
 @inlined()
@@ -120,15 +126,14 @@ def _shifted_value(j, round_start, moved, size):  # pragma: no cover
 
 
 @inlined(fastmath=_FAST)
-def _fill_exit_values(
-    i, actions, width, process, values, history, shift_from, neg_inf, reachable_above, scratch
-):  # pragma: no cover
+def _fill_exit_values(i, actions, width, process, values, history, shift_from, scratch):  # pragma: no cover
     """Fill in c(a); return the repeat-action value, the largest |c(a)|, and the greedy successor."""
     row = i if len(process.reward) > 1 else 0
     start = history.round_start
     moved, size_here = values[i] - start[i], abs(start[i])
-    shifts = values[i] > reachable_above and start[i] > reachable_above and moved != 0
-    repeat_value, best, size, greedy_successor = neg_inf, neg_inf, 0.0 * neg_inf, i
+    shifts = moved != 0
+    nothing = 0.0 * size_here
+    repeat_value, best, size, greedy_successor = nothing - np.inf, nothing - np.inf, nothing, i
     for a in range(actions):
         exit_value = process.reward[row, a]
         likeliest, toward = 0.0 * exit_value, i
@@ -136,66 +141,63 @@ def _fill_exit_values(
             j, move = process.successors[i, a, m], process.discounted_probs[i, a, m]
             value = values[j]
             farther = shifts and j > i and j >= shift_from
-            if farther and history.greedy_successor[j] >= i and reachable_above < start[j] < start[i]:
+            if farther and history.greedy_successor[j] >= i and start[j] < start[i]:
                 value = _shifted_value(j, start, moved, size_here)
             exit_value += move * value
             if move > likeliest:
                 likeliest, toward = move, j
         scratch.exit_values[a] = exit_value
-        size = max(size, abs(exit_value))
-        repeated = exit_value * process.self_loop_factor[i, a] if process.self_loop_factor[i, a] > 0 else neg_inf
-        repeat_value = max(repeat_value, repeated)
-        nearer = repeated if toward < i else neg_inf
-        greedy_successor = toward if nearer > best else greedy_successor
-        best = max(best, nearer)
+        if exit_value > -np.inf or np.isnan(exit_value):
+            size = max(size, abs(exit_value))
+            if process.self_loop_factor[i, a] > 0:
+                repeated = exit_value * process.self_loop_factor[i, a]
+                repeat_value = max(repeat_value, repeated)
+                if toward < i and repeated > best:
+                    best, greedy_successor = repeated, toward
     return repeat_value, size, greedy_successor
 
 
 @inlined(fastmath=_FAST)
-def _shift_farther(i, actions, width, process, values, history, shift_from, reachable_above):  # pragma: no cover
+def _shift_farther(i, actions, width, process, values, history, shift_from):  # pragma: no cover
     """Move the farther states of which state i is the greedy successor along with it."""
     start = history.round_start
-    if values[i] > reachable_above and start[i] > reachable_above:
-        for a in range(actions):
-            for m in range(width):
-                j = process.successors[i, a, m]
-                farther = j > i and j >= shift_from
-                if farther and history.greedy_successor[j] == i and reachable_above < start[j] < start[i]:
-                    values[j] = _shifted_value(j, start, values[i] - start[i], abs(start[i]))
+    for a in range(actions):
+        for m in range(width):
+            j = process.successors[i, a, m]
+            farther = j > i and j >= shift_from
+            if farther and history.greedy_successor[j] == i and start[j] < start[i]:
+                values[j] = _shifted_value(j, start, values[i] - start[i], abs(start[i]))
 
 
 @inlined(fastmath=_FAST)
-def _solve_state(
-    i, actions, width, process, backup, guess, repeat_value, reachable_above, neg_inf, scratch
-):  # pragma: no cover
+def _solve_state(i, actions, width, process, backup, guess, repeat_value, scratch):  # pragma: no cover
     """Return the root of the state's own equation; c(a) is in the scratch already."""
     for a in range(actions):
         scratch.exit_weights[a] = process.one_minus_discount
         for m in range(width):
             scratch.exit_weights[a] += process.discounted_probs[i, a, m]
-    return own_root(actions, backup, guess, repeat_value, reachable_above, neg_inf, scratch)
+    count = process.choosable[i if len(process.choosable) > 1 else 0]
+    return own_root(actions, backup, count, guess, repeat_value, scratch)
 
 
 @inlined(fastmath=_FAST)
-def own_root(actions, backup, guess, repeat_value, reachable_above, neg_inf, scratch):  # pragma: no cover
+def own_root(actions, backup, count, guess, repeat_value, scratch):  # pragma: no cover
     """Return the root of a state's own equation, by one Newton step from a guess (see `base`).
 
     For the log-sum-exp, a step from far above the root ends below it, perhaps far below, where actions that never leave
     seemed to matter most; so another step follows.
     """
     above = backup.kind == LOG_SUM_EXP
-    value = repeat_value
-    if guess > reachable_above:
-        value = max(guess, repeat_value) if above else min(guess, repeat_value)
+    value = max(guess, repeat_value) if above else min(guess, repeat_value)
     # a break would make numba count references again (see `Scratch`)
     again = True
     for _ in range(_NEWTON_STEPS):
         if again:
             for a in range(actions):
                 scratch.advantages[a] = scratch.exit_values[a] - scratch.exit_weights[a] * value
-            gain, divisor = backed_up(backup, scratch)
+            gain, divisor = backed_up(backup, count, scratch)
             step = gain / (divisor if divisor > 0 else 1.0)
-            value = max(value + step, repeat_value) if above else max(min(value + step, repeat_value), neg_inf)
+            value = max(value + step, repeat_value) if above else min(value + step, repeat_value)
             again = above and backup.beta * step < -_LONG_STEP
     return value
 
@@ -206,7 +208,7 @@ def sweep_kernel(actions: int, width: int) -> NativeFunction:
 
     @compiled(fastmath=_FAST)
     def sweep(
-        positions, backup, process, values, into, history, number, round_first, shift_from, solve_all, skip, neg_inf
+        positions, backup, process, values, into, history, number, round_first, shift_from, solve_all, skip
     ):  # pragma: no cover
         """Solve the own equations of the states at ascending positions.
 
@@ -222,7 +224,6 @@ def sweep_kernel(actions: int, width: int) -> NativeFunction:
             shift_from: Values from this position on are shifted.
             solve_all: Whether no state is skipped.
             skip: The relative change that counts as none.
-            neg_inf: The stand-in for −∞.
 
         Returns:
             The largest relative change, NaN if any is, and the number of states that were solved.
@@ -230,10 +231,8 @@ def sweep_kernel(actions: int, width: int) -> NativeFunction:
         dtype = values.dtype
         scratch = Scratch(np.empty(actions, dtype), np.empty(actions, dtype), np.empty(actions, dtype))
         last_changed, last_solved = history.last_changed, history.last_solved
-        # below this lie values at discount 1 of states that cannot reach a terminal state
-        reachable_above = -np.sqrt(-neg_inf)
         smallest = np.finfo(values.dtype).tiny / skip
-        largest = 0.0 * neg_inf
+        largest = 0.0 * process.one_minus_discount
         solved = 0
         for index in range(len(positions)):
             i = positions[index]
@@ -244,22 +243,17 @@ def sweep_kernel(actions: int, width: int) -> NativeFunction:
                 continue
             solved += 1
             repeat_value, size, history.greedy_successor[i] = _fill_exit_values(
-                i, actions, width, process, values, history, shift_from, neg_inf, reachable_above, scratch
+                i, actions, width, process, values, history, shift_from, scratch
             )
-            old, value = history.round_start[i] if last_solved[i] < round_first else values[i], neg_inf
-            if repeat_value > reachable_above:
-                value = _solve_state(
-                    i, actions, width, process, backup, values[i], repeat_value, reachable_above, neg_inf, scratch
-                )
+            old = history.round_start[i] if last_solved[i] < round_first else values[i]
+            value = _solve_state(i, actions, width, process, backup, values[i], repeat_value, scratch)
             change, scale = abs(value - old), max(abs(value), size, smallest)
-            if not (old > reachable_above or value > reachable_above):
-                change = 0.0 * neg_inf
             into[i] = value
             last_solved[i] = number
             if not change <= skip * scale:
                 last_changed[i] = number
                 if shift_from < len(values):
-                    _shift_farther(i, actions, width, process, values, history, shift_from, reachable_above)
+                    _shift_farther(i, actions, width, process, values, history, shift_from)
             if change > largest * scale or np.isnan(change):
                 largest = change / scale
         return largest, solved
@@ -272,8 +266,8 @@ def first_values_kernel(actions: int, width: int) -> NativeFunction:
     """Return the native code of first values for these numbers."""
 
     @compiled()
-    def first_values(backup, process, values, neg_inf, bound):  # pragma: no cover
-        """Fill in unknown values (`neg_inf`), nearest first, by the moves to nearer states.
+    def first_values(backup, process, values, bound):  # pragma: no cover
+        """Fill in unknown values (−∞), nearest first, by the moves to nearer states.
 
         An action that leads to none counts as one that costs its price twice, there and back. Where no nearer state is
         known the value is `bound`.
@@ -281,7 +275,7 @@ def first_values_kernel(actions: int, width: int) -> NativeFunction:
         dtype = values.dtype
         scratch = Scratch(np.empty(actions, dtype), np.empty(actions, dtype), np.empty(actions, dtype))
         for i in range(len(values)):
-            if process.terminal[i] or values[i] > neg_inf:
+            if process.terminal[i] or values[i] > -np.inf:
                 continue
             value, is_known = bound, False
             for a in range(actions):
@@ -289,10 +283,10 @@ def first_values_kernel(actions: int, width: int) -> NativeFunction:
                 scratch.exit_weights[a] = process.one_minus_discount
                 for m in range(width):
                     j = process.successors[i, a, m]
-                    if j < i and values[j] > neg_inf:
+                    if j < i and process.discounted_probs[i, a, m] > 0 and values[j] > -np.inf:
                         scratch.exit_values[a] += process.discounted_probs[i, a, m] * values[j]
                         scratch.exit_weights[a] += process.discounted_probs[i, a, m]
-                if scratch.exit_weights[a] > process.one_minus_discount:
+                if scratch.exit_weights[a] > process.one_minus_discount and scratch.exit_values[a] > -np.inf:
                     repeat_value = scratch.exit_values[a] / scratch.exit_weights[a]
                     value = max(value, repeat_value) if is_known else repeat_value
                     is_known = True
@@ -301,7 +295,8 @@ def first_values_kernel(actions: int, width: int) -> NativeFunction:
                     scratch.advantages[a] = scratch.exit_values[a] - scratch.exit_weights[a] * value
                     if not scratch.exit_weights[a] > process.one_minus_discount:
                         scratch.advantages[a] += min(scratch.exit_values[a], 0.0)
-                gain, divisor = backed_up(backup, scratch)
+                count = process.choosable[i if len(process.choosable) > 1 else 0]
+                gain, divisor = backed_up(backup, count, scratch)
                 value += gain / (divisor if divisor > 0 else 1.0)
             values[i] = value
 

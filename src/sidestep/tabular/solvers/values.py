@@ -11,9 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sidestep.tabular.solvers.base import SolveResult, WarmStart, neg_inf
+from sidestep.tabular.solvers.base import SolveResult, WarmStart
 from sidestep.tabular.solvers.native import NativeEquation, SolveInfo, inverse_permutation, map_ranges, write_info
 from sidestep.tabular.solvers.ordering import NumberedProcess, number_process, order_by_distance
+from sidestep.tabular.solvers.reachability import finite_states_on_host
 from sidestep.tabular.solvers.sweep_loop import SweepLoop
 from sidestep.tabular.solvers.value_kernels import first_values_kernel
 
@@ -53,11 +54,17 @@ def solve_values(
         write_info(into, order, SolveInfo(0, np.nan, False))
         return
 
+    if inverse_permutation(order) is None:
+        order = order_by_distance(process)
+        start = start._replace(order=order)
+    finite = finite_states_on_host(process, order)
+    region = region if region.any() else np.ones_like(region)
+
     def solve_from(start: WarmStart, region: np.ndarray, max_sweeps: int, max_rounds: int) -> SolveInfo:
         """Solve from values and an order, or a new one if that does not serve; write the values and the order."""
-        begun = _begin(start, equation, bound)
+        begun = _begin(start, equation, finite, bound)
         if begun is None or begun.out_of_order > _OUT_OF_ORDER * len(order):
-            begun = _begin(start._replace(order=order_by_distance(process)), equation, bound)
+            begun = _begin(start._replace(order=order_by_distance(process, finite)), equation, finite, bound)
             assert begun is not None
         positions = np.arange(len(order), dtype=np.int32)
         if not region.all():
@@ -68,17 +75,15 @@ def solve_values(
         into.order[:] = begun.order
         return info
 
-    unknown = neg_inf(values.dtype)
     info = SolveInfo(0, np.inf, False)
-    region = region if region.any() else np.ones_like(region)
-    if (values > unknown).any():
+    if (values > -np.inf).any():
         digits = -np.log10(max(equation.tolerance, np.finfo(values.dtype).eps))
         trusted = min(int(np.ceil(_TRUST * max(1.0, digits))), max_sweeps)
         info = solve_from(start, region, trusted, _TRUSTED_ROUNDS * trusted)
     if not info.converged and info.sweeps < max_sweeps:
         # where the start's values did not serve, its order is no better
         known_order = np.full_like(order, -1) if info.sweeps else order
-        cold, left = start._replace(values=np.full_like(values, unknown), order=known_order), max_sweeps - info.sweeps
+        cold, left = start._replace(values=np.full_like(values, -np.inf), order=known_order), max_sweeps - info.sweeps
         again = solve_from(cold, np.ones_like(region), left, left)
         info = again._replace(sweeps=info.sweeps + again.sweeps)
     write_info(into, into.order, info)
@@ -99,19 +104,24 @@ class _Begun(NamedTuple):
     out_of_order: int
 
 
-def _begin(start: WarmStart, equation: NativeEquation, bound: np.floating) -> _Begun | None:
-    """Return the task numbered in the start's order; None if this is not a permutation of all states."""
+def _begin(
+    start: WarmStart, equation: NativeEquation, finite: Bool[np.ndarray, " states"], bound: np.floating
+) -> _Begun | None:
+    """Return the task numbered in the start's order.
+
+    None if this is not a permutation of all states, or leaves a state without a first value that has a finite one.
+    """
     known, order = np.asarray(start.values), np.asarray(start.order)
     position = inverse_permutation(order)
     if position is None:
         return None
-    unknown = known.dtype.type(neg_inf(known.dtype))
-    process, kernels = number_process(equation.process, order, position)
-    values, ends = known[order], np.flatnonzero(process.terminal)
+    process, kernels = number_process(equation.process, order, position, finite)
+    values, ends = known[order], np.flatnonzero(equation.process.terminal[order])
+    values[~finite[order]] = -np.inf
     values[ends] = np.broadcast_to(equation.process.terminal_reward, known.shape)[order[ends]]
     greedy = np.empty_like(order)
-    counts = map_ranges(
-        lambda begin, end: kernels.greedy_successors(begin, end, process, values, unknown, greedy), len(order)
-    )
-    first_values_kernel(*process.discounted_probs.shape[1:])(equation.backup, process, values, unknown, bound)
+    counts = map_ranges(lambda begin, end: kernels.greedy_successors(begin, end, process, values, greedy), len(order))
+    first_values_kernel(*process.discounted_probs.shape[1:])(equation.backup, process, values, bound)
+    if (np.isneginf(values) & finite[order]).any():
+        return None
     return _Begun(order, process, values, greedy, sum(counts))

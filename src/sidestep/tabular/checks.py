@@ -1,0 +1,117 @@
+"""Checks that tasks, behavior and demonstrations are of a model's world; what JAX is tracing is not looked at."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from sidestep.errors import InputError, check, check_instance
+from sidestep.tabular.backups import Behavior
+from sidestep.tabular.behavior_model import BehaviorModel
+from sidestep.tabular.demonstrations import Demonstrations
+from sidestep.tabular.graph import Graph
+from sidestep.tabular.models import TransitionModel
+from sidestep.tabular.tasks import Task
+
+
+def is_traced(*trees: Any) -> bool:
+    """Return whether JAX is tracing any array of some trees, so that its numbers are not known.
+
+    Args:
+        trees: Of arrays and other things.
+    """
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def check_model(model: TransitionModel) -> None:
+    """Raise `InputError` unless something is a transition model without NaN in its parameters.
+
+    Args:
+        model: The model.
+    """
+    check_instance(model, TransitionModel, "model")
+    for leaf in jax.tree.leaves(model.parameters):
+        if not is_traced(leaf):
+            missing = np.isnan(np.asarray(leaf))
+            places = np.argwhere(missing)[:1].tolist()
+            check(not missing.any(), f"expected numbers as parameters, found nan at {places}", field="model")
+
+
+def check_persons(behavior: Behavior | BehaviorModel | None, tasks: int) -> None:
+    """Raise `InputError` unless a behavior model has no persons, or the person of each task.
+
+    Args:
+        behavior: The behavior.
+        tasks: The number of tasks.
+    """
+    if isinstance(behavior, BehaviorModel) and behavior.person is not None:
+        own = len(behavior.person)
+        message = f"expected the person of each of the {tasks} tasks (see split_by_person), found {own} persons"
+        check(own == tasks, message, field="person")
+
+
+def check_behavior(behavior: Behavior | BehaviorModel, *, learned: bool = False) -> None:
+    """Raise `InputError` unless something is a behavior.
+
+    Args:
+        behavior: The behavior.
+        learned: Whether a `BehaviorModel` is one too.
+    """
+    check_instance(behavior, (Behavior, BehaviorModel) if learned else Behavior, "behavior")
+
+
+def check_task(task: Task, world: Graph, field: str = "task") -> None:
+    """Raise `InputError` unless a task, or a stack of tasks, is of the world of a graph.
+
+    Args:
+        task: One task or a stack.
+        world: The graph of a model.
+        field: The argument, for the error.
+    """
+    check_instance(task, Task, field)
+    check_instance(world, Graph, "world")
+    states = task.terminal.shape[-1]
+    message = f"expected a task of the model's {world.states} states, found one of {states}"
+    check(states == world.states, message, field=field)
+    own = [("rewards", task.reward.shape[-2:], (world.states, world.actions))]
+    if task.outcome_reward is not None:
+        own.append(("rewards of outcomes", task.outcome_reward.shape[-3:], world.successors.shape))
+    for what, axes, expected in own:
+        fits = all(axis in (1, size) for axis, size in zip(axes, expected, strict=True))
+        check(fits, f"expected {what} of shape {expected}, or 1 instead of an axis, found {axes}", field=field)
+
+
+def check_demonstrations(demonstrations: Demonstrations, world: Graph) -> None:
+    """Raise `InputError` unless demonstrations are of the world of a graph, and take available actions only.
+
+    Args:
+        demonstrations: The moves and their tasks.
+        world: The graph of a model.
+    """
+    check_instance(demonstrations, Demonstrations, "demonstrations")
+    check_instance(demonstrations.tasks, Task, "demonstrations")
+    check_task(demonstrations.tasks, world, "demonstrations")
+    if is_traced(demonstrations, world):
+        return
+    moves = (demonstrations.states, demonstrations.actions, demonstrations.next_states)
+    states, actions, next_states = (np.asarray(part) for part in moves)
+    for name, numbers, count in (("state", states, world.states), ("action", actions, world.actions)):
+        _check_moves(demonstrations, (numbers < 0) | (numbers >= count), name, numbers, f"0…{count - 1}")
+    _check_moves(demonstrations, (next_states < 0) | (next_states >= world.states), "state", next_states, "the world's")
+    available = np.broadcast_to(np.asarray(world.available), (world.states, world.actions))
+    if not available.all():
+        _check_moves(
+            demonstrations, ~available[states, actions], "action", actions, "one that is available in its state"
+        )
+
+
+def _check_moves(demonstrations: Demonstrations, wrong: np.ndarray, name: str, numbers: np.ndarray, valid: str) -> None:
+    """Raise `InputError` with the trajectory and the move of the first wrong number."""
+    if not wrong.any():
+        return
+    index = int(np.argmax(wrong))
+    trajectory = np.asarray(demonstrations.trajectory)
+    move = index - int(np.searchsorted(trajectory, trajectory[index]))
+    message = f"expected {name} {valid} in move {move}, found {numbers[index]} in state {demonstrations.states[index]}"
+    raise InputError(message, source=f"trajectory {trajectory[index]}", field="demonstrations")
