@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import sidestep as ss
-from helpers.wrong_calls import data, learning, maps, models, right, small
+from helpers.wrong_calls import data, discrete, learning, maps, models, right, small
 from sidestep.errors import InputError
 
-CASES = [*data.CASES, *models.CASES, *learning.CASES, *maps.CASES]
+CASES = [*data.CASES, *discrete.CASES, *models.CASES, *learning.CASES, *maps.CASES]
 
 
 @pytest.fixture(scope="module", autouse=True)
