@@ -199,8 +199,7 @@ def fit(
 
     Raises:
         InputError: For arguments of other types or out of range, or that exclude each other, demonstrations in another
-            world, visited states from which a goal cannot be reached, or a
-            checkpoint of another fit.
+            world, visited states from which a goal cannot be reached, or a checkpoint of another fit.
         ImproperTask: For tasks without values.
         NotConverged: If values do not converge at the start, or stop converging on the way.
 

@@ -120,6 +120,27 @@ class Normal(Prior):
         return -jnp.sum(jnp.stack(penalties))
 
 
+def sensor_arrays(
+    probability: Float[np.ndarray, "rows columns"] | Sequence[Sequence[float]],
+    variance: float | Float[np.ndarray, "rows columns"] | Sequence[Sequence[float]],
+) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
+    """Return what a sensor saw as arrays: the probability and the variance of each cell.
+
+    Args:
+        probability: As for `sensor_prior`.
+        variance: As for `sensor_prior`.
+
+    Raises:
+        InputError: For other shapes, probabilities outside [0, 1] and variances that are not above 0.
+    """
+    cells = np.asarray(to_floats(probability, "sensor map", ("rows", "columns")))
+    variances = np.broadcast_to(to_floats(variance, "sensor variance", (), cells.shape), cells.shape)
+    least = np.nanmin(variances, initial=np.inf)
+    check(least > 0, f"expected numbers above 0, found {least}", field="sensor variance")
+    to_finite(cells[~np.isnan(cells)], "sensor map", least=0, most=1)
+    return cells, variances
+
+
 def sensor_prior(
     probability: Float[np.ndarray, "rows columns"] | Sequence[Sequence[float]],
     variance: float | Float[np.ndarray, "rows columns"] | Sequence[Sequence[float]],
@@ -144,11 +165,7 @@ def sensor_prior(
         [0.0, -2.0]
     """
     check_instance(unobserved, Normal, "unobserved")
-    cells = to_floats(probability, "sensor map", ("rows", "columns"))
-    variances = np.broadcast_to(to_floats(variance, "sensor variance", (), cells.shape), cells.shape)
-    least, values = np.nanmin(variances, initial=np.inf), cells[~np.isnan(cells)]
-    check(least > 0, f"expected numbers above 0, found {least}", field="sensor variance")
-    to_finite(values, "sensor map", least=0, most=1)
+    cells, variances = sensor_arrays(probability, variance)
     observed = ~np.isnan(cells) & np.isfinite(variances)
     p = np.clip(np.where(observed, cells, 0.5), MIN_PROBABILITY, 1 - MIN_PROBABILITY)
     for each in (unobserved.mean, unobserved.variance):

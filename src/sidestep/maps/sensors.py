@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from sidestep._arguments import to_finite, to_floats
-from sidestep.errors import check
-from sidestep.inference.priors import Normal, sensor_prior
+from sidestep.inference.priors import Normal, sensor_arrays, sensor_prior
 from sidestep.io.maps import read_sensor_map, read_sensor_variance
 from sidestep.maps.config import PriorConfig
 from sidestep.tabular.grid import Cell, Grid
@@ -36,11 +34,7 @@ class SensorMap:
     variance_source: str | None = None
 
     def __post_init__(self) -> None:
-        cells = to_floats(self.probability, "probability", ("rows", "columns"))
-        to_finite(cells[~np.isnan(cells)], "probability", least=0, most=1)
-        variance = to_floats(self.variance, "variance", (), cells.shape)
-        least = np.nanmin(variance, initial=np.inf)
-        check(least > 0, f"expected numbers above 0, found {least}", field="variance")
+        sensor_arrays(self.probability, self.variance)
 
     def summary(self) -> dict[str, Any]:
         """Return the entries of `summary.json`: the file of the map, and the variance or its file.

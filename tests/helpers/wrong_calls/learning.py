@@ -68,6 +68,7 @@ CASES = [
     ]),
     *labeled("optimizers", [
         ("LBFGS, tolerance NaN", lambda: ss.LBFGS(max_iterations=2, tolerance=NAN), "tolerance"),
+        ("LBFGS, tolerance below 0", lambda: ss.LBFGS(tolerance=-1e-4), "tolerance"),
         ("LBFGS, iterations below 0", lambda: ss.LBFGS(max_iterations=-1), "max_iterations"),
         ("LBFGS, iterations of a fraction", lambda: ss.LBFGS(max_iterations=1.5), "max_iterations"),
         ("LBFGS, memory 0", lambda: ss.LBFGS(memory_size=0), "memory_size"),

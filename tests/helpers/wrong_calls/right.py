@@ -119,5 +119,12 @@ CASES = {
     "evaluate of lists": lambda: (
         ss.evaluate(None, np.zeros((1, 2)).tolist(), ss.Grid([[0, 0]]), [[True, True]], [[0, 1]], goals=[1]).auc is None
     ),
+    "Behavior of a class": lambda: isinstance(ss.Behavior(ss.BoltzmannAverage).backup, ss.BoltzmannAverage),
+    "Behavior of a name": lambda: isinstance(ss.Behavior("boltzmann").backup, ss.BoltzmannAverage),
+    "Behavior of integers": lambda: ss.Behavior(ss.BoltzmannAverage(), 5, 0).beta == 5,
+    "graph of a list": lambda: ss.graph([[[0]]]).states == 1,
+    "task of lists": lambda: ss.task([0, 1], 1, [False, True]).terminal.tolist() == [False, True],
+    "reach of NumPy's numbers": lambda: ss.reach(GRID, np.int8(3), discount=1, step_cost=np.int64(1)).discount == 1,
+    "behavior_model of a list": lambda: len(ss.behavior_model(BEHAVIOR, person=[0, 1]).person) == 2,
     "Behavior": lambda: BEHAVIOR.lapse is None and MAP.converged is None,
 }
