@@ -45,6 +45,7 @@ from .tabular.models import (
     borders as borders,
     closed as closed,
     road_network as road_network,
+    tabular_model as tabular_model,
     true_model as true_model,
     walled_grid as walled_grid,
 )

@@ -146,13 +146,15 @@ def maximize(
         InputError: If a visited state cannot reach its goal, and as `Saver.load` does.
     """
     saver = saver or Saver(None, "")
-    evaluator = _Evaluator(objective, tolerances)
+    evaluator = _Evaluator(objective, tolerances, optimizer.scales)
     x, state, history = evaluator.start, optimizer.init(evaluator.start), []
     if resume:
         x, state, history = evaluator.load(saver, x, state)
     while True:
         point = evaluator.evaluate(x)
-        progress = Progress(len(history), *point.terms.tolist(), gradient=float(np.abs(point.gradient).max(initial=0.0)))
+        progress = Progress(
+            len(history), *point.terms.tolist(), gradient=float(np.abs(point.gradient).max(initial=0.0))
+        )
         if progress.iteration == 0:
             _check_start(objective.problem, progress, evaluator.solves)
         if not np.isfinite(progress).all():
@@ -179,10 +181,14 @@ def maximize(
         elif evaluator.tighten():
             history.pop()
         else:
-            measure, limit = optimizer.measure.format(optimizer.convergence(point.gradient, state)), evaluator.resolution
+            measure, limit = (
+                optimizer.measure.format(optimizer.convergence(point.gradient, state)),
+                evaluator.resolution,
+            )
             if status is None and optimizer.expected_gain(x, point.gradient, state) <= limit:
                 status = Status.CONVERGED
-                measure += f", and what is left to gain is below the precision of the objective, {limit:.1g} nats"
+                measure += f", and no more than {limit:.1g} nats are left to gain, the precision of the objective"
+                measure += "" if x.dtype == np.float64 else " in 32-bit numbers (see jax_enable_x64)"
             status = status or (Status.NO_ASCENT_STEP if x.dtype == np.float64 else Status.PRECISION_LIMIT)
             message = "; ".join(filter(None, (f"{status.value}: {measure}", status.advice)))
             return Maximum(evaluator.parameters(x), tuple(history), status, message, evaluator.solves_at(x))
@@ -216,9 +222,16 @@ class _Evaluator:
     It keeps the last exact point, because line searches ask for it twice.
     """
 
-    def __init__(self, objective: Objective, tolerances: Sequence[float | None]):
+    def __init__(self, objective: Objective, tolerances: Sequence[float | None], scales: bool):
         self.objective, self.tolerances = objective, list(tolerances)
-        self.start, self.unravel = _ravel(objective.problem.parameters)
+        problem = objective.problem
+        start, self.unravel = _ravel(problem.parameters)
+        self.unit = np.ones_like(start)
+        if scales:
+            # a tight prior would leave the line search no step to start with
+            tight = _ravel(problem.prior.scale(problem.model.parameters))[0]
+            self.unit[: len(tight)] = tight
+        self.start = start / self.unit
         self.warm_starts = objective.cold_starts()
         self.last = _Point(np.full_like(self.start, np.nan), np.zeros(4), np.zeros_like(self.start))
         self.solves: list[SolveSummary] = []
@@ -233,10 +246,11 @@ class _Evaluator:
         return max(float(problem.solver.tolerance_for(dtype)), _ROUNDING * float(np.finfo(dtype).eps)) * self.scale
 
     def parameters(self, x: Vector) -> Parameters:
-        return jax.device_put(self.unravel(x))
+        return jax.device_put(self.unravel(x * self.unit))
 
     def evaluate(self, x: Vector, approximate: bool = False) -> _Point:
-        if np.array_equal(x, self.last.x):
+        # without parameters there is no NaN to tell that nothing was evaluated yet
+        if x.size and np.array_equal(x, self.last.x):
             return self.last
         approximate = approximate and bool(self.contributions)
         evaluation, self.warm_starts = self.objective.evaluate(
@@ -247,7 +261,7 @@ class _Evaluator:
             reuse_below=_REUSE * self.scale / max(1, len(self.objective.batches)) if approximate else 0.0,
             partial_below=_PARTIAL if approximate and len(self.tolerances) > 1 else 0.0,
         )
-        point = _Point(x, np.array(evaluation[:4]), _ravel(evaluation.gradient)[0])
+        point = _Point(x, np.array(evaluation[:4]), _ravel(evaluation.gradient)[0] * self.unit)
         self.contributions = evaluation.contributions
         if not approximate:
             self.last, self.solves = point, evaluation.solves

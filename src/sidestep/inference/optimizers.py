@@ -48,6 +48,7 @@ class Optimizer(eqx.Module):
         tolerance: The fit has converged when `convergence` is at most this.
         solve_tolerance: The tolerance of the solves of large maps until the optimizer has converged with it.
         approximates: Whether `step` asks for approximate losses.
+        scales: Whether parameters are optimized in units of the prior's scale; otherwise steps are in units of θ.
         measure: A format for the number that `convergence` returns.
         resumes_with: The attributes that an interrupted fit must share with the one that resumes it.
 
@@ -60,6 +61,7 @@ class Optimizer(eqx.Module):
     tolerance: eqx.AbstractVar[float]
     solve_tolerance: ClassVar[float] = 1e-7
     approximates: ClassVar[bool] = False
+    scales: ClassVar[bool] = False
     measure: ClassVar[str] = "the largest gradient is {:.2g}"
     resumes_with: ClassVar[tuple[str, ...]] = ()
 
@@ -136,7 +138,8 @@ class LBFGS(Optimizer):
 
     Attributes:
         max_iterations: The largest number of steps.
-        tolerance: The fit has converged when no component of the gradient is larger (nats per unit of θ).
+        tolerance: The fit has converged when no component of the gradient is larger (nats per unit of θ, or per
+            standard deviation of the prior where that is less).
         memory_size: The number of steps from which the curvature is estimated.
 
     Example:
@@ -152,6 +155,7 @@ class LBFGS(Optimizer):
     tolerance: float = eqx.field(default=1e-4, static=True, converter=_tolerance)
     memory_size: int = eqx.field(default=20, static=True, converter=_memory_size)
     resumes_with: ClassVar[tuple[str, ...]] = ("memory_size",)
+    scales: ClassVar[bool] = True
 
     def init(self, x: Vector) -> Tree:
         """Return an empty memory."""
@@ -168,7 +172,6 @@ class LBFGS(Optimizer):
             if best is not None:
                 return best, updated
         return None
-
 
     def expected_gain(self, x: Vector, gradient: Vector, state: Tree) -> float:
         """Return the gain of a Newton step with the estimated curvature, half its first-order gain."""

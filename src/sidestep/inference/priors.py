@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Shaped
 
 from sidestep._arguments import to_finite, to_floats, to_integers
-from sidestep._typing import FloatTree
+from sidestep._typing import FloatTree, Tree
 from sidestep.errors import InputError, check, check_instance, to_number
 from sidestep.tabular.arrays import to_jax
 
@@ -72,6 +72,17 @@ class Prior(eqx.Module):
             log p(θ) in nats, up to a constant.
         """
 
+    def scale(self, parameters: FloatTree) -> Tree:
+        """Return the unit in which each parameter is optimized: 1, or less where the prior is tighter.
+
+        Args:
+            parameters: θ.
+
+        Returns:
+            Numbers in (0, 1], shaped as the parameters.
+        """
+        return jax.tree.map(lambda leaf: np.ones_like(np.asarray(leaf)), parameters)
+
     def check_parameters(self, parameters: FloatTree) -> None:
         """Raise `InputError` unless this is a density over parameters of such shapes.
 
@@ -118,6 +129,11 @@ class Normal(Prior):
             for leaf in jax.tree.leaves(parameters)
         ]
         return -jnp.sum(jnp.stack(penalties))
+
+    def scale(self, parameters: FloatTree) -> Tree:
+        """Return the standard deviation where it is below 1."""
+        deviation = np.minimum(np.sqrt(np.asarray(self.variance, np.float64)), 1.0)
+        return jax.tree.map(lambda leaf: np.broadcast_to(deviation, np.shape(leaf)).astype(leaf.dtype), parameters)
 
 
 def sensor_arrays(
@@ -211,6 +227,10 @@ class GaussianMRF(Prior):
         check(shape is not None and len(shape) == 1 and last < shape[0], message, field="prior")
         self.independent.check_parameters(parameters)
 
+    def scale(self, parameters: Float[Array, "..."]) -> Tree:
+        """Return the unit of `independent`."""
+        return self.independent.scale(parameters)
+
     def log_density(self, parameters: Float[Array, " parameters"]) -> Float[Array, ""]:
         """Return the independent prior's log density − s Σ (θ_i − θ_j)²."""
         one, other = parameters[self.pairs].T
@@ -241,6 +261,10 @@ class WallPrior(Prior):
 
     def __check_init__(self) -> None:
         check_instance(self.independent, Normal, "independent")
+
+    def scale(self, parameters: Float[Array, "..."]) -> Tree:
+        """Return the unit of `independent`."""
+        return self.independent.scale(parameters)
 
     def log_density(self, parameters: Float[Array, " cells"]) -> Float[Array, ""]:
         """Return the independent prior's log density + s Σ p [1 − (1 − p_left p_right)(1 − p_up p_down)].
@@ -274,6 +298,10 @@ class FreeCellEvidence(Prior):
 
     def __check_init__(self) -> None:
         check_instance(self.prior, Prior, "prior")
+
+    def scale(self, parameters: Float[Array, "..."]) -> Tree:
+        """Return the unit of `prior`."""
+        return self.prior.scale(parameters)
 
     def log_density(self, parameters: Float[Array, " cells"]) -> Float[Array, ""]:
         """Return the prior's log density + Σ n ln(1 − p)."""

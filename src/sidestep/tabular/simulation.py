@@ -101,7 +101,7 @@ def _person_of(behavior: Behavior | BehaviorModel | None, task: int) -> int | No
 
 def _followed(
     key: PRNGKeyArray, world: TransitionModel, made: Plan, starts: Int[np.ndarray, " agents"], limit: int
-) -> tuple[Int[np.ndarray, "agents moves+1"], Int[np.ndarray, "agents moves"], Bool[np.ndarray, " agents"]]:
+) -> tuple[Int[np.ndarray, "agents visits"], Int[np.ndarray, "agents moves"], Bool[np.ndarray, " agents"]]:
     """Return the states and actions of agents that follow a plan (−1 once they have arrived), and which arrived."""
     terminal, agents = np.asarray(made.terminal), len(starts)
     # with copies of agents up to a power of two, so that one compiled function serves many numbers of agents

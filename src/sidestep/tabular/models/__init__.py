@@ -5,6 +5,7 @@ from sidestep.tabular.models.categorical import FIXED as FIXED
 from sidestep.tabular.models.categorical import IMPOSSIBLE as IMPOSSIBLE
 from sidestep.tabular.models.categorical import TabularModel as TabularModel
 from sidestep.tabular.models.categorical import TiedModel as TiedModel
+from sidestep.tabular.models.categorical import tabular_model as tabular_model
 from sidestep.tabular.models.obstacle_grid import FeaturedGrid as FeaturedGrid
 from sidestep.tabular.models.obstacle_grid import ObstacleGrid as ObstacleGrid
 from sidestep.tabular.models.obstacle_grid import borders as borders
