@@ -133,8 +133,8 @@ def test_batch_tasks_of_different_kinds_are_refused(tasks):
     ({"radius": 0.0}, "'radius': expected a finite number above 0, found 0"),
     ({"step_cost": -1.0}, "'step_cost': expected a finite number above 0, found -1"),
     ({"goal": (0.0, np.nan)}, "'goal': expected finite numbers"),
-    ({"discount": 0.0}, "'discount': expected a number above 0 and at most 1, found 0"),
-    ({"discount": 1.1}, "'discount': expected a number above 0 and at most 1, found 1.1"),
+    ({"discount": 0.0}, "'discount': expected a finite number above 0 and at most 1, found 0"),
+    ({"discount": 1.1}, "'discount': expected a finite number above 0 and at most 1, found 1.1"),
     ({"discount": 1.0}, "'discount': a goal that pays 1 needs a discount below 1"),
 ])  # fmt: skip
 def test_reach_region_settings_out_of_range_are_refused(settings, match):
@@ -144,7 +144,7 @@ def test_reach_region_settings_out_of_range_are_refused(settings, match):
 
 @pytest.mark.parametrize(("goal", "discount", "match"), [
     (np.nan, 0.9, "'tasks': expected finite numbers"),
-    (0.0, 1.5, "'discount': expected a number above 0 and at most 1, found 1.5"),
+    (0.0, 1.5, "'discount': expected a finite number above 0 and at most 1, found 1.5"),
 ])  # fmt: skip
 def test_check_tasks_refuses_bad_numbers(goal, discount, match):
     with pytest.raises(ss.InputError, match=match):

@@ -106,7 +106,7 @@ def test_tabular_model_probabilities_add_up_and_keep_the_mean(dynamics, lattice,
 
 def test_tabular_model_of_dynamics_that_return_nan_raises():
     nan = jax.tree.map(lambda leaf: leaf * jnp.nan, WALKER.dynamics.parameters)
-    with pytest.raises(ss.InputError, match="expected a possible outcome for every state and action"):
+    with pytest.raises(ss.InputError, match="expected a possible outcome of every action"):
         replace(WALKER, dynamics=WALKER.dynamics.with_parameters(nan)).tabular_model()
 
 

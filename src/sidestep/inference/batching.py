@@ -108,15 +108,18 @@ def plan_batches(
     return BatchPlan(devices * together, keeps_warm_starts, reuses)
 
 
-def make_batches(demonstrations: Demonstrations, behavior: BehaviorModel, size: int) -> list[Batch]:
+def make_batches(
+    demonstrations: Demonstrations, behavior: BehaviorModel, size: int, *, deadline: bool = False
+) -> list[Batch]:
     """Return batches of `size` tasks; the last is padded with terminated tasks without choices.
 
     Args:
         demonstrations: The moves and all tasks.
         behavior: The behavior model, for the persons.
         size: The number of tasks of a batch.
+        deadline: As in `SolveOptions`.
     """
-    tasks = demonstrations.tasks
+    tasks, choices = demonstrations.tasks, choices_of(demonstrations, deadline=deadline)
     count = len(tasks.terminal)
     missing = -count % size
 
@@ -126,7 +129,7 @@ def make_batches(demonstrations: Demonstrations, behavior: BehaviorModel, size: 
 
     padded_tasks = eqx.tree_at(lambda task: task.terminal, jax.tree.map(padded, tasks), padded(tasks.terminal, True))
     person = np.zeros(count, np.int32) if behavior.person is None else behavior.person
-    whole = Batch(padded_tasks, padded(person), jax.tree.map(padded, choices_of(demonstrations)))
+    whole = Batch(padded_tasks, padded(person), jax.tree.map(padded, choices))
     return [
         jax.tree.map(lambda leaf, first=first: jax.device_put(leaf[first : first + size]), whole)
         for first in range(0, count, size)

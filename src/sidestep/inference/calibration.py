@@ -90,6 +90,8 @@ def score_statistics(
     """
     check_instance(options, (SolveOptions, type(None)), "options")
     check_likelihood(model, demonstrations, behavior, options or SolveOptions())
+    deadline = options is not None and options.deadline
+    check(not deadline, "expected options without a deadline, found one", field="options")
     padded, agents = padded_for(demonstrations, behavior)
     converged, *numbers = _scores(model, padded, agents, options)
     if not bool(converged):

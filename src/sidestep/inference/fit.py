@@ -28,7 +28,7 @@ from sidestep.inference.priors import Normal, Prior
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
 from sidestep.tabular.demonstrations import Demonstrations
-from sidestep.tabular.likelihood import ALL_TERMS, Terms
+from sidestep.tabular.likelihood import ALL_TERMS, Terms, check_deadline
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.proper import check_proper
 from sidestep.tabular.solve import SolveOptions
@@ -222,7 +222,7 @@ def fit(
     _check_settings(optimizer, options, prior, memory, mesh, large_map, report)
     behavior = as_behavior_model(behavior)
     solver = options.solver_for(behavior.behavior.backup, model.graph.states)
-    options = SolveOptions(options.gradient, options.horizon, solver)
+    options = SolveOptions(options.gradient, options.horizon, solver, deadline=options.deadline)
     problem = Problem(model, behavior, demonstrations, prior, tuple(terms), options, tempering)
     _check_problem(problem, optimizer)
     count, devices, reuse = len(demonstrations.tasks.terminal), 1 if mesh is None else mesh.size, optimizer.approximates
@@ -270,4 +270,5 @@ def _check_problem(problem: Problem, optimizer: Optimizer) -> None:
     message = "the fixed-policy gradient of the Boltzmann average belongs to no objective: expected Adam(), or 'exact'"
     message += f", found {type(optimizer).__name__}"
     check(has_objective or isinstance(optimizer, Adam), message, field="gradient")
+    check_deadline(demos, options)
     check_proper(behavior.tasks_of(demos.tasks), behavior.behavior_of(), graph, options.horizon)

@@ -341,7 +341,7 @@ def _check_start(problem: Problem, progress: Progress, solves: list[SolveSummary
         )
     if unreachable.any():
         task, choice = np.argwhere(unreachable)[0]
-        state = choices_of(demos).states[task, choice]
+        state = choices_of(demos, deadline=problem.options.deadline).states[task, choice]
         move = np.flatnonzero((np.asarray(demos.task) == task) & (np.asarray(demos.states) == state))[0]
         raise InputError(
             f"state {int(state)} is visited, but the goal cannot be reached from it",

@@ -192,7 +192,9 @@ class Objective:
         self.plan: BatchPlan = plan or plan_batches(problem.model, problem.solver, len(terminal))
         if jax.process_count() > 1:  # copies tell whether all processes have the same problem
             _replicate(np.frombuffer(bytes.fromhex(fingerprint(problem)), np.uint8), mesh)
-        batches = make_batches(problem.demonstrations, problem.behavior, self.plan.size) if uses_actions else []
+        rest = problem.behavior, self.plan.size
+        deadline = problem.options.deadline
+        batches = make_batches(problem.demonstrations, *rest, deadline=deadline) if uses_actions else []
         self.batches: list[Batch] = [_shard(batch, mesh) for batch in batches]
         self.arrivals: Arrivals | None = arrivals_of(problem.demonstrations) if "transitions" in problem.terms else None
         # batches and arrivals replace the demonstrations

@@ -6,6 +6,7 @@ Agents plan with the dynamics that they know, so both terms depend on θ: the *a
 *transitions* directly. Each can be left out. Each move counts by its weight.
 """
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -139,8 +140,24 @@ def check_likelihood(
     agents = as_behavior_model(behavior)
     check_features(behavior, model.graph)
     check_persons(behavior, len(demonstrations.tasks.terminal))
+    check_deadline(demonstrations, options)
     if not is_traced(model, demonstrations, behavior):
         check_proper(agents.tasks_of(demonstrations.tasks), agents.behavior_of(), model.graph, options.horizon)
+
+
+def check_deadline(demonstrations: Demonstrations, options: SolveOptions) -> None:
+    """Raise `InputError` unless all trajectories end by the deadline, where there is one.
+
+    Args:
+        demonstrations: Moves and tasks.
+        options: With the horizon.
+    """
+    if options.deadline and not is_traced(demonstrations):
+        lengths = np.bincount(np.asarray(demonstrations.trajectory))
+        longest = int(np.argmax(lengths))
+        message = f"expected at most {options.horizon} moves by the deadline, found {lengths[longest]}"
+        valid = lengths[longest] <= (options.horizon or 0)
+        check(valid, message, source=f"trajectory {longest}", field="demonstrations")
 
 
 def padded_for(
@@ -214,8 +231,15 @@ def _log_policies(
 ) -> Float[Array, " moves"]:
     moves = eqx.tree_at(lambda each: each.tasks, demonstrations, agents.tasks_of(demonstrations.tasks))
     behavior, task = agents.behavior_of(), moves.task
-    solution = solve(model, demonstrations.tasks, agents, options=options)
-    q = visited_advantages(model, moves, solution.values_after)
+    if options.deadline:
+        count = len(demonstrations.tasks.terminal)
+        times = jnp.minimum(move_times(moves.trajectory), (options.horizon or 1) - 1)
+        visited, times = (jnp.broadcast_to(each, (count, len(each))) for each in (moves.states, times))
+        solution = solve(model, demonstrations.tasks, agents, options=options, visited=visited, times=times)
+        q = solution.advantages[task, jnp.arange(len(task))]
+    else:
+        solution = solve(model, demonstrations.tasks, agents, options=options)
+        q = visited_advantages(model, moves, solution.values_after)
     betas = agents.betas(solution.values.shape[0])[task]
 
     def of_move(beta: Array, q: Array, state: Array, action: Array) -> Array:
@@ -234,11 +258,13 @@ class Choices(NamedTuple):
         states: The state in which each action was taken.
         actions: The action.
         counts: The sum of the weights of these moves; 0 for padding.
+        times: The number of moves before it, where policies depend on it; otherwise None.
     """
 
     states: Int[Array, "*tasks choices"]
     actions: Int[Array, "*tasks choices"]
     counts: Float[Array, "*tasks choices"]
+    times: Int[Array, "*tasks choices"] | None = None
 
 
 def choice_log_likelihood(
@@ -267,7 +293,8 @@ def choice_log_likelihood(
     Returns:
         The log-likelihood, NaN if the values did not converge, and the solution.
     """
-    solution = solve(model, task, behavior, options=options, start=start, visited=choices.states, region=region)
+    visited, times = choices.states, choices.times
+    solution = solve(model, task, behavior, options=options, start=start, visited=visited, times=times, region=region)
     q = solution.advantages
     each = _log_policy(model, behavior, q, choices.states, choices.actions)
     # those that do not count may be impossible
@@ -275,13 +302,15 @@ def choice_log_likelihood(
     return total * jnp.where(solution.converged, 1.0, jnp.nan), solution
 
 
-def choices_of(demonstrations: Demonstrations) -> Choices:
+def choices_of(demonstrations: Demonstrations, *, deadline: bool = False) -> Choices:
     """Return the distinct choices of each task, with their counts.
 
     Args:
         demonstrations: The moves and their tasks.
+        deadline: Whether choices after different numbers of moves are distinct (see `SolveOptions`).
     """
-    distinct, counts = _distinct_moves(demonstrations, "task", "states", "actions")
+    times = [np.asarray(move_times(demonstrations.trajectory))] if deadline else []
+    distinct, counts = _distinct_moves(demonstrations, "task", "states", "actions", others=times)
     sizes = np.bincount(distinct[0], minlength=len(demonstrations.tasks.terminal))
     filled = np.arange(next_power_of_two(max(int(sizes.max()), _MIN_LENGTH))) < sizes[:, None]
 
@@ -290,7 +319,17 @@ def choices_of(demonstrations: Demonstrations) -> Choices:
         whole[filled] = part
         return to_jax(whole)
 
-    return Choices(padded(distinct[1]), padded(distinct[2]), padded(counts))
+    return Choices(padded(distinct[1]), padded(distinct[2]), padded(counts), *map(padded, distinct[3:]))
+
+
+def move_times(trajectory: Int[Array, " moves"]) -> Int[Array, " moves"]:
+    """Return the number of moves before each move in its trajectory.
+
+    Args:
+        trajectory: The trajectory of each move.
+    """
+    places = jnp.arange(len(trajectory))
+    return places - jnp.full_like(places, len(trajectory)).at[trajectory].min(places)[trajectory]
 
 
 class Arrivals(NamedTuple):
@@ -322,9 +361,11 @@ def arrivals_of(demonstrations: Demonstrations) -> Arrivals:
     return Arrivals(states, actions, next_states, to_jax(np.pad(counts, (0, missing))))
 
 
-def _distinct_moves(demonstrations: Demonstrations, *fields: str) -> tuple[np.ndarray, np.ndarray]:
+def _distinct_moves(
+    demonstrations: Demonstrations, *fields: str, others: Sequence[np.ndarray] = ()
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the distinct values of some fields, one move a column, and the sum of the weights of each."""
-    moves = np.stack([np.asarray(getattr(demonstrations, field)) for field in fields])
+    moves = np.stack([*(np.asarray(getattr(demonstrations, field)) for field in fields), *others])
     distinct, which = np.unique(moves, axis=1, return_inverse=True)
     return distinct, np.bincount(which.ravel(), np.asarray(demonstrations.weights))
 

@@ -178,6 +178,26 @@ def _plan(model: TransitionModel, task: Task, behavior: Behavior, optimal: bool,
     return Plan(policy, intended.astype(jnp.int32), task.terminal, solution)
 
 
+def policy_by_time(
+    model: TransitionModel, task: Task, behavior: Behavior, options: SolveOptions
+) -> Float[Array, "moves states actions"]:
+    """Return the policy before each move of agents with a deadline.
+
+    Args:
+        model: The transition model.
+        task: One task.
+        behavior: The agents'.
+        options: With the deadline.
+    """
+    states, moves = model.graph.states, options.horizon or 1
+    every = np.tile(np.arange(states), moves), np.repeat(np.arange(moves), states)
+    visited, times = (to_jax(each, np.int32) for each in every)
+    solution = solve(model, task, behavior, options=options, visited=visited, times=times)
+    advantages = solution.advantages.reshape(moves, states, -1)
+    available = jnp.broadcast_to(model.graph.available, advantages.shape[1:])
+    return jnp.exp(behavior.log_policy(advantages, available))
+
+
 def _first_best(
     policy: Float[Array, "states actions"], advantages: Float[Array, "states actions"]
 ) -> Int[Array, " states"]:
@@ -227,7 +247,7 @@ class RollOuts(NamedTuple):
 def roll_out(
     key: PRNGKeyArray,
     world: TransitionModel,
-    policy: Float[Array, "states actions"],
+    policy: Float[Array, "*moves states actions"],
     terminal: Bool[Array, " states"],
     starts: Shaped[ArrayLike, "..."] | Sequence[int],
     max_moves: int,
@@ -237,7 +257,7 @@ def roll_out(
     Args:
         key: Of the random choices; the trajectory of agent i does not depend on how many agents come after it.
         world: The transition model that moves follow; the policy may have been made for another one.
-        policy: The probability of each action in every state.
+        policy: The probability of each action in every state; with an axis of moves before these, of each move.
         terminal: Where agents stop.
         starts: The state that each agent starts in.
         max_moves: The number of moves after which an agent stops anyway.
@@ -263,17 +283,16 @@ def roll_out(
     max_moves = to_count(max_moves, "max_moves")
     check_model(world)
     shape = world.graph.states, world.graph.actions
-    fits = jnp.shape(policy) == shape and jnp.shape(terminal) == shape[:1]
-    message = f"expected a policy of shape {shape} and terminal states of shape {shape[:1]}, found "
+    fits = jnp.shape(policy) in (shape, (max_moves, *shape)) and jnp.shape(terminal) == shape[:1]
+    message = f"expected a policy of shape {shape}, or one for each of {max_moves} moves, and terminal states of shape "
+    message += f"{shape[:1]}, found "
     check(fits, f"{message}{jnp.shape(policy)} and {jnp.shape(terminal)}", field="policy, terminal")
     if not is_traced(policy):
         numbers = np.asarray(policy)
-        rows = np.flatnonzero(~(np.isclose(numbers.sum(axis=1), 1, atol=1e-4) & (numbers >= 0).all(axis=1)))[:1]
-        check(
-            not len(rows),
-            f"expected probabilities that sum to one in every state, found other ones in state {rows}",
-            field="policy",
-        )
+        valid = np.isclose(numbers.sum(axis=-1), 1, atol=1e-4) & (numbers >= 0).all(axis=-1)
+        wrong = np.argwhere(~valid)[:1].tolist()
+        message = f"expected probabilities that sum to one in every state, found other ones in state {wrong}"
+        check(not wrong, message, field="policy")
     states = to_jax(to_states(starts, world.graph.states, "starts"), np.int32)
     return _roll_out(to_key(key), world, policy, terminal, states, max_moves)
 
@@ -282,23 +301,25 @@ def roll_out(
 def _roll_out(
     key: PRNGKeyArray,
     world: TransitionModel,
-    policy: Float[Array, "states actions"],
+    policy: Float[Array, "*moves states actions"],
     terminal: Bool[Array, " states"],
     starts: Int[Array, " agents"],
     max_moves: int,
 ) -> RollOuts:
     log_policy, log_probabilities = jnp.log(policy), jnp.log(world.probabilities())
+    each = jnp.arange(max_moves)
 
     def of_agent(key: PRNGKeyArray, start: Int[Array, ""]) -> tuple[Array, Array]:
-        def step(state: Int[Array, ""], key: PRNGKeyArray) -> tuple[Array, tuple[Array, Array]]:
-            action_key, outcome_key = jax.random.split(key)
-            action = jax.random.categorical(action_key, log_policy[state])
+        def step(state: Int[Array, ""], move: tuple[PRNGKeyArray, Array]) -> tuple[Array, tuple[Array, Array]]:
+            action_key, outcome_key = jax.random.split(move[0])
+            own = log_policy[state] if log_policy.ndim == 2 else log_policy[move[1], state]
+            action = jax.random.categorical(action_key, own)
             outcome = jax.random.categorical(outcome_key, log_probabilities[state, action])
             done = terminal[state]
             next_state = jnp.where(done, state, world.graph.successors[state, action, outcome])
             return next_state, (next_state, jnp.where(done, -1, action))
 
-        _, (states, actions) = jax.lax.scan(step, start, jax.random.split(key, max_moves))
+        _, (states, actions) = jax.lax.scan(step, start, (jax.random.split(key, max_moves), each))
         return jnp.concatenate([start[None], states]), actions
 
     starts = starts.astype(world.graph.successors.dtype)

@@ -4,16 +4,17 @@ from collections.abc import Sequence
 
 import jax
 import numpy as np
-from jaxtyping import ArrayLike, Bool, Int, PRNGKeyArray, Shaped
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from sidestep._arguments import to_key, to_states
 from sidestep.errors import InputError, check, to_count, to_list
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior
-from sidestep.tabular.behavior_model import BehaviorModel
+from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
 from sidestep.tabular.checks import check_model, check_persons
 from sidestep.tabular.demonstrations import Trajectory, next_power_of_two
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.planning import Plan, plan, roll_out
+from sidestep.tabular.planning import plan, policy_by_time, roll_out
 from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.tasks import Task
 
@@ -45,7 +46,8 @@ def simulate(
         max_moves: The number of moves after which an agent stops; its trajectory is then `truncated`. By default no
             agent stops before it arrives, and one that has not arrived after twice the number of states, and at least
             1000 moves, is an error.
-        options: How the agents plan; by default `SolveOptions()`.
+        options: How the agents plan; by default `SolveOptions()`. With a deadline all agents stop there, and have a
+            `behavior`.
 
     Returns:
         The trajectories, those of the first task first. An agent that starts in a terminal state makes no move.
@@ -72,6 +74,10 @@ def simulate(
     check(len(starts) == len(tasks), f"expected as many as tasks, {len(tasks)}, found {len(starts)}", field="starts")
     limit = max(1000, 2 * world.graph.states) if max_moves is None else to_count(max_moves, "max_moves")
     check_persons(behavior, len(tasks))
+    options = options or SolveOptions()
+    if options.deadline and options.horizon is not None:
+        check(behavior is not None, "expected a behavior with a deadline, found none", field="behavior")
+        limit = min(limit, options.horizon)
     key, trajectories = to_key(key), []
     for index, (task, own) in enumerate(zip(tasks, starts, strict=True)):
         begin = to_states(own, world.graph.states, f"starts[{index}]")
@@ -80,8 +86,12 @@ def simulate(
         if not len(begin):
             continue
         key, own_key = jax.random.split(key)
-        states, actions, arrived = _followed(own_key, world, made, begin, limit)
-        if max_moves is None and not arrived.all():
+        policy = made.policy
+        if options.deadline and behavior is not None:
+            agents = as_behavior_model(behavior)
+            policy = policy_by_time(world, agents.tasks_of(task), agents.behavior_of(person), options)
+        states, actions, arrived = _followed(own_key, world, policy, np.asarray(made.terminal), begin, limit)
+        if max_moves is None and not options.deadline and not arrived.all():
             raise InputError(
                 f"an agent from state {int(begin[np.argmin(arrived)])} had not arrived after {limit} moves: "
                 "expected a goal in reach, a larger β, a step cost with discount 1 for long ways, or `max_moves`",
@@ -100,17 +110,23 @@ def _person_of(behavior: Behavior | BehaviorModel | None, task: int) -> int | No
 
 
 def _followed(
-    key: PRNGKeyArray, world: TransitionModel, made: Plan, starts: Int[np.ndarray, " agents"], limit: int
+    key: PRNGKeyArray,
+    world: TransitionModel,
+    policy: Float[Array, "*moves states actions"],
+    terminal: Bool[np.ndarray, " states"],
+    starts: Int[np.ndarray, " agents"],
+    limit: int,
 ) -> tuple[Int[np.ndarray, "agents visits"], Int[np.ndarray, "agents moves"], Bool[np.ndarray, " agents"]]:
-    """Return the states and actions of agents that follow a plan (−1 once they have arrived), and which arrived."""
-    terminal, agents = np.asarray(made.terminal), len(starts)
+    """Return the states and actions of agents that follow a policy (−1 once they have arrived), and which arrived."""
+    agents = len(starts)
     # with copies of agents up to a power of two, so that one compiled function serves many numbers of agents
     states = np.resize(starts, next_power_of_two(agents))[:, None]
     actions = np.zeros((len(states), 0), dtype=np.int64)
     while not terminal[states[:agents, -1]].all() and actions.shape[1] < limit:
         key, chunk_key = jax.random.split(key)
-        moves = min(_CHUNK, limit - actions.shape[1])
-        rolled = roll_out(chunk_key, world, made.policy, made.terminal, states[:, -1], moves)
+        moves, before = min(_CHUNK, limit - actions.shape[1]), actions.shape[1]
+        own = policy if policy.ndim == 2 else policy[before : before + moves]
+        rolled = roll_out(chunk_key, world, own, to_jax(terminal), states[:, -1], moves)
         states = np.concatenate([states, np.asarray(rolled.states)[:, 1:]], axis=1)
         actions = np.concatenate([actions, np.asarray(rolled.actions)], axis=1)
     return states[:agents], actions[:agents], terminal[states[:agents, -1]]

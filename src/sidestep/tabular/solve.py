@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.errors import check_choice, check_instance, to_count
+from sidestep.errors import check, check_choice, check_instance, to_count
 from sidestep.tabular.backups import Backup, Behavior, Gradient
 from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
 from sidestep.tabular.checks import check_behavior, check_features, check_model, check_persons, check_task, is_traced
@@ -54,6 +54,8 @@ class SolveOptions(eqx.Module):
         gradient: "exact", or "fixed_policy" for the derivative of the average under the policy held fixed (eqs. 9, 10).
         horizon: The number of actions that agents look ahead, at least 1; None for the fixed point of the Bellman
             equation.
+        deadline: Whether the horizon is the number of actions in all, so that agents look one action less ahead with
+            every action (finite-horizon maximum entropy); by default they look `horizon` ahead at each.
         solver: Computes the fixed point; None for the one that `default_solver` chooses.
 
     Raises:
@@ -66,12 +68,15 @@ class SolveOptions(eqx.Module):
 
     gradient: Gradient = eqx.field(static=True, default="exact")
     horizon: int | None = eqx.field(static=True, default=None)
+    deadline: bool = eqx.field(static=True, default=False, kw_only=True)
     solver: base.Solver | None = None
 
     def __check_init__(self) -> None:
         check_choice(self.gradient, ("exact", "fixed_policy"), "gradient")
         if self.horizon is not None:
             to_count(self.horizon, "horizon")
+        check_instance(self.deadline, bool, "deadline")
+        check(not self.deadline or self.horizon, "expected a horizon with a deadline, found none", field="horizon")
         check_instance(self.solver, (base.Solver, type(None)), "solver")
 
     def solver_for(self, backup: Backup, states: int) -> base.Solver:
@@ -128,6 +133,7 @@ def solve(
     options: SolveOptions | None = None,
     start: base.WarmStart | None = None,
     visited: Int[Array, "*tasks visited"] | None = None,
+    times: Int[Array, "*tasks visited"] | None = None,
     region: Bool[Array, "*tasks states"] | None = None,
 ) -> Solution:
     """Return the values of one task, or of a stack of tasks, for agents that behave as `behavior` describes.
@@ -145,6 +151,7 @@ def solve(
             `start.adjoint` is the new adjoint λ, which the next solve can start from.
         visited: The states to compute action values of; by default all. Few of them save time and memory where they
             are differentiated.
+        times: With a deadline, the number of actions before that in each visited state; by default none.
         region: The states that have to be solved; by default all. `start.region` has those with an adjoint other than
             0 in the earlier solve. `GaussSeidel` updates the others only roughly, to save time. Derivatives are NaN
             where these others are seen to matter, but a state that did not matter before and does now is not noticed:
@@ -181,7 +188,7 @@ def solve(
         check_persons(behavior, len(task.terminal))
     if not is_traced(model, task, behavior):
         check_proper(agents.tasks_of(task), agents.behavior_of(), model.graph, options.horizon)
-    return _solve(model, task, agents, options, start, visited, region)
+    return _solve(model, task, agents, options, start, visited, times, region)
 
 
 # Compiled as a whole: otherwise every call would compile the loops of a solver again.
@@ -193,6 +200,7 @@ def _solve(
     options: SolveOptions,
     start: base.WarmStart | None,
     visited: Int[Array, "*tasks visited"] | None,
+    times: Int[Array, "*tasks visited"] | None,
     region: Bool[Array, "*tasks states"] | None,
 ) -> Solution:
     task, behavior = agents.tasks_of(task), agents.behavior_of()
@@ -204,7 +212,9 @@ def _solve(
     everywhere = jnp.ones(task.terminal.shape, dtype=bool) if region is None else region
     betas = agents.betas(*tasks).astype(dtype) if tasks else behavior.beta.astype(dtype)
 
-    def one(task: Task, start: base.WarmStart, visited: Array | None, region: Array, beta: Array) -> Solution:
+    def one(
+        task: Task, start: base.WarmStart, visited: Array | None, times: Array | None, region: Array, beta: Array
+    ) -> Solution:
         process = decision_process(model, probabilities, task)
         some = jnp.zeros(0, jnp.int32) if visited is None else visited
         if options.horizon is None:
@@ -215,9 +225,11 @@ def _solve(
             constants = (*structure, solver, result.order, region, some)
             solved = fixed_point(behavior.backup, options.gradient, constants, inputs, result.values, start.adjoint)
             values, rows = cast(tuple[Array, Array], solved)
-            after = values
+            after, later = values, values[None]
         else:
-            values, after = base.finite_horizon(process, behavior.backup, beta, options.horizon, options.gradient)
+            rules = behavior.backup, beta, options.horizon, options.gradient
+            values, later = base.finite_horizon(process, *rules)
+            after = later[0]
             sweeps, residual = jnp.asarray(options.horizon), jnp.asarray(0, values.dtype)
             result = base.SolveResult(values, start.order, sweeps, residual, jnp.isfinite(values).all())
             rows = probabilities[some]
@@ -226,14 +238,15 @@ def _solve(
         else:
             parts = process.reward, process.available
             reward, available = (part[visited] if len(part) > 1 else part for part in parts)
-            here, leads_to = after[visited], after[process.successors[visited]]
+            time = jnp.zeros_like(visited) if times is None else times
+            here, leads_to = later[time, visited], later[time[:, None, None], process.successors[visited]]
             advantages = base.advantages(here, leads_to, rows, reward, available, process.discount)
         q = base.finite_or_zero(here)[:, None] + advantages
         next_start = base.WarmStart(jax.lax.stop_gradient(values), start.adjoint, result.order)
         info = result.sweeps, result.residual, result.converged
         return Solution(values, after, q, advantages, *info, next_start)
 
-    return (jax.vmap(one) if tasks else one)(task, begin, visited, everywhere, betas)
+    return (jax.vmap(one) if tasks else one)(task, begin, visited, times, everywhere, betas)
 
 
 def decision_process(

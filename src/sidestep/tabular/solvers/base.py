@@ -257,22 +257,23 @@ class Solver(eqx.Module):
 
 def finite_horizon(
     process: DecisionProcess, backup: Backup, beta: Beta, horizon: int, gradient: Gradient
-) -> tuple[Values, Values]:
-    """Return V after `horizon` backups from zero, the value of acting that many times, and V after one backup less.
+) -> tuple[Values, Float[Array, "horizon states"]]:
+    """Return V after `horizon` backups from zero, the value of acting that many times, and V after fewer backups.
 
-    Q of an agent that looks `horizon` actions ahead is R + γ Σ T V with the second. Differentiable by JAX itself;
-    `gradient` chooses the exact one or that of the policies held fixed.
+    The latter are V after horizon − 1, …, 1, 0 backups. Q of an agent that looks n actions ahead is R + γ Σ T V with V
+    after n − 1 backups. Differentiable by JAX itself; `gradient` chooses the exact one or that of the policies held
+    fixed.
     """
 
-    def back_up(values: Values) -> Values:
+    def back_up(values: Values, _: None) -> tuple[Values, Values]:
         q, available = process.action_values(values), process.available_actions()
-        if gradient == "exact":
-            return process.with_terminal_rewards(backup.value(q, beta, available))
-        return process.with_terminal_rewards(at_fixed_policy(backup, beta, q, available))
+        exact = gradient == "exact"
+        new = backup.value(q, beta, available) if exact else at_fixed_policy(backup, beta, q, available)
+        return process.with_terminal_rewards(new), values
 
     start = process.with_terminal_rewards(jnp.zeros(process.terminal.shape, process.probabilities.dtype))
-    after = jax.lax.scan(lambda values, _: (back_up(values), None), start, length=horizon - 1)[0]
-    return back_up(after), after
+    last, before = jax.lax.scan(back_up, start, length=horizon)
+    return last, before[::-1]
 
 
 def is_reachable(values: Float[Array, "*states"]) -> Bool[Array, "*states"]:
