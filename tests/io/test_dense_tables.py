@@ -80,6 +80,7 @@ def test_from_dense_keeps_as_many_outcomes_as_an_action_has_at_most():
     world = from_dense(P, np.zeros(50), discount=0.9)
     assert world.model.graph.successors.shape == (50, 1, 3)
     assert world.model.graph.successors[3, 0].tolist() == [4, 9, 44]
+    assert world.model.graph.successors[0, 0].tolist() == [int(np.argmax(P[0, 0]))] * 3
     np.testing.assert_allclose(world.model.probabilities()[3, 0], [0.25, 0.25, 0.5], rtol=1e-12)
 
 

@@ -59,6 +59,35 @@ class Corridor(gymnasium.Env):
         return self._seen(), reward, bool(opens), self.steps >= LIMIT, {}
 
 
+class Ladder(gymnasium.Env):
+    """From rung 0, up, down to 0, or stay. Going up from rung 19 ends, and pays `pay` of the number of steps."""
+
+    observation_space, action_space = Discrete(21), Discrete(3)
+
+    def __init__(self, pay, top=20):
+        self.pay, self.top, self.rung, self.steps = pay, top, 0, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.rung = self.steps = 0
+        return self.rung, {}
+
+    def step(self, action):
+        assert self.rung < 20, "the episode is over"
+        self.steps += 1
+        self.rung = (self.rung + 1, 0, self.rung)[action]
+        ends = self.rung == self.top
+        return self.rung, self.pay(self.steps) if ends else 0.0, ends, False, {}
+
+
+class Round(Ladder):
+    """A ladder of three rungs; an episode ends, and pays 1, by going down to rung 0, where it starts."""
+
+    def step(self, action):
+        rung, *_ = super().step(0 if action == 0 and self.rung < 2 else 1)
+        return rung, float(rung == 0), rung == 0, False, {}
+
+
 def corridor_values(discount, slips=0.0):
     """V[carries, cell] by value iteration."""
     values, cells = np.zeros((2, CELLS)), np.arange(CELLS)
@@ -166,6 +195,28 @@ def test_enumerate_env_with_a_key_that_leaves_something_out_raises():
     unhashable: Any = lambda env, _: [env.cell]  # noqa: E731
     with pytest.raises(InputError, match="'key': expected a number, text or tuple that tells states apart, found list"):
         enumerate_env(Corridor(), key=unhashable)
+
+
+def test_enumerate_env_of_what_only_a_second_try_sees_raises():
+    """No random walk comes up to the last rung, but staying on it counts a step."""
+    same = enumerate_env(Ladder(lambda _: 1.0), 0.9)
+    assert plan(same.model, same.task).solution.values[0] == pytest.approx(0.9**19)
+    with pytest.raises(
+        InputError, match=r"^state 19, action 0: expected a key.*found \(20, 20.0, True\) and then \(20, 21"
+    ):
+        enumerate_env(Ladder(float))
+
+
+def test_enumerate_env_of_episodes_that_end_where_they_start_separates_the_end():
+    world = enumerate_env(Round(float, top=-1), 0.9)
+    assert (world.labels, world.ends) == ((0, 1, 2), {0: 3})
+    np.testing.assert_allclose(plan(world.model, world.task).solution.values, [1.0, 1.0, 1.0, 0.0])
+
+
+def test_enumerate_env_of_as_many_states_as_the_limit_finds_them():
+    assert len(enumerate_env(Corridor(), limit=2 * CELLS).labels) == 2 * CELLS
+    with pytest.raises(InputError, match="'limit': expected at most 9 states, found more"):
+        enumerate_env(Corridor(), limit=2 * CELLS - 1)
 
 
 def test_enumerate_env_pays_what_wrappers_pay():

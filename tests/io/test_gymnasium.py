@@ -90,6 +90,17 @@ def test_from_gymnasium_pays_every_outcome_its_own_reward():
     assert plan(world.model, world.task).solution.values[0] == pytest.approx(3.75 / 0.875)
 
 
+def test_from_gymnasium_pays_nothing_else_for_impossible_outcomes():
+    """State 0 stays with reward −1, or goes to 1 or stays; what has probability 0 may be anything."""
+    table = {0: {0: [(1.0, 0, -1.0, False)], 1: [(0.5, 1, 4.0, True), (0.5, 0, 2.0, False)]}, 1: {}}
+    world = from_gymnasium(Table(table))
+    assert world.task.outcome_reward is not None
+    assert world.task.outcome_reward[0].tolist() == [[-1.0, -1.0], [4.0, 2.0]]
+    assert world.model.graph.successors[0].tolist() == [[0, 0], [1, 0]]
+    turned = {0: {0: [(0.0, 1, 4.0, True), (1.0, 0, -1.0, False), (0.0, 9, np.inf, True)], 1: table[0][1]}, 1: {}}
+    assert eqx.tree_equal(from_gymnasium(Table(turned)), world)
+
+
 def test_from_gymnasium_of_equal_rewards_has_rewards_of_actions():
     world = from_gymnasium(Table({0: {0: [(0.5, 0, -2.0, False), (0.5, 1, -2.0, True)]}, 1: {0: STAYS}}))
     assert world.task.outcome_reward is None

@@ -33,6 +33,7 @@ from sidestep.tabular.graph import Graph, graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.planning import plan
 from sidestep.tabular.tasks import Task, reach, stack_tasks, with_outcome_reward
+from sidestep.tabular.tasks import task as task_of_states
 
 pytestmark = pytest.mark.usefixtures("datasets")
 
@@ -390,6 +391,17 @@ def test_write_demonstrations_of_several_outcomes_has_their_mean():
     other = gather([Trajectory(np.array([0, 0, 1]), np.array([0, 0]), 0)], [task])
     with pytest.raises(InputError, match="trajectory, row 1: expected moves that the world has"):
         write_demonstrations(fresh("ours/mean"), other, graph([[[1, 1, 1]], [[1, 1, 1]]]))
+
+
+def test_write_demonstrations_has_as_goal_what_pays_most_on_arrival():
+    """State 1 pays 1 a move after arrival, γ = ½; arriving in 2 pays .7, and staying in 1, where all has ended, 9."""
+    world = graph([[[1], [2]], [[1], [1]], [[2], [2]]])
+    rewards = np.array([[[0.0], [0.7]], [[9.0], [9.0]], [[0.0], [0.0]]])
+    task = with_outcome_reward(task_of_states(np.array([0.0, 1.0, 0.0]), 0.5, np.array([False, True, True])), rewards)
+    dataset = fresh("ours/goal")
+    write_demonstrations(dataset, gather([Trajectory(np.array([0, 2]), np.array([1]), 0)], [task]), world)
+    (stored,) = minari.load_dataset(dataset).storage.get_episode_metadata([0])
+    assert stored["goal"] == 2
 
 
 def test_read_demonstrations_with_a_task_of_another_world_raises():
