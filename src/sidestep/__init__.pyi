@@ -12,7 +12,12 @@ from ._version import __version__ as __version__
 
 # data: maps, walks and demonstrations
 from .io.demonstrations import demonstrations_from_walks as demonstrations_from_walks
-from .io.gymnasium import collect as collect, from_gymnasium as from_gymnasium, slip_of as slip_of, slippery as slippery
+from .io.dense_tables import from_dense as from_dense
+from .io.enumeration import enumerate_env as enumerate_env
+from .io.environments import Environment as Environment
+from .io.episodes import collect as collect
+from .io.gymnasium import from_gymnasium as from_gymnasium, slip_of as slip_of, slippery as slippery
+from .io.keys import observation_key as observation_key
 from .io.maps import read_map as read_map, write_map as write_map
 from .io.minari.demonstrations import (
     read_demonstrations as read_demonstrations,

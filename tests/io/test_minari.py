@@ -6,6 +6,7 @@ import os
 import re
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import equinox as eqx
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 import minari
 import numpy as np
 import pytest
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, Text, Tuple
 from hypothesis import given
 from hypothesis import strategies as st
 from minari.namespace import list_local_namespaces
@@ -23,14 +24,16 @@ from helpers.stored import buffer, fresh, store
 from sidestep.errors import InputError
 from sidestep.inference.fit import fit
 from sidestep.inference.priors import Normal
-from sidestep.io.gymnasium import collect, from_gymnasium, slippery
+from sidestep.io.episodes import collect
+from sidestep.io.gymnasium import from_gymnasium, slippery
 from sidestep.io.minari.demonstrations import read_demonstrations, write_demonstrations
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.demonstrations import Trajectory, gather
-from sidestep.tabular.graph import Graph
+from sidestep.tabular.graph import Graph, graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.planning import plan
-from sidestep.tabular.tasks import Task, reach, stack_tasks
+from sidestep.tabular.tasks import Task, reach, stack_tasks, with_outcome_reward
+from sidestep.tabular.tasks import task as task_of_states
 
 pytestmark = pytest.mark.usefixtures("datasets")
 
@@ -50,20 +53,27 @@ sizes = st.tuples(st.integers(2, 3), st.integers(1, 2), st.integers(1, 2), st.in
 
 
 def pursuits(states, actions, tasks, walks, seed):
-    """A graph, and walks towards tasks on it, whose rewards have full and short axes."""
+    """A graph, and weighted walks towards tasks on it, of which rewards have full and short axes."""
     random = np.random.default_rng(seed)
+
+    def table(*shape):
+        return jnp.asarray(random.normal(size=[random.choice([1, size]) for size in shape]))
+
     wanted, walked = [], []
     for _ in range(tasks):
         terminal = jnp.asarray(np.arange(states) >= random.integers(1, states + 1))  # at times there is none
-        reward = random.normal(size=(random.choice([1, states]), random.choice([1, actions])))
-        final = random.normal(size=random.choice([1, states]))
-        wanted.append(Task(jnp.asarray(reward), jnp.asarray(final), terminal, jnp.asarray(random.uniform(0.1, 1.0))))
+        of_outcomes = table(states, actions, states) if random.integers(2) else None
+        discount = jnp.asarray(random.uniform(0.1, 1.0))
+        wanted.append(Task(table(states, actions), table(states), terminal, discount, of_outcomes))
     for task in random.integers(tasks, size=walks):
         moves = random.integers(1, 5)
         acting = np.flatnonzero(~np.asarray(wanted[task].terminal))
         path = np.append(random.choice(acting, moves), random.integers(states))
         walked.append(Trajectory(path, random.integers(actions, size=moves), int(task)))
-    return complete(states, actions), gather(walked, wanted)
+    gathered = gather(walked, wanted)
+    if random.integers(2):
+        gathered = replace(gathered, weights=jnp.asarray(random.uniform(size=len(gathered))))
+    return complete(states, actions), gathered
 
 
 @pytest.mark.slow
@@ -86,10 +96,13 @@ def test_write_demonstrations_returns_are_those_of_the_tasks(size):
     for episode, path in zip(minari.load_dataset(dataset), demonstrations.paths(), strict=True):
         own = np.flatnonzero(trajectory == episode.id)
         task = int(demonstrations.task[own[0]])
-        discount, reward, final = float(tasks.discount[task]), tasks.reward[task], tasks.terminal_reward[task]
+        discount, final = float(tasks.discount[task]), tasks.terminal_reward[task]
+        reward = np.broadcast_to(tasks.reward[task], (world.states, world.actions))[..., None]
+        reward = reward + (0 if tasks.outcome_reward is None else np.asarray(tasks.outcome_reward[task]))
+        reward = np.broadcast_to(reward, (world.states, world.actions, world.states))
         expected = 0.0
         for t, (state, action) in enumerate(zip(path, np.asarray(demonstrations.actions)[own], strict=False)):
-            expected += discount**t * reward[min(state, len(reward) - 1), min(action, reward.shape[1] - 1)]
+            expected += discount**t * reward[state, action, path[t + 1]]
         arrived = bool(tasks.terminal[task, path[-1]])
         expected += arrived * discount ** len(own) * final[min(path[-1], len(final) - 1)]
         found = (discount ** np.arange(len(own)) * episode.rewards).sum()
@@ -306,14 +319,94 @@ def test_read_demonstrations_of_an_empty_dataset_raises():
     ("spaces", "message"),
     [
         ((Discrete(7), Discrete(4)), r", field 'observation_space': expected Discrete\(6\).*found Discrete\(7\)"),
-        ((Discrete(6, start=1), Discrete(4)), r", field 'observation_space': .*found Discrete\(6, start=1\)"),
-        ((Box(0, 5, (1,)), Discrete(4)), r", field 'observation_space': .*found Box"),
+        ((Discrete(5, start=1), Discrete(4)), r", field 'observation_space': .*found Discrete\(5, start=1\)"),
+        ((Box(0, 5, (1,)), Discrete(4)), r", field 'observation_space': .*found Box.*; pass `state_of`"),
         ((Discrete(6), Discrete(8)), r", field 'action_space': expected Discrete\(4\).*found Discrete\(8\)"),
     ],
 )
 def test_read_demonstrations_of_other_spaces_raises(spaces, message):
     seen = np.zeros((3, 1), np.float32) if isinstance(spaces[0], Box) else [1, 2, 3]
     refused(store(spaces, buffer(seen, [3, 3])), message, task=reach(GRID, 5))
+
+
+BABY = Dict({"direction": Discrete(4), "image": Box(0, 9, (2, 2, 3), np.uint8), "mission": Text(9)})
+"""The observations of published datasets of MiniGrid and BabyAI."""
+
+
+def test_read_demonstrations_of_shifted_spaces_shifts_states_and_actions():
+    dataset = store((Discrete(6, start=5), Discrete(4, start=-2)), buffer([5, 6, 10], [1, -2]))
+    demonstrations = read_demonstrations(dataset, GRID, task=reach(GRID, 5))
+    assert [path.tolist() for path in demonstrations.paths()] == [[0, 1, 5]]
+    assert demonstrations.actions.tolist() == [3, 0]
+    outside = store((Discrete(6, start=5), Discrete(4)), buffer([5, 4, 10], [3, 3]))
+    message = "expected a whole number in 5…10, found 4 at step 1"
+    refused(outside, f", episode 0, field 'observations': {message}", task=reach(GRID, 5))
+
+
+def test_read_demonstrations_of_dicts_needs_the_state_of_an_observation():
+    images = np.arange(3 * 12, dtype=np.uint8).reshape(3, 2, 2, 3) % 9
+    seen = {"direction": np.array([1, 2, 3]), "image": images, "mission": ["go", "go", "go"]}
+    dataset = store((BABY, Discrete(4)), buffer(seen, [3, 3]))
+    advice = "expected Discrete\\(6\\), as the world has, found Dict.*; pass `state_of` for other observations"
+    refused(dataset, f", field 'observation_space': {advice}", task=reach(GRID, 5))
+
+    def state_of(observation):
+        assert observation["mission"] == "go"
+        np.testing.assert_array_equal(observation["image"], images[observation["direction"] - 1])
+        return int(observation["direction"]) - 1
+
+    demonstrations = read_demonstrations(dataset, GRID, task=reach(GRID, 5), state_of=state_of)
+    assert [path.tolist() for path in demonstrations.paths()] == [[0, 1, 2]]
+    for wrong, message in ((lambda _: 6, "in 0…5, found 6 at step 0"), (lambda _: 0.5, "numbers, found float64")):
+        refused(dataset, f", episode 0, field 'observations': .*{message}", task=reach(GRID, 5), state_of=wrong)
+    refused(dataset, ", episode 0, field 'goal': neither the episode nor an argument has it", state_of=state_of)
+
+
+def test_read_demonstrations_of_tuples_passes_tuples():
+    cards = Tuple((Discrete(3), Discrete(2)))
+    dataset = store((cards, Discrete(4)), buffer((np.array([0, 0, 2]), np.array([0, 1, 1])), [3, 3]))
+    read = read_demonstrations(dataset, GRID, task=reach(GRID, 5), state_of=lambda seen: int(2 * seen[0] + seen[1]))
+    assert [path.tolist() for path in read.paths()] == [[0, 1, 5]]
+    short = store((cards, Discrete(4)), buffer((np.array([0, 0, 2]), np.array([0, 1])), [3, 3]))
+    message = ", episode 0, field '1': expected 3 observations around 2 moves, found 2"
+    refused(short, message, task=reach(GRID, 5), state_of=lambda _: 0)
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        ([1.0, 1.0], r"expected 3 numbers, found float64 of shape \(2,\)"),
+        ([1.0, -1.0, 1.0], "expected finite numbers of at least 0"),
+        ([1.0, np.nan, 1.0], "expected finite numbers of at least 0"),
+    ],
+)
+def test_read_demonstrations_of_bad_weights_raises(weights, message):
+    dataset = store(SPACES, buffer([0, 1, 2], [3, 3], infos={"move_weight": np.array(weights)}))
+    refused(dataset, f", episode 0, field 'move_weight': {message}", task=reach(GRID, 2))
+
+
+def test_write_demonstrations_of_several_outcomes_has_their_mean():
+    """Action 0 leads from state 0 to 1 with reward 2 or 6, or stays with reward 1."""
+    world = graph([[[1, 0, 1]], [[1, 1, 1]]])
+    task = with_outcome_reward(reach(world, 1, discount=0.5), np.array([[[2.0, 1.0, 6.0]], [[0.0, 0.0, 0.0]]]))
+    dataset = fresh("ours/mean")
+    write_demonstrations(dataset, gather([Trajectory(np.array([0, 0, 1]), np.array([0, 0]), 0)], [task]), world)
+    (episode,) = minari.load_dataset(dataset)
+    assert episode.rewards.tolist() == [1.0, 4.0 + 0.5 * 1.0]  # γ times the terminal reward
+    other = gather([Trajectory(np.array([0, 0, 1]), np.array([0, 0]), 0)], [task])
+    with pytest.raises(InputError, match="trajectory, row 1: expected moves that the world has"):
+        write_demonstrations(fresh("ours/mean"), other, graph([[[1, 1, 1]], [[1, 1, 1]]]))
+
+
+def test_write_demonstrations_has_as_goal_what_pays_most_on_arrival():
+    """State 1 pays 1 a move after arrival, γ = ½; arriving in 2 pays .7, and staying in 1, where all has ended, 9."""
+    world = graph([[[1], [2]], [[1], [1]], [[2], [2]]])
+    rewards = np.array([[[0.0], [0.7]], [[9.0], [9.0]], [[0.0], [0.0]]])
+    task = with_outcome_reward(task_of_states(np.array([0.0, 1.0, 0.0]), 0.5, np.array([False, True, True])), rewards)
+    dataset = fresh("ours/goal")
+    write_demonstrations(dataset, gather([Trajectory(np.array([0, 2]), np.array([1]), 0)], [task]), world)
+    (stored,) = minari.load_dataset(dataset).storage.get_episode_metadata([0])
+    assert stored["goal"] == 2
 
 
 def test_read_demonstrations_with_a_task_of_another_world_raises():
@@ -351,6 +444,10 @@ def set_in_task(**values):
         (set_in_task(reward=[[0.0, 1.0]]), r", task 1, field 'reward': .*\(6, 4\), found shape \(1, 2\)"),
         (set_in_task(reward=[[float("nan")]]), ", task 1, field 'reward': expected finite numbers"),
         (set_in_task(reward=[[0], [0, 1]]), ", task 1, field 'reward': expected a table of numbers"),
+        (
+            set_in_task(outcome_reward=[[[1.0] * 3]]),
+            r", task 1, field 'outcome_reward': .*\(6, 4, 2\), found shape \(1, 1, 3\)",
+        ),
         (set_in_task(terminal_reward=[[1.0]]), r", task 1, field 'terminal_reward': .*\(6,\), found shape \(1, 1\)"),
     ],
 )

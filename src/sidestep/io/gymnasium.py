@@ -1,41 +1,28 @@
-"""Gymnasium environments with a transition table: as models and tasks, and episodes collected in them.
+"""Gymnasium environments with a transition table, as models and tasks.
 
 `env.unwrapped.P[s][a]` lists (probability, next state, reward, whether the episode ends), as in `FrozenLake-v1`,
-`CliffWalking-v1` and `Taxi`. A state in which an episode ends is terminal. The terminal reward is the reward of ending
-there beyond that of the other outcomes of the same action (divided by γ, because it is received one move later); the
-rest is R(s, a). If outcomes of one action have different rewards without ending, R(s, a) has their mean. If an episode
-may either end in a state or continue there (a taxi with a passenger waiting at the destination), the end gets a
-separate state, after those of the environment.
+`CliffWalking-v1` and `Taxi`. States and actions are the keys of the table; an action that a state lacks is not
+available there. Spaces that start at another number than 0 are shifted to it. `sidestep.io.environments` says which
+states are terminal. The reward of an outcome is R(s, a, s′), whatever the other outcomes pay.
 """
 
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from numbers import Real
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from sidestep.errors import InputError, check, check_count
-from sidestep.tabular.demonstrations import Trajectory
-from sidestep.tabular.graph import graph
-from sidestep.tabular.models import FIXED, IMPOSSIBLE, TabularModel, TiedModel
-from sidestep.tabular.tasks import Task, check_discount
+from sidestep.errors import InputError, check, describe
+from sidestep.io.environments import Environment, Outcome, check_single, check_whole, environment_of, numbers_of
+from sidestep.tabular.models import FIXED, IMPOSSIBLE, TiedModel
+from sidestep.tabular.tasks import check_discount
 
-Act = Callable[[int, np.random.Generator], int]
-"""Returns an action in a state, with a random generator."""
-
-
-class Environment(NamedTuple):
-    """The model and the task of an environment.
-
-    Attributes:
-        model: With the probabilities of the environment's table.
-        task: With the rewards of the environment's table.
-        ends: The separate states of ends, by the environment's state.
-    """
-
-    model: TabularModel
-    task: Task
-    ends: Mapping[int, int]
+_HARMLESS = {
+    *("OrderEnforcing", "PassiveEnvChecker", "TimeLimit", "RecordEpisodeStatistics", "RecordVideo", "HumanRendering"),
+    *("RenderCollection", "DataCollector"),
+}
+"""The wrappers of Gymnasium and Minari that change no transition; a time limit truncates episodes, it ends none."""
 
 
 def from_gymnasium(env: Any, discount: float = 0.99) -> Environment:
@@ -45,9 +32,14 @@ def from_gymnasium(env: Any, discount: float = 0.99) -> Environment:
         env: A Gymnasium environment with `env.unwrapped.P`.
         discount: γ in (0, 1].
 
+    Returns:
+        With the table's probabilities and rewards. State s is the table's, less the start of the observation space,
+        and so are actions. Time limits count as truncation: they are in neither.
+
     Raises:
-        InputError: For an environment without a table, a discount outside (0, 1], and a terminal state with different
-            rewards after different actions.
+        InputError: For an environment without a table, of several agents, or under a wrapper that may change rewards,
+            observations or actions, a table that is malformed, probabilities that do not sum to 1, and a discount
+            outside (0, 1].
 
     Example:
         >>> import gymnasium
@@ -55,45 +47,94 @@ def from_gymnasium(env: Any, discount: float = 0.99) -> Environment:
         16
     """
     check_discount(discount)
-    rows = getattr(env.unwrapped, "P", None)
-    check(rows is not None, "expected an environment with a transition table, `P`", source=env)
-    probabilities, successors, rewards, ending, ends = _outcomes(rows)
-    terminal = np.isin(np.arange(len(successors)), successors[ending])
-    continuing = np.where(ending, 0.0, probabilities)
-    total = continuing.sum(axis=-1)
-    reward = (continuing * rewards).sum(axis=-1) / np.where(total > 0, total, 1.0)
-    # the terminal reward is what ending pays beyond the other outcomes; where there are none, the action pays the rest
-    paid = ending & ~terminal[:, None, None]
-    beside_others = paid & (total > 0)[..., None]
-    final = np.zeros(len(successors))
-    final[successors[beside_others]] = (rewards - reward[..., None])[beside_others]
-    reward = np.where(total > 0, reward, rewards[..., 0] - final[successors[..., 0]])
-    beyond, known = rewards - reward[..., None], final[successors]
-    for place in np.argwhere(paid & ~np.isclose(known, beyond))[:1].tolist():
-        one, other, state = (float(each[*place]) for each in (known, beyond, successors))
-        raise InputError(f"ending in state {state:g} pays {one:g} beyond one action and {other:g} beyond another")
-    reward[terminal] = 0.0
-    logits = jnp.log(jnp.asarray(np.where(probabilities > 0, probabilities, 1.0)))
-    task = Task(jnp.asarray(reward), jnp.asarray(final / discount), jnp.asarray(terminal), jnp.asarray(float(discount)))
-    return Environment(TabularModel(graph(successors), logits, jnp.asarray(probabilities > 0)), task, ends)
+    check_single(env)
+    own = getattr(env, "unwrapped", env)
+    table: Any = getattr(own, "P", None)
+    advice = "`enumerate_env` needs none"
+    message = f"expected an environment with a transition table `P`, found {describe(env)} without one; {advice}"
+    check(table is not None, message, field="env")
+    _check_wrappers(env)
+    message = "found a taxi with fickle passengers: its destination changes in ways that its table lacks"
+    check(not getattr(own, "fickle_passenger", False), message, source=env)
+    states, actions = (numbers_of(getattr(own, name, None)) for name in ("observation_space", "action_space"))
+    first, count = states or (0, len(table) if hasattr(table, "__len__") else 0)
+    rows = _entries(table, first, "a dict or list of states", "P")
+    message = (
+        f"expected a row for each of the states {first}…{first + count - 1}, found {_difference(rows, first, count)}"
+    )
+    check(count and rows.keys() == set(range(first, first + count)), message, field="P")
+    first_action = actions[0] if actions else 0
+    tables = [
+        _entries(rows[state], first_action, "a dict or list of actions", f"state {state}")
+        for state in range(first, first + count)
+    ]
+    last_action = sum(actions) - 1 if actions else max((action for row in tables for action in row), default=-1)
+    check(last_action >= first_action, "expected at least one action, found none", field="P")
+    read: list[dict[int, list[Outcome]]] = []
+    for state, row in enumerate(tables, start=first):
+        wrong = [action for action in row if not first_action <= action <= last_action]
+        message = f"expected actions in {first_action}…{last_action}, found {wrong}"
+        check(not wrong, message, source=f"state {state}")
+        read.append({a - first_action: _outcomes(each, (first, count), state, a) for a, each in row.items()})
+    chance = np.asarray(getattr(own, "initial_state_distrib", ()))
+    starts = np.flatnonzero(chance > 0).tolist() if chance.shape == (count,) else []
+    return environment_of(read, last_action - first_action + 1, discount, starts, (first, first_action))
 
 
-def _outcomes(rows: Any) -> tuple[Any, ...]:
-    """Return probability, next state, reward and whether the episode ends, of each outcome; and the separate ends."""
-    table = [[[each for each in rows[s][a] if each[0] > 0] for a in rows[s]] for s in range(len(rows))]
-    outcomes = [(s, *each) for s, row in enumerate(table) for action in row for each in action]
-    # a state needs a separate end if episodes also pass it
-    ended = {int(after) for _, _, after, _, ends in outcomes if ends}
-    passed = {int(after) for s, _, after, _, ends in outcomes if not ends and s not in ended}
-    separate = {state: len(table) + index for index, state in enumerate(sorted(ended & passed))}
-    table += [[[(1.0, end, 0.0, False)]] * len(table[0]) for end in separate.values()]
-    width = max(1, *(len(action) for row in table for action in row))
-    padded = [[each + [(0.0, s, 0.0, False)] * (width - len(each)) for each in row] for s, row in enumerate(table)]
-    probabilities, states, rewards, ending = np.moveaxis(np.array(padded, dtype=np.float64), -1, 0)
-    successors, ending = states.astype(np.int64), ending > 0
-    for state, end in separate.items():
-        successors[ending & (successors == state)] = end
-    return probabilities, successors, rewards, ending, separate
+def _difference(rows: Mapping[int, Any], first: int, count: int) -> str:
+    """Return which states a table lacks, or has beyond those there are."""
+    missing = sorted(set(range(first, first + count)) - rows.keys())[:3]
+    return f"none for {missing}" if missing else f"also {sorted(rows.keys() - set(range(first, first + count)))[:3]}"
+
+
+def _check_wrappers(env: Any) -> None:
+    """Raise `InputError` for a wrapper that may change what the table says."""
+    layer = env
+    while layer is not getattr(layer, "unwrapped", layer):
+        kind = type(layer)
+        harmless = kind.__name__ in _HARMLESS and kind.__module__.split(".")[0] in ("gymnasium", "gym", "minari")
+        message = f"found the wrapper {kind.__name__}, which may change rewards, observations or actions"
+        check(harmless, f"{message}: the table lacks that; pass the environment without it", source=env)
+        layer = layer.env
+
+
+def _entries(table: Any, first: int, kind: str, source: str) -> dict[int, Any]:
+    """Return the entries of a dict by whole numbers, or of a list, by number."""
+    if isinstance(table, Mapping):
+        message = "expected whole numbers as keys"
+        return {check_whole(key, message, source): each for key, each in table.items()}
+    is_list = isinstance(table, Sequence | np.ndarray) and not isinstance(table, str)
+    check(is_list, f"expected {kind}, found {type(table).__name__}", source=source)
+    return dict(enumerate(table, start=first))
+
+
+def _outcomes(entries: Any, states: tuple[int, int], state: int, action: int) -> list[Outcome]:
+    """Return the outcomes of an action that have a probability other than 0."""
+    source, kind = f"state {state}, action {action}", "expected (probability, next state, reward, whether it ends)"
+    is_list = isinstance(entries, Sequence) and not isinstance(entries, str)
+    check(is_list, f"expected a list of outcomes, found {type(entries).__name__}", source=source)
+    outcomes = []
+    for entry in entries:
+        fits = isinstance(entry, Sequence) and not isinstance(entry, str) and len(entry) == 4
+        check(fits, f"{kind}, found {entry!r}", source=source)
+        probability, after, reward, ends = entry
+        numbers = [_number(each, f"{kind}, found {entry!r}", source) for each in (probability, after, reward, ends)]
+        if numbers[0] == 0:
+            continue
+        first, count = states
+        inside = numbers[1].is_integer() and first <= numbers[1] < first + count
+        check(inside, f"expected a next state in {first}…{first + count - 1}, found {after}", source=source)
+        check(np.isfinite(numbers[2]), f"expected a finite reward, found {reward}", source=source)
+        check(numbers[3] in (0, 1), f"expected whether the episode ends, found {ends!r}", source=source)
+        outcomes.append(Outcome(numbers[0], int(numbers[1]) - first, numbers[2], numbers[3] == 1))
+    return outcomes
+
+
+def _number(value: Any, message: str, source: str) -> float:
+    """Return a number, or a truth value as 0 or 1; raise `InputError` for anything else."""
+    if not isinstance(value, Real | np.bool_):
+        raise InputError(message, source=source)
+    return float(value)
 
 
 def slippery(environment: Environment, logit: float = 0.0) -> TiedModel:
@@ -116,6 +157,8 @@ def slippery(environment: Environment, logit: float = 0.0) -> TiedModel:
     check(possible.shape[-1] == 3, message, field="environment")
     index = np.tile([0, FIXED, 0], (*possible.shape[:2], 1))
     certain = possible.sum(axis=-1) == 1
+    message = "expected one or three outcomes of every action, found two"
+    check((certain | possible.all(axis=-1)).all(), message, field="environment")
     index[certain] = np.where(possible[certain], FIXED, IMPOSSIBLE)
     return TiedModel(environment.model.graph, index, logit)
 
@@ -133,36 +176,3 @@ def slip_of(model: TiedModel) -> float:
     """
     odds = 2 * float(jnp.exp(model.parameters[0]))
     return odds / (1 + odds)
-
-
-def collect(env: Any, world: Environment, act: Act, episodes: int, *, seed: int = 0, task: int = 0) -> list[Trajectory]:
-    """Return episodes in a Gymnasium environment as trajectories; some may be truncated by a time limit.
-
-    Args:
-        env: The environment.
-        world: `from_gymnasium(env)`.
-        act: Chooses an action in a state, with a random generator.
-        episodes: The number of episodes, at least 1.
-        seed: Of the environment's first episode, and of the random generator.
-        task: The index of the task of the trajectories.
-
-    Raises:
-        InputError: For a number of episodes below 1.
-
-    Example:
-        >>> import gymnasium
-        >>> env = gymnasium.make("FrozenLake-v1")
-        >>> len(collect(env, from_gymnasium(env), lambda state, random: int(random.integers(4)), episodes=3))
-        3
-    """
-    check_count(episodes, 1, "episodes")
-    random, trajectories = np.random.default_rng(seed), []
-    for episode in range(episodes):
-        state, _ = env.reset(seed=seed if episode == 0 else None)
-        states, actions, terminated, truncated = [int(state)], [], False, False
-        while not (terminated or truncated):
-            actions.append(int(act(states[-1], random)))
-            state, _, terminated, truncated, _ = env.step(actions[-1])
-            states.append(world.ends.get(int(state), int(state)) if terminated else int(state))
-        trajectories.append(Trajectory(np.asarray(states), np.asarray(actions), task))
-    return trajectories

@@ -1,7 +1,9 @@
-"""Wrong calls of graphs, tasks, models, behavior, solvers, likelihoods and plans."""
+"""Wrong calls of graphs, tasks, models, behavior, solvers, likelihoods, plans and environments."""
 
 # ruff: noqa: E501
 # pyright: basic, reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
+
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from helpers.wrong_calls.small import (
     BEHAVIOR,
     DEMOS,
     GRID,
+    INF,
     KEY,
     MODEL,
     NAN,
@@ -23,6 +26,16 @@ from helpers.wrong_calls.small import (
 
 GRAPH = ss.graph(np.array([[[0, 1]], [[1, 0]]]))
 POLICY = jnp.full((20, 4), 0.25)
+
+
+def table(transitions):
+    """An environment of Gymnasium with a table of transitions."""
+    env = SimpleNamespace(P=transitions)
+    env.unwrapped = env
+    return env
+
+
+LOOP = {0: [(1.0, 1, 0.0, True)]}
 CASES = [
     *labeled("backups", [
         ("beta of text", lambda: ss.Behavior(ss.BoltzmannAverage(), beta="7"), "beta"),
@@ -119,6 +132,16 @@ CASES = [
         ("one name without a tuple", lambda: ss.behavior_model(BEHAVIOR, "beta"), "learn"),
         ("a discount of text", lambda: ss.behavior_model(BEHAVIOR, ("discount",), discount="0.9"), "discount"),
         ("a backup", lambda: ss.behavior_model(ss.HardMax()), "behavior"),
+    ]),
+    *labeled("from_gymnasium", [
+        ("no state", lambda: ss.from_gymnasium(table({})), "state"),
+        ("a state that is missing", lambda: ss.from_gymnasium(table({0: LOOP, 2: LOOP})), "state"),
+        ("probabilities of .3", lambda: ss.from_gymnasium(table({0: {0: [(0.3, 1, 1.0, True)]}, 1: LOOP})), "probabilit"),
+        ("an infinite reward", lambda: ss.from_gymnasium(table({0: {0: [(1.0, 0, INF, False)]}, 1: LOOP})), "reward"),
+        ("outcomes of two numbers", lambda: ss.from_gymnasium(table({0: {0: [(1.0, 1)]}, 1: LOOP})), "probability, next state"),
+        ("a fraction of a state", lambda: ss.from_gymnasium(table({0: {0: [(1.0, 0.5, 1.0, True)]}, 1: LOOP})), "state"),
+        ("a number for a table", lambda: ss.from_gymnasium(table(5)), "P"),
+        ("None", lambda: ss.from_gymnasium(None), "env"),
     ]),
 ]  # fmt: skip
 

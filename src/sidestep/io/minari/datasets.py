@@ -131,12 +131,21 @@ def _episode(dataset: str | Path, stored: Any, metadata: Metadata) -> Episode:
     """Return an episode from one of Minari's; raise `InputError` for one without a move, or of other lengths."""
     source, moves, observations = f"{dataset}, episode {stored.id}", len(stored.rewards), stored.observations
     check(moves != 0, "expected at least one move, found none", source=source, field="rewards")
-    several = observations if isinstance(observations, Mapping) else {"observations": observations}
-    for name, values in several.items():
+    for name, values in _arrays(observations, "observations"):
         message = f"expected {moves + 1} observations around {moves} moves, found {len(values)}"
         check(len(values) == moves + 1, message, source=source, field=name)
     terminated = bool(stored.terminations[-1:].any())
     return Episode(observations, stored.actions, stored.rewards, terminated, stored.infos or {}, metadata, source)
+
+
+def _arrays(observations: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """Yield the name and the values of each part of observations that are dicts or tuples."""
+    if isinstance(observations, Mapping | tuple):
+        parts = observations.items() if isinstance(observations, Mapping) else enumerate(observations)
+        for part, values in parts:
+            yield from _arrays(values, str(part))
+    else:
+        yield name, observations
 
 
 @contextmanager

@@ -1,33 +1,39 @@
 """Demonstrations in discrete worlds as Minari datasets, and datasets of discrete spaces as demonstrations.
 
-Observations are states, and actions are numbered as in the model. The reward of a move (s, a, s′) is R(s, a), plus γ
-times the terminal reward of s′ if s′ is terminal. The return Σ γ^t r_t of an episode is then that of the task, and the
-rewards are on average those of the Gymnasium environment.
+Observations are states, and actions are numbered as in the model; `Discrete` spaces that start at another number are
+shifted to 0. The reward of a move (s, a, s′) is R(s, a) + R(s, a, s′), plus γ times the terminal reward of s′ if s′ is
+terminal. The return Σ γ^t r_t of an episode is then that of the task. Where several outcomes of an action lead to s′,
+R(s, a, s′) is their mean.
 
 Complete tasks are in the metadata, so that a dataset suffices for learning. The metadata of the dataset have `tasks`,
-one entry per task: `discount`, `terminal` (a list of states), and `reward` and `terminal_reward`, tables with axes of
-length 1 where allowed in `Task`. The metadata of each episode have `goal` (the terminal state with the largest reward,
-or a list of several), `discount`, and `task`, the number of its entry. In a dataset without `tasks`, the task of each
-episode is to reach its `goal` at its `discount`, as in `reach`.
+one entry per task (`task_entries`). The metadata of each episode have `goal` (the terminal state that pays most on
+arrival, or a list of several), `discount`, and `task`, the number of its entry. In a dataset without `tasks`, the task
+of each episode is to reach its `goal` at its `discount`, as in `reach`. Weights other than 1 are in `infos`, as
+`move_weight`, beside the observation after each move.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from sidestep.errors import InputError, check, check_instance, describe, input_errors, to_number
-from sidestep.io.minari.datasets import Episode, Metadata, read_dataset, require_minari, write_dataset
+from sidestep.errors import InputError, check, check_instance, describe, to_number
+from sidestep.io.minari import task_entries
+from sidestep.io.minari.datasets import Episode, read_dataset, require_minari, write_dataset
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.tasks import Task, reach
 
+StateOf = Callable[[Any], int]
+"""Returns the state of an observation."""
 _NO_ENDS: Mapping[int, int] = {}
+_WEIGHT = "move_weight"
 
 
 def write_demonstrations(
@@ -52,7 +58,7 @@ def write_demonstrations(
     require_minari(dataset)
     from gymnasium.spaces import Discrete
 
-    states, actions = _world_size(world)
+    states, actions = task_entries.world_size(world)
     check_instance(demonstrations, Demonstrations, "demonstrations")
     check_instance(demonstrations.tasks, Task, "demonstrations")
     _check_dataset(dataset, ends)
@@ -61,12 +67,9 @@ def write_demonstrations(
     message = f"expected demonstrations in a world of {states} states and {actions} actions"
     message += f", found {own_states} states and action {last_action}"
     check(own_states == states and last_action < actions, message, field="demonstrations")
-    names = ("discount", "terminal_reward", "reward")
-    columns = {name: getattr(moves.tasks, name).astype(np.float64).tolist() for name in names}
-    columns["terminal"] = [np.flatnonzero(terminal).tolist() for terminal in moves.tasks.terminal]
-    tasks = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+    tasks = task_entries.entries_of(moves.tasks)
     spaces = Discrete(states - len(ends)), Discrete(actions)
-    write_dataset(dataset, spaces, list(_episodes(moves, tasks, actions, ends)), {"tasks": tasks})
+    write_dataset(dataset, spaces, list(_episodes(moves, tasks, world, ends)), {"tasks": tasks})
 
 
 def read_demonstrations(
@@ -77,8 +80,9 @@ def read_demonstrations(
     discount: float | None = None,
     step_cost: float | None = None,
     ends: Mapping[int, int] = _NO_ENDS,
+    state_of: StateOf | None = None,
 ) -> Demonstrations[Task]:
-    """Return the demonstrations in a local Minari dataset with whole numbers as observations and actions.
+    """Return the demonstrations in a local Minari dataset of `Discrete` actions, and observations that are states.
 
     Args:
         dataset: Its id, or its path.
@@ -87,6 +91,7 @@ def read_demonstrations(
         discount: Of episodes that have a goal but no discount in their metadata.
         step_cost: Of episodes that have only goal and discount in their metadata, as in `reach`.
         ends: As in `write_demonstrations`.
+        state_of: Returns the state of an observation, for datasets of other observations than `Discrete` ones.
 
     Raises:
         InputError: For a dataset that does not exist, is broken or empty, or has other spaces than the world, and,
@@ -96,20 +101,25 @@ def read_demonstrations(
     Example:
         >>> demonstrations = read_demonstrations("office/walks-v0", grid)  # doctest: +SKIP
     """
-    states, actions = _world_size(world)
+    states, actions = task_entries.world_size(world)
     _check_dataset(dataset, ends)
     check_instance(task, (Task, type(None)), "task")
     for value, field in ((discount, "discount"), (step_cost, "step_cost")):
         if value is not None:
             to_number(value, field, above=0)
+    first: dict[str, int] = {}
 
     def check_spaces(*spaces: object) -> None:
         from gymnasium.spaces import Discrete
 
         counts = {"observation_space": states - len(ends), "action_space": actions}
         for space, (field, count) in zip(spaces, counts.items(), strict=True):
-            fits = isinstance(space, Discrete) and space.n == count and space.start == 0
-            check(fits, f"expected Discrete({count}), as the world has, found {space}", source=dataset, field=field)
+            is_seen = field == "observation_space"
+            fits = (isinstance(space, Discrete) and space.n == count) or (is_seen and state_of is not None)
+            advice = "; pass `state_of` for other observations" if is_seen else ""
+            message = f"expected Discrete({count}), as the world has, found {space}{advice}"
+            check(fits, message, source=dataset, field=field)
+            first[field] = int(getattr(space, "start", 0))
 
     metadata, episodes = read_dataset(dataset, check_spaces)
     entries = metadata.get("tasks")
@@ -119,24 +129,37 @@ def read_demonstrations(
         tasks, indices = [task], [0] * len(episodes)
     elif entries is not None:
         check(isinstance(entries, list) and entries, "expected a list of tasks", source=dataset, field="tasks")
-        tasks = [_task(entry, world, f"{dataset}, task {index}") for index, entry in enumerate(entries)]
-        indices = [_entry_of(episode, entries) for episode in episodes]
+        tasks = [task_entries.task_of(entry, world, f"{dataset}, task {index}") for index, entry in enumerate(entries)]
+        indices = [_entry_of(episode, entries, world) for episode in episodes]
     else:
         tasks, indices = _tasks_of_goals(episodes, world, discount, step_cost)
+    start = 0 if state_of is not None else first["observation_space"]
+    seen = _Numbers(start, start + states - len(ends), "observations")
+    acted = _Numbers(first["action_space"], first["action_space"] + actions, "actions")
     pairs = zip(episodes, indices, strict=True)
-    trajectories = [_trajectory(episode, index, states - len(ends), actions, ends) for episode, index in pairs]
+    trajectories = [_trajectory(episode, index, seen, acted, ends, state_of) for episode, index in pairs]
     try:
-        return gather(trajectories, tasks)
+        gathered = gather(trajectories, tasks)
     except InputError as error:
         raise error.of(dataset if error.row is None else episodes[error.row - 1].source) from error
+    return replace(gathered, weights=to_jax(np.concatenate([_weights(episode) for episode in episodes])))
+
+
+class _Numbers(NamedTuple):
+    """The numbers of states or actions in a dataset: the first, one past the last, and the field."""
+
+    first: int
+    end: int
+    field: str
 
 
 def _episodes(
-    moves: Demonstrations[Task], tasks: list[dict], actions: int, ends: Mapping[int, int]
+    moves: Demonstrations[Task], tasks: list[dict], world: Grid | Graph, ends: Mapping[int, int]
 ) -> Iterator[Episode]:
     """Yield the episode of each trajectory; `moves` has NumPy's arrays, `tasks` describes each task."""
     origin = {own: state for state, own in ends.items()}
-    rewards = _rewards(moves, actions)
+    rewards, weighted = _rewards(moves, world), (moves.weights != 1).any()
+    goals = [task_entries.best_terminal_states(task, world) for task in tasks]
     for row, own in enumerate(np.split(np.arange(len(moves)), moves.first_moves()[1:]), start=1):
         before, after, task = moves.states[own], moves.next_states[own], moves.task[own]
         connected = (after[:-1] == before[1:]).all() and (task == task[0]).all()
@@ -146,43 +169,71 @@ def _episodes(
         path = np.append(before, origin.get(last, last)).astype(np.int64)
         acted = moves.actions[own].astype(np.int64)
         metadata = {"task": index, "discount": tasks[index]["discount"]}
-        goals = _best_terminal_states(tasks[index])
-        metadata |= {"goal": goals[0] if len(goals) == 1 else goals} if goals else {}
-        yield Episode(path, acted, rewards[own], last in tasks[index]["terminal"], {}, metadata)
+        best = goals[index]
+        metadata |= {"goal": best[0] if len(best) == 1 else best} if best else {}
+        infos = {_WEIGHT: np.append(0.0, moves.weights[own])} if weighted else {}
+        yield Episode(path, acted, rewards[own], last in tasks[index]["terminal"], infos, metadata)
 
 
-def _rewards(moves: Demonstrations[Task], actions: int) -> Float[np.ndarray, " moves"]:
-    """Return the reward of each move: R(s, a), plus γ times the terminal reward if the move ends the task."""
+def _rewards(moves: Demonstrations[Task], world: Grid | Graph) -> Float[np.ndarray, " moves"]:
+    """Return the reward of each move, with γ times the terminal reward if the move ends the task."""
     tasks, task, after = moves.tasks, moves.task, moves.next_states
-    reward = np.broadcast_to(tasks.reward, (*tasks.terminal.shape, actions))[task, moves.states, moves.actions]
+    states, actions = task_entries.world_size(world)
+    place = task, moves.states, moves.actions
+    reward = np.broadcast_to(tasks.reward, (len(tasks.terminal), states, actions))[place].astype(np.float64)
+    if tasks.outcome_reward is not None:
+        successors = np.asarray(task_entries.graph_of(world).successors)
+        paid = np.broadcast_to(tasks.outcome_reward, (len(tasks.terminal), *successors.shape))[place]
+        same = successors[moves.states, moves.actions] == after[:, None]
+        row = int(moves.trajectory[np.argmin(same.any(axis=1))]) + 1
+        check(same.any(axis=1).all(), "expected moves that the world has", source="trajectory", row=row)
+        reward += (paid * same).sum(axis=1) / same.sum(axis=1)
     terminal_reward = np.broadcast_to(tasks.terminal_reward, tasks.terminal.shape)[task, after]
     return reward + tasks.discount[task].astype(np.float64) * tasks.terminal[task, after] * terminal_reward
 
 
-def _trajectory(episode: Episode, task: int, states: int, actions: int, ends: Mapping[int, int]) -> Trajectory:
-    path = _within(episode.observations, len(episode.rewards) + 1, states, episode.source, "observations")
+def _trajectory(
+    episode: Episode, task: int, seen: _Numbers, acted: _Numbers, ends: Mapping[int, int], state_of: StateOf | None
+) -> Trajectory:
+    moves, observations = len(episode.rewards), episode.observations
+    if state_of is not None:
+        observations = [state_of(_at(observations, step)) for step in range(moves + 1)]
+    path = _within(observations, moves + 1, seen, episode.source)
     if episode.terminated:
         path[-1] = ends.get(int(path[-1]), int(path[-1]))
-    return Trajectory(path, _within(episode.actions, len(episode.rewards), actions, episode.source, "actions"), task)
+    return Trajectory(path, _within(episode.actions, moves, acted, episode.source), task)
 
 
-def _within(values: object, length: int, count: int, source: str, field: str) -> Int[np.ndarray, " length"]:
-    """Return whole numbers in 0…count − 1, one for each move or observation."""
-    numbers = np.asarray(values)
-    message = f"expected {length} whole numbers, found {numbers.dtype} of shape {numbers.shape}"
-    check(numbers.shape == (length,) and numbers.dtype.kind in "iu", message, source=source, field=field)
-    step = int(np.argmax((numbers < 0) | (numbers >= count)))
-    message = f"expected a whole number in 0…{count - 1}, found {numbers[step]} at step {step}"
-    check(0 <= numbers[step] < count, message, source=source, field=field)
-    return numbers.astype(np.int64)
+def _at(observations: Any, step: int) -> Any:
+    """Return one observation of several, in dicts and tuples as the space has them."""
+    if isinstance(observations, Mapping):
+        return {name: _at(values, step) for name, values in observations.items()}
+    if isinstance(observations, tuple):
+        return tuple(_at(values, step) for values in observations)
+    return observations[step]
 
 
-def _best_terminal_states(entry: Mapping[str, Any]) -> list[int]:
-    """Return the terminal states of a task with the largest reward; none if the task has no terminal state."""
-    terminal = np.asarray(entry["terminal"], dtype=np.int64)
-    final = np.asarray(entry["terminal_reward"])
-    paid = final[terminal] if len(final) > 1 else np.repeat(final, len(terminal))
-    return terminal[paid == paid.max(initial=-np.inf)].tolist()
+def _within(values: object, length: int, numbers: _Numbers, source: str) -> Int[np.ndarray, " length"]:
+    """Return whole numbers, from 0 on, one for each move or observation."""
+    array, (first, end, field) = np.asarray(values), numbers
+    message = f"expected {length} whole numbers, found {array.dtype} of shape {array.shape}"
+    check(array.shape == (length,) and array.dtype.kind in "iu", message, source=source, field=field)
+    step = int(np.argmax((array < first) | (array >= end)))
+    message = f"expected a whole number in {first}…{end - 1}, found {array[step]} at step {step}"
+    check(first <= array[step] < end, message, source=source, field=field)
+    return array.astype(np.int64) - first
+
+
+def _weights(episode: Episode) -> Float[np.ndarray, " moves"]:
+    """Return the weight of each move, by default 1."""
+    moves = len(episode.rewards)
+    weights = np.asarray(episode.infos.get(_WEIGHT, np.ones(moves + 1)))
+    fits = weights.shape == (moves + 1,) and weights.dtype.kind in "iuf"
+    message = f"expected {moves + 1} numbers, found {weights.dtype} of shape {weights.shape}"
+    check(fits, message, source=episode.source, field=_WEIGHT)
+    valid = (np.isfinite(weights) & (weights >= 0)).all()
+    check(valid, "expected finite numbers of at least 0", source=episode.source, field=_WEIGHT)
+    return weights[1:].astype(np.float64)
 
 
 def _tasks_of_goals(
@@ -193,7 +244,10 @@ def _tasks_of_goals(
     keys = []
     for episode in episodes:
         metadata = {"discount": discount} | dict(episode.metadata)
-        key = _whole(metadata, "goal", episode.source), _number(metadata, "discount", episode.source)
+        key = (
+            task_entries.whole_number_in(metadata, "goal", episode.source),
+            task_entries.number_in(metadata, "discount", episode.source),
+        )
         keys.append(key)
         try:
             towards[key] = towards.get(key) or reach(world, key[0], discount=key[1], step_cost=step_cost)
@@ -202,61 +256,17 @@ def _tasks_of_goals(
     return list(towards.values()), [list(towards).index(key) for key in keys]
 
 
-def _entry_of(episode: Episode, entries: Sequence[Mapping[str, Any]]) -> int:
+def _entry_of(episode: Episode, entries: Sequence[Mapping[str, Any]], world: Grid | Graph) -> int:
     """Return the entry of an episode; goal and discount of its metadata, if any, must be those of the entry."""
-    index = _whole(episode.metadata, "task", episode.source)
+    index = task_entries.whole_number_in(episode.metadata, "task", episode.source)
     message = f"expected a task in 0…{len(entries) - 1}, found {index}"
     check(0 <= index < len(entries), message, source=episode.source, field="task")
     entry = entries[index]
-    for field, expected in (("goal", _best_terminal_states(entry)), ("discount", entry["discount"])):
+    for field, expected in (("goal", task_entries.best_terminal_states(entry, world)), ("discount", entry["discount"])):
         own = episode.metadata.get(field, expected)
         message = f"expected {expected} as in task {index}, found {own}"
         check(np.array_equal(np.atleast_1d(own), np.atleast_1d(expected)), message, source=episode.source, field=field)
     return index
-
-
-def _number(metadata: Metadata, field: str, source: str) -> float:
-    """Return a number in the metadata of an episode."""
-    value: Any = metadata.get(field)
-    message = "neither the episode nor an argument has it: expected a number, or a task for all episodes"
-    check(value is not None, message, source=source, field=field)
-    is_number = np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"
-    check(is_number, f"expected a number, found {value!r}", source=source, field=field)
-    return float(value)
-
-
-def _whole(metadata: Metadata, field: str, source: str) -> int:
-    """Return a whole number in the metadata of an episode."""
-    value = _number(metadata, field, source)
-    check(value.is_integer(), f"expected a whole number, found {value:g}", source=source, field=field)
-    return int(value)
-
-
-def _task(entry: Any, world: Grid | Graph, source: str) -> Task:
-    """Return the task of an entry; raise `InputError` for one that does not fit the world."""
-    states, actions = _world_size(world)
-    complete = isinstance(entry, Mapping) and {"discount", "terminal", "terminal_reward", "reward"} <= entry.keys()
-    check(complete, "expected discount, terminal, terminal_reward and reward", source=source)
-    discount = _number(entry, "discount", source)
-    message = f"expected a number above 0 and at most 1, found {discount}"
-    check(0 < discount <= 1, message, source=source, field="discount")
-    ends = np.asarray(entry["terminal"])
-    valid = ends.ndim == 1 and (ends.dtype.kind == "i" or not len(ends)) and np.isin(ends, np.arange(states)).all()
-    check(valid, f"expected a list of states in 0…{states - 1}", source=source, field="terminal")
-    terminal = jnp.asarray(np.isin(np.arange(states), ends))
-    reward = jnp.asarray(_table(entry, "reward", (states, actions), source))
-    terminal_reward = jnp.asarray(_table(entry, "terminal_reward", (states,), source))
-    return Task(reward, terminal_reward, terminal, jnp.asarray(discount, jnp.result_type(float)))
-
-
-def _table(entry: Mapping[str, Any], field: str, shape: tuple[int, ...], source: str) -> Float[np.ndarray, "..."]:
-    """Return a table of finite numbers of a shape, of which any axis may have length 1."""
-    with input_errors("expected a table of numbers", TypeError, ValueError, source=source, field=field):
-        table = np.asarray(entry[field], dtype=np.float64)
-    fits = table.ndim == len(shape) and all(np.isin(table.shape, 1) | (np.array(table.shape) == shape))
-    message = f"expected finite numbers of shape {shape}, found shape {table.shape}"
-    check(fits and np.isfinite(table).all(), message, source=source, field=field)
-    return table
 
 
 def _check_dataset(dataset: object, ends: object) -> None:
@@ -264,9 +274,3 @@ def _check_dataset(dataset: object, ends: object) -> None:
     message = f"expected the name of a dataset, found {describe(dataset)}"
     check(isinstance(dataset, str | Path), message, field="dataset")
     check_instance(ends, Mapping, "ends")
-
-
-def _world_size(world: Grid | Graph) -> tuple[int, int]:
-    """Return the numbers of states and actions of a world."""
-    check_instance(world, (Grid, Graph), "world")
-    return (world.size, len(world.steps)) if isinstance(world, Grid) else (world.states, world.actions)
