@@ -234,7 +234,7 @@ def test_enumerate_env_pays_what_wrappers_pay():
         (Corridor(), {"samples": 0}, "'samples': expected at least 1, found 0"),
         (Corridor(), {"limit": 0}, "'limit': expected at least 1, found 0"),
         (Corridor(), {"seeds": ()}, "'seeds': expected at least one, found none"),
-        (Corridor(), {"discount": 0.0}, "'discount': expected a number above 0"),
+        (Corridor(), {"discount": 0.0}, "'discount': expected a finite number above 0"),
         (gymnasium.make("Blackjack-v1"), {}, r"action 1, field 'samples': the action draws random numbers"),
     ],
 )
