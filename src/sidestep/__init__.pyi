@@ -20,6 +20,7 @@ from .io.minari.demonstrations import (
 )
 from .io.maps import read_sensor_map as read_sensor_map, read_sensor_variance as read_sensor_variance
 from .io.walks import Walks as Walks, read_walks as read_walks, write_walks as write_walks
+from .tabular.demonstration_tables import Labels as Labels
 from .tabular.demonstrations import (
     Demonstrations as Demonstrations,
     Trajectory as Trajectory,
@@ -29,6 +30,7 @@ from .tabular.demonstrations import (
 from .tabular.graph import Graph as Graph, graph as graph, grid_graph as grid_graph
 from .tabular.grid import Cell as Cell, Grid as Grid
 from .tabular.reward import Reward as Reward
+from .tabular.selection import join as join
 from .tabular.simulation import simulate as simulate
 from .tabular.tasks import Task as Task, reach as reach, stack_tasks as stack_tasks, task as task
 
