@@ -33,6 +33,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 from scipy.special import entr, expit, softmax
 
+from sidestep._repr import short_repr
 from sidestep.errors import check, check_count
 from sidestep.inference.chain_kernels import Chain, Workspace
 from sidestep.inference.chains import NEG_INF, BarrierProblem, problem_of
@@ -97,6 +98,7 @@ class AscentProgress(NamedTuple):
         return f"objective {self.objective:.3f}, P(closed) off by at most {self.gap:.2g}"
 
 
+@short_repr()
 @dataclass(frozen=True, eq=False)
 class BarrierMeanField(Generic[Model]):
     """A mixture of independent barriers that approximates the posterior of a transition model.

@@ -17,6 +17,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
+from sidestep._repr import short_repr
 from sidestep.errors import check
 from sidestep.inference.batching import LARGE_MAP, MEMORY, plan_batches
 from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
@@ -53,6 +54,7 @@ class Estimate(NamedTuple):
     standard_error: float | None
 
 
+@short_repr("model", "behavior", "problem", "description", "converged")
 class Fit(eqx.Module, Generic[Model]):
     """A learned transition model.
 

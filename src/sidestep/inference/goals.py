@@ -24,6 +24,7 @@ import numpy as np
 from jax.scipy.special import logsumexp
 from jaxtyping import Float
 
+from sidestep._repr import short_repr
 from sidestep.errors import InputError, NotConverged, check_count
 from sidestep.inference.fit import Fit, Model
 from sidestep.tabular.backups import Behavior
@@ -33,6 +34,7 @@ from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.tasks import Task, stack_tasks
 
 
+@short_repr()
 class GoalFit(eqx.Module, Generic[Model]):
     """A model learned from trajectories with unknown goals.
 

@@ -27,6 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 from scipy.special import expit
 
+from sidestep._repr import short_repr
 from sidestep.errors import check
 from sidestep.inference.mrf import SHAPE_TERMS, BinaryMRF
 from sidestep.inference.prior_chains import native_terms, run_prior
@@ -48,6 +49,7 @@ _SWEEPS, _PROPOSALS, _CELLS = 40, 10_000, 2_000_000
 barriers that more may store."""
 
 
+@short_repr()
 @dataclass(frozen=True, eq=False)
 class HierarchicalMRF:
     """A binary Markov random field with unknown log-odds δ and strength λ of its shapes.

@@ -23,11 +23,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 
+from sidestep._repr import short_repr
 from sidestep.errors import check
 
 SHAPE_TERMS = ("lines", "pairs", "blocks", "isolated")
 
 
+@short_repr()
 @dataclass(frozen=True, eq=False)
 class BinaryMRF:
     """A binary Markov random field over barriers.

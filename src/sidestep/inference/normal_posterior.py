@@ -14,6 +14,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from sidestep._repr import short_repr
 from sidestep.errors import check, check_count
 from sidestep.inference.natural_scale import NaturalScale, natural_scale
 from sidestep.inference.objective import Parameters
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from arviz import InferenceData
 
 
+@short_repr("parameters", "standard_errors", "neglected", "distance", "simulated")
 @dataclass(frozen=True, eq=False)
 class Laplace:
     """A normal approximation of the posterior of what a fit has learned; made by `laplace`.

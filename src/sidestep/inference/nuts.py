@@ -19,6 +19,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from sidestep._repr import short_repr
 from sidestep._typing import Tree
 from sidestep.errors import check_count
 from sidestep.inference.arviz_data import inference_data, require
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 _Data = tuple[list[Batch], list[WarmStart], Arrivals | None]
 
 
+@short_repr()
 @dataclass(frozen=True, eq=False)
 class Draws:
     """Samples of a posterior, by `sample`.

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sidestep._repr import short_repr
 from sidestep._typing import FloatTree
 from sidestep.errors import check, check_not_negative
 
@@ -38,6 +39,7 @@ def _checked_strength(strength: float) -> Float[Array, ""]:
     return _as_floats(strength)
 
 
+@short_repr()
 class Prior(eqx.Module):
     """A density over parameters, up to a constant.
 

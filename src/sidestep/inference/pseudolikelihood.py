@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sidestep._repr import short_repr
 from sidestep.errors import check, check_positive
 from sidestep.inference.mrf import SHAPE_TERMS, BinaryMRF
 from sidestep.tabular.grid import STEPS, Cell, Grid
@@ -28,6 +29,7 @@ from sidestep.tabular.grid import STEPS, Cell, Grid
 _TOLERANCE = 1e-8
 
 
+@short_repr()
 @dataclass(frozen=True, eq=False)
 class MRFFit:
     """Weights of a `BinaryMRF` that were fitted to maps.

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, Float, Scalar
 
+from sidestep._repr import short_repr
 from sidestep.errors import InputError, check, check_positive
 from sidestep.tabular.arrays import to_jax
 
@@ -220,6 +221,7 @@ BACKUPS: Mapping[str, Callable[[], Backup]] = MappingProxyType(
 """The backups by the names that settings and the command line use."""
 
 
+@short_repr()
 class Behavior(eqx.Module):
     """How agents act: the backup that they value states with, their inverse temperature and their lapses.
 

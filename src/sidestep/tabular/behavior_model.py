@@ -22,6 +22,7 @@ import numpy as np
 from jax.scipy.special import logit
 from jaxtyping import Array, Float, Int
 
+from sidestep._repr import short_repr
 from sidestep.errors import InputError, check
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior
@@ -39,6 +40,7 @@ _COST_MEAN, _COST_STD = -4.0, 2.0
 """The mean and the standard deviation of the prior of k."""
 
 
+@short_repr()
 class BehaviorParameters(NamedTuple):
     """The learned numbers, unconstrained; None for what is known.
 
@@ -57,6 +59,7 @@ class BehaviorParameters(NamedTuple):
     cost_parameters: Float[Array, " states"] | None = None
 
 
+@short_repr("behavior", "parameters", "person", "features", "aimed_at")
 class BehaviorModel(eqx.Module):
     """How agents behave: what is known, and what is learned; made by `behavior_model`.
 

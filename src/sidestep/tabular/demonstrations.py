@@ -10,6 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from typing_extensions import TypeVar
 
+from sidestep._repr import short_repr
 from sidestep.errors import InputError, check
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.tasks import Task, stack_tasks
@@ -44,6 +45,7 @@ class Trajectory(NamedTuple):
     task: int
 
 
+@short_repr("trajectories", "states", "actions", "tasks", "weights", "person")
 class Demonstrations(eqx.Module, Generic[Tasks]):
     """The moves (s, a, s′) of many trajectories on many tasks, one after another; made by `gather`.
 

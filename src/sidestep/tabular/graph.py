@@ -11,6 +11,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from sidestep._repr import short_repr
 from sidestep.errors import check
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.grid import Cell, Grid
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     import scipy.sparse
 
 
+@short_repr()
 class Graph(eqx.Module):
     """The possible outcomes of each action, and its length; made by `graph` or `grid_graph`.
 

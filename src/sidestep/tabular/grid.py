@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 
+from sidestep._repr import short_repr
 from sidestep.errors import InputError, check, check_positive
 
 Connectivity = Literal[4, 8]
@@ -34,6 +35,7 @@ class Cell(IntEnum):
     OCCUPIED = 1
 
 
+@short_repr("shape", "resolution", "origin", "connectivity", "known")
 @dataclass(frozen=True, eq=False)
 class Grid:
     """The geometry of a map, what is known of its cells, and the moves on it.

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sidestep._programs import keep_program
+from sidestep._repr import short_repr
 from sidestep.errors import NotConverged, check
 from sidestep.tabular.backups import Behavior, HardMax
 from sidestep.tabular.models import TransitionModel
@@ -21,6 +22,7 @@ from sidestep.tabular.solvers.base import is_reachable
 from sidestep.tabular.tasks import Task
 
 
+@short_repr()
 class Plan(eqx.Module):
     """A policy for one task under a model; made by `plan`.
 
@@ -145,6 +147,7 @@ def _plan(model: TransitionModel, task: Task, behavior: Behavior, optimal: bool,
     return Plan(policy, intended.astype(jnp.int32), task.terminal, solution)
 
 
+@short_repr()
 class RollOuts(NamedTuple):
     """Trajectories of several agents that follow a policy; made by `roll_out`.
 

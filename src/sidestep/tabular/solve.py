@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from sidestep._repr import short_repr
 from sidestep.errors import ImproperTask, check, check_count
 from sidestep.tabular.backups import Backup, Behavior, Gradient, LogSumExp
 from sidestep.tabular.implicit import fixed_point
@@ -82,6 +83,7 @@ class SolveOptions(eqx.Module):
         return self.solver or default_solver(backup, states)
 
 
+@short_repr("values", "action_values", "sweeps", "residual", "converged")
 class Solution(eqx.Module):
     """The values of a task under a model, with a leading `tasks` axis for several tasks; made by `solve`.
 

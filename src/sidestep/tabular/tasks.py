@@ -13,12 +13,14 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
+from sidestep._repr import short_repr
 from sidestep.errors import InputError, check, check_positive
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.grid import Cell, Grid
 
 
+@short_repr()
 class Task(eqx.Module):
     """One task, or with a leading `tasks` axis on every field several; made by `reach`, `task` and `stack_tasks`.
 

@@ -10,12 +10,14 @@ from typing import TypeVar
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from sidestep._repr import short_repr
 from sidestep._typing import FloatTree
 from sidestep.tabular.graph import Graph
 
 _Model = TypeVar("_Model", bound="TransitionModel")
 
 
+@short_repr()
 class TransitionModel(eqx.Module):
     """Probabilities T_θ on a graph; a new family of models is a subclass with `probabilities`.
 
