@@ -87,6 +87,10 @@ from .inference.coordinate_ascent import (
     BarrierMeanField as BarrierMeanField,
     mean_field_barriers as mean_field_barriers,
 )
+from .inference.criteria import (
+    InformationCriteria as InformationCriteria,
+    information_criteria as information_criteria,
+)
 from .inference.diagnostics import effective_sizes as effective_sizes, split_rhat as split_rhat
 from .inference.enumeration import ExactPosterior as ExactPosterior, enumerate_barriers as enumerate_barriers
 from .inference.fit import Estimate as Estimate, Fit as Fit, fit as fit
@@ -101,6 +105,10 @@ from .inference.mrf import BinaryMRF as BinaryMRF
 from .inference.nuts import Draws as Draws, sample as sample
 from .inference.objective import Parameters as Parameters, tasks_mesh as tasks_mesh
 from .inference.optimizers import LBFGS as LBFGS, Adam as Adam, Optimizer as Optimizer, Rprop as Rprop
+from .inference.pointwise import (
+    PointwiseLogLikelihood as PointwiseLogLikelihood,
+    pointwise_log_likelihood as pointwise_log_likelihood,
+)
 from .inference.priors import (
     FreeCellEvidence as FreeCellEvidence,
     GaussianMRF as GaussianMRF,

@@ -29,6 +29,7 @@ from sidestep.inference.fit import Fit
 from sidestep.inference.laplace import laplace
 from sidestep.inference.natural_scale import natural_scale
 from sidestep.inference.objective import Parameters, Problem, actions_log_likelihood, transitions_and_prior
+from sidestep.inference.pointwise import Unit, pointwise_log_likelihood
 from sidestep.inference.tabular_information import TabularInformation
 from sidestep.tabular.likelihood import Arrivals
 from sidestep.tabular.solvers.base import WarmStart
@@ -58,14 +59,20 @@ class Draws:
     divergent: Bool[np.ndarray, "chains draws"]
     acceptance: Float[np.ndarray, "chains draws"]
 
-    def to_arviz(self) -> "InferenceData":
+    def to_arviz(self, fit: Fit[Any] | None = None, *, unit: Unit = "walk") -> "InferenceData":
         """Return the samples as ArviZ's `InferenceData`, on their natural scales.
 
+        Args:
+            fit: The fit that was sampled, for a group `log_likelihood`, which `arviz.loo` and `arviz.waic` need.
+            unit: What that group has an entry for, and `loo` leaves out: "walk" or "move".
+
         Raises:
-            InputError: Where ArviZ is not installed.
+            InputError: Where ArviZ is not installed, and for another fit.
+            NotConverged: If the values of a draw do not converge.
         """
         statistics = {"diverging": self.divergent, "acceptance_rate": self.acceptance}
-        return inference_data(natural_scale(self.parameters), statistics)
+        pointwise = None if fit is None else pointwise_log_likelihood(fit, self.parameters)
+        return inference_data(natural_scale(self.parameters), statistics, pointwise, unit)
 
 
 def sample(fit: Fit[Any], key: PRNGKeyArray, n: int = 1_000, *, chains: int = 4, warmup: int = 500) -> Draws:
