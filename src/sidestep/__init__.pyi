@@ -19,6 +19,7 @@ from .io.minari.demonstrations import (
     write_demonstrations as write_demonstrations,
 )
 from .io.maps import read_sensor_map as read_sensor_map, read_sensor_variance as read_sensor_variance
+from .io.saving import load as load, save as save
 from .io.walks import Walks as Walks, read_walks as read_walks, write_walks as write_walks
 from .tabular.demonstration_tables import Labels as Labels
 from .tabular.demonstrations import (
