@@ -92,6 +92,7 @@ from .inference.criteria import (
     InformationCriteria as InformationCriteria,
     information_criteria as information_criteria,
 )
+from .inference.cross_validation import CrossValidation as CrossValidation, cross_validate as cross_validate
 from .inference.diagnostics import effective_sizes as effective_sizes, split_rhat as split_rhat
 from .inference.enumeration import ExactPosterior as ExactPosterior, enumerate_barriers as enumerate_barriers
 from .inference.fit import Estimate as Estimate, Fit as Fit, fit as fit
