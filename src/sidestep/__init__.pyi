@@ -24,7 +24,9 @@ from .io.minari.demonstrations import (
     write_demonstrations as write_demonstrations,
 )
 from .io.maps import read_sensor_map as read_sensor_map, read_sensor_variance as read_sensor_variance
+from .io.saving import load as load, save as save
 from .io.walks import Walks as Walks, read_walks as read_walks, write_walks as write_walks
+from .tabular.demonstration_tables import Labels as Labels
 from .tabular.demonstrations import (
     Demonstrations as Demonstrations,
     Trajectory as Trajectory,
@@ -34,6 +36,7 @@ from .tabular.demonstrations import (
 from .tabular.graph import Graph as Graph, graph as graph, grid_graph as grid_graph
 from .tabular.grid import Cell as Cell, Grid as Grid
 from .tabular.reward import Reward as Reward
+from .tabular.selection import join as join
 from .tabular.simulation import simulate as simulate
 from .tabular.tasks import Task as Task, reach as reach, stack_tasks as stack_tasks, task as task
 
@@ -87,6 +90,11 @@ from .inference.coordinate_ascent import (
     BarrierMeanField as BarrierMeanField,
     mean_field_barriers as mean_field_barriers,
 )
+from .inference.criteria import (
+    InformationCriteria as InformationCriteria,
+    information_criteria as information_criteria,
+)
+from .inference.cross_validation import CrossValidation as CrossValidation, cross_validate as cross_validate
 from .inference.diagnostics import effective_sizes as effective_sizes, split_rhat as split_rhat
 from .inference.enumeration import ExactPosterior as ExactPosterior, enumerate_barriers as enumerate_barriers
 from .inference.fit import Estimate as Estimate, Fit as Fit, fit as fit
@@ -101,6 +109,10 @@ from .inference.mrf import BinaryMRF as BinaryMRF
 from .inference.nuts import Draws as Draws, sample as sample
 from .inference.objective import Parameters as Parameters, tasks_mesh as tasks_mesh
 from .inference.optimizers import LBFGS as LBFGS, Adam as Adam, Optimizer as Optimizer, Rprop as Rprop
+from .inference.pointwise import (
+    PointwiseLogLikelihood as PointwiseLogLikelihood,
+    pointwise_log_likelihood as pointwise_log_likelihood,
+)
 from .inference.priors import (
     FreeCellEvidence as FreeCellEvidence,
     GaussianMRF as GaussianMRF,

@@ -25,6 +25,7 @@ from jax.core import Tracer
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float, PRNGKeyArray, Scalar, Shaped
 
+from sidestep._repr import short_repr
 from sidestep._typing import ArrayTree, FloatTree, Tree
 from sidestep.errors import InputError, check
 from sidestep.tabular.models import TransitionModel
@@ -41,6 +42,7 @@ ValueFunction = Callable[[State], Real]
 _Family = TypeVar("_Family", bound="Dynamics")
 
 
+@short_repr()
 class Dynamics(eqx.Module):
     """A density T_θ(s, a, ·) over next states.
 

@@ -20,6 +20,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from sidestep._repr import short_repr
 from sidestep._typing import FloatTree, Tree
 from sidestep.continuous.dynamics import Dynamics
 from sidestep.continuous.estimators import Estimator
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 Family = TypeVar("Family", bound=Dynamics)
 
 
+@short_repr("dynamics", "planner_state", "problem", "message", "converged")
 class ContinuousFit(eqx.Module, Generic[Family, SomePolicy]):
     """The result of a fit.
 

@@ -19,6 +19,7 @@ import numpy as np
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float, PRNGKeyArray, Shaped
 
+from sidestep._repr import short_repr
 from sidestep.continuous.dynamics import Action, Dynamics, Real
 from sidestep.continuous.tasks import ContinuousTask, States
 from sidestep.errors import check, check_positive
@@ -69,6 +70,7 @@ def _center_and_scale(rows: Float[Array, "rows *_"], least: float) -> tuple[Floa
     return rows.mean(axis=0), jax.device_put(np.where(spread > least, spread, 1.0))
 
 
+@short_repr()
 class Policy(eqx.Module):
     """A distribution π_λ(c | x); λ are all its floating-point arrays that gradients reach.
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from sidestep._repr import short_repr
 from sidestep.continuous.dynamics import Action, Real, State, check_finite
 from sidestep.errors import InputError, check, check_positive
 from sidestep.tabular.tasks import Task, check_discount
@@ -22,6 +23,7 @@ States = Shaped[Array, "states *state"]
 _Task = TypeVar("_Task", bound="ContinuousTask")
 
 
+@short_repr()
 class ContinuousTask(eqx.Module):
     """One task, or several with a leading `tasks` axis on every array (see `batch_tasks`).
 

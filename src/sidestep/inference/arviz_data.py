@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Mapping
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -13,6 +13,8 @@ from sidestep.inference.natural_scale import NaturalScale
 
 if TYPE_CHECKING:
     from arviz import InferenceData
+
+    from sidestep.inference.pointwise import PointwiseLogLikelihood, Unit
 
 
 def require(package: str, what: str) -> None:
@@ -26,12 +28,19 @@ def require(package: str, what: str) -> None:
     check(find_spec(package) is not None, message, source=what)
 
 
-def inference_data(draws: NaturalScale, statistics: Mapping[str, np.ndarray] | None = None) -> "InferenceData":
+def inference_data(
+    draws: NaturalScale,
+    statistics: Mapping[str, np.ndarray] | None = None,
+    pointwise: "PointwiseLogLikelihood | None" = None,
+    unit: "Unit" = "walk",
+) -> "InferenceData":
     """Return draws as `InferenceData`.
 
     Args:
         draws: Each leaf with leading axes of chains and draws.
         statistics: Of the sampler, with the same axes, by ArviZ's names.
+        pointwise: The log-likelihood of each move, with the same axes.
+        unit: What the group `log_likelihood` has an entry for.
     """
     require("arviz", "to_arviz")
     with warnings.catch_warnings():
@@ -41,4 +50,10 @@ def inference_data(draws: NaturalScale, statistics: Mapping[str, np.ndarray] | N
     names: dict[str, np.ndarray] = {}
     for path, leaf in jax.tree_util.tree_flatten_with_path(draws)[0]:
         names[jax.tree_util.keystr(path).removeprefix(".")] = np.asarray(leaf)
-    return arviz.from_dict(posterior=names, sample_stats=None if statistics is None else dict(statistics))
+    others: dict[str, Any] = {}
+    if statistics is not None:
+        others["sample_stats"] = dict(statistics)
+    if pointwise is not None:
+        others["log_likelihood"] = {f"{unit}s": pointwise.of(unit)}
+        others["dims"], others["coords"] = {f"{unit}s": [unit]}, {unit: pointwise.numbers_of(unit)}
+    return arviz.from_dict(posterior=names, **others)

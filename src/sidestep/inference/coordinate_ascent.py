@@ -34,6 +34,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from scipy.special import entr, expit, softmax
 
 from sidestep._arguments import to_key
+from sidestep._repr import short_repr
 from sidestep.errors import check, check_count, check_function, check_instance
 from sidestep.inference.chain_kernels import Chain, Workspace
 from sidestep.inference.chains import NEG_INF, BarrierProblem, problem_of
@@ -98,6 +99,7 @@ class AscentProgress(NamedTuple):
         return f"objective {self.objective:.3f}, P(closed) off by at most {self.gap:.2g}"
 
 
+@short_repr()
 @dataclass(frozen=True, eq=False)
 class BarrierMeanField(Generic[Model]):
     """A mixture of independent barriers that approximates the posterior of a transition model.

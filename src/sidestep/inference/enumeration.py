@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sidestep._repr import short_repr
 from sidestep.errors import NotConverged, check, check_instance, to_count
 from sidestep.inference.arguments import check_evidence
 from sidestep.inference.chains import PASSING, check_prior, crossed_barriers
@@ -39,6 +40,7 @@ _BATCH = 128
 """The number of maps that are evaluated at once."""
 
 
+@short_repr()
 class ExactPosterior(NamedTuple):
     """The exact posterior of barriers.
 

@@ -17,6 +17,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
+from sidestep._repr import short_repr
 from sidestep.errors import check, check_function, check_instance, to_count, to_number
 from sidestep.inference.arguments import check_evidence
 from sidestep.inference.batching import LARGE_MAP, MEMORY, plan_batches
@@ -55,6 +56,7 @@ class Estimate(NamedTuple):
     standard_error: float | None
 
 
+@short_repr("model", "behavior", "problem", "description", "converged")
 class Fit(eqx.Module, Generic[Model]):
     """A learned transition model.
 

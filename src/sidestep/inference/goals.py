@@ -25,6 +25,7 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Float
 
 from sidestep._arguments import to_finite
+from sidestep._repr import short_repr
 from sidestep.errors import InputError, NotConverged, check_count, check_function, check_instance, to_list, to_number
 from sidestep.inference.arguments import check_tasks
 from sidestep.inference.fit import Fit, Model
@@ -35,6 +36,7 @@ from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.tasks import Task, stack_tasks
 
 
+@short_repr()
 class GoalFit(eqx.Module, Generic[Model]):
     """A model learned from trajectories with unknown goals.
 

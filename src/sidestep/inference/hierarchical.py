@@ -29,6 +29,7 @@ from jaxtyping import Bool, Float, Int, Integer
 from scipy.special import expit
 
 from sidestep._arguments import to_finite, to_floats, to_mask
+from sidestep._repr import short_repr
 from sidestep.errors import check, check_instance, describe, to_number
 from sidestep.inference.mrf import SHAPE_TERMS, BinaryMRF
 from sidestep.inference.prior_chains import native_terms, run_prior
@@ -50,6 +51,7 @@ _SWEEPS, _PROPOSALS, _CELLS = 40, 10_000, 2_000_000
 barriers that more may store."""
 
 
+@short_repr()
 @dataclass(frozen=True, eq=False)
 class HierarchicalMRF:
     """A binary Markov random field with unknown log-odds δ and strength λ of its shapes.

@@ -24,11 +24,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 
 from sidestep._arguments import to_finite, to_integers
+from sidestep._repr import short_repr
 from sidestep.errors import check, describe, to_number
 
 SHAPE_TERMS = ("lines", "pairs", "blocks", "isolated")
 
 
+@short_repr()
 @dataclass(frozen=True, eq=False)
 class BinaryMRF:
     """A binary Markov random field over barriers.

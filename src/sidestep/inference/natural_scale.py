@@ -7,11 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sidestep._repr import short_repr
 from sidestep._typing import Tree
 from sidestep.errors import check_instance
 from sidestep.inference.objective import Parameters
 
 
+@short_repr()
 class NaturalScale(NamedTuple):
     """All that is learned, on the scales that people read; None for what is known.
 

@@ -6,7 +6,7 @@ the natural scale. So intervals are computed there, and their ends mapped.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from sidestep._arguments import to_floats, to_key
+from sidestep._repr import short_repr
 from sidestep.errors import check_count, check_function, to_number
 from sidestep.inference.natural_scale import NaturalScale, natural_scale
 from sidestep.inference.objective import Parameters
@@ -22,7 +23,11 @@ from sidestep.inference.objective import Parameters
 if TYPE_CHECKING:
     from arviz import InferenceData
 
+    from sidestep.inference.fit import Fit
+    from sidestep.inference.pointwise import Unit
 
+
+@short_repr("parameters", "standard_errors", "neglected", "distance", "simulated")
 @dataclass(frozen=True, eq=False)
 class Laplace:
     """A normal approximation of the posterior of what a fit has learned; made by `laplace`.
@@ -126,19 +131,28 @@ class Laplace:
         flat, unravel = ravel_pytree(self.parameters)
         return jax.vmap(unravel)(flat + jnp.asarray(inner * self.scale, flat.dtype))
 
-    def to_arviz(self, key: PRNGKeyArray, n: int = 1_000) -> "InferenceData":
+    def to_arviz(
+        self, key: PRNGKeyArray, n: int = 1_000, *, fit: "Fit[Any] | None" = None, unit: "Unit" = "walk"
+    ) -> "InferenceData":
         """Return samples as ArviZ's `InferenceData`, on their natural scales; needs `sidestep[samplers]`.
 
         Args:
             key: Of the random numbers.
             n: The number of samples, at least 1.
+            fit: The fit of a transition model that the approximation belongs to, for a group `log_likelihood`, which
+                `arviz.loo` and `arviz.waic` need.
+            unit: What that group has an entry for, and `loo` leaves out: "walk" or "move".
 
         Raises:
-            InputError: Where ArviZ is not installed, and for n below 1.
+            InputError: Where ArviZ is not installed, for n below 1, and for another fit.
+            NotConverged: If the values of a sample do not converge.
         """
         from sidestep.inference.arviz_data import inference_data
+        from sidestep.inference.pointwise import pointwise_log_likelihood
 
-        return inference_data(natural_scale(jax.tree.map(lambda leaf: leaf[None], self.sample(key, n))))
+        samples = jax.tree.map(lambda leaf: leaf[None], self.sample(key, n))
+        pointwise = None if fit is None else pointwise_log_likelihood(fit, samples)
+        return inference_data(natural_scale(samples), None, pointwise, unit)
 
     def _tree(self, vector: Float[np.ndarray, " parameters"]) -> Parameters:
         flat, unravel = ravel_pytree(self.parameters)

@@ -20,6 +20,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sidestep._arguments import to_key
+from sidestep._repr import short_repr
 from sidestep._typing import Tree
 from sidestep.errors import check_count, check_instance
 from sidestep.inference.arviz_data import inference_data, require
@@ -29,6 +30,7 @@ from sidestep.inference.fit import Fit
 from sidestep.inference.laplace import laplace
 from sidestep.inference.natural_scale import natural_scale
 from sidestep.inference.objective import Parameters, Problem, actions_log_likelihood, transitions_and_prior
+from sidestep.inference.pointwise import Unit, pointwise_log_likelihood
 from sidestep.inference.tabular_information import TabularInformation
 from sidestep.tabular.likelihood import Arrivals
 from sidestep.tabular.solvers.base import WarmStart
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
 _Data = tuple[list[Batch], list[WarmStart], Arrivals | None]
 
 
+@short_repr()
 @dataclass(frozen=True, eq=False)
 class Draws:
     """Samples of a posterior, by `sample`.
@@ -57,14 +60,20 @@ class Draws:
     divergent: Bool[np.ndarray, "chains draws"]
     acceptance: Float[np.ndarray, "chains draws"]
 
-    def to_arviz(self) -> "InferenceData":
+    def to_arviz(self, fit: Fit[Any] | None = None, *, unit: Unit = "walk") -> "InferenceData":
         """Return the samples as ArviZ's `InferenceData`, on their natural scales.
 
+        Args:
+            fit: The fit that was sampled, for a group `log_likelihood`, which `arviz.loo` and `arviz.waic` need.
+            unit: What that group has an entry for, and `loo` leaves out: "walk" or "move".
+
         Raises:
-            InputError: Where ArviZ is not installed.
+            InputError: Where ArviZ is not installed, and for another fit.
+            NotConverged: If the values of a draw do not converge.
         """
         statistics = {"diverging": self.divergent, "acceptance_rate": self.acceptance}
-        return inference_data(natural_scale(self.parameters), statistics)
+        pointwise = None if fit is None else pointwise_log_likelihood(fit, self.parameters)
+        return inference_data(natural_scale(self.parameters), statistics, pointwise, unit)
 
 
 def sample(fit: Fit[Any], key: PRNGKeyArray, n: int = 1_000, *, chains: int = 4, warmup: int = 500) -> Draws:

@@ -26,6 +26,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
 from sidestep._programs import keep_program
+from sidestep._repr import short_repr
 from sidestep._typing import Tree
 from sidestep.errors import InputError, to_list
 from sidestep.inference.batching import Batch, BatchPlan, make_batches, plan_batches
@@ -44,6 +45,7 @@ AXIS = "tasks"
 """The name of a mesh's axis, over which tasks are spread."""
 
 
+@short_repr()
 class Parameters(NamedTuple):
     """All that is learned.
 
@@ -56,6 +58,7 @@ class Parameters(NamedTuple):
     behavior: BehaviorParameters
 
 
+@short_repr()
 class Problem(eqx.Module):
     """All that the objective depends on besides the parameters.
 

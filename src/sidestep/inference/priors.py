@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Shaped
 
 from sidestep._arguments import to_finite, to_floats, to_integers
+from sidestep._repr import short_repr
 from sidestep._typing import FloatTree, Tree
 from sidestep.errors import InputError, check, check_instance, to_number
 from sidestep.tabular.arrays import to_jax
@@ -51,6 +52,7 @@ def _checked_counts(counts: Float[Array | np.ndarray, " cells"] | Sequence[float
     return to_jax(to_finite(counts, "counts", ("cells",), least=0))
 
 
+@short_repr()
 class Prior(eqx.Module):
     """A density over parameters, up to a constant.
 

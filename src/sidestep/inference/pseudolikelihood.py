@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sidestep._arguments import to_integers
+from sidestep._repr import short_repr
 from sidestep.errors import check, check_positive, describe, to_list, to_number
 from sidestep.inference.mrf import SHAPE_TERMS, BinaryMRF
 from sidestep.tabular.grid import STEPS, Cell, Grid
@@ -29,6 +30,7 @@ from sidestep.tabular.grid import STEPS, Cell, Grid
 _TOLERANCE = 1e-8
 
 
+@short_repr()
 @dataclass(frozen=True, eq=False)
 class MRFFit:
     """Weights of a `BinaryMRF` that were fitted to maps.

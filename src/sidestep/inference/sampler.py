@@ -38,6 +38,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from sidestep._arguments import to_key
+from sidestep._repr import short_repr
 from sidestep.errors import check_count, check_function
 from sidestep.inference.chains import BarrierProblem, ChainState, problem_of
 from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
@@ -98,6 +99,7 @@ class SweepProgress(NamedTuple):
         return f"objective {self.objective:.3f}, {self.accepted:.1%} of proposals accepted"
 
 
+@short_repr("model", "behavior", "closed", "samples", "description")
 @dataclass(frozen=True, eq=False)
 class BarrierPosterior(Generic[Model]):
     """Samples of the barriers of a transition model from their posterior.

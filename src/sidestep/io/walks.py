@@ -25,6 +25,7 @@ import pyarrow as pa
 from jaxtyping import Bool, Float, Int, Integer, Real
 
 from sidestep._arguments import to_floats, to_indices, to_integers
+from sidestep._repr import short_repr
 from sidestep.errors import check, check_instance, describe, to_list, to_path
 from sidestep.io.minari.walks import read_positions, write_positions
 from sidestep.io.tables import check_columns, check_rows, finite_column, number_column, read_table, write_table
@@ -35,6 +36,7 @@ _STORES = {"minari": (read_positions, write_positions)}
 """Stores other than files, by the prefix of their names: the functions that read and write them."""
 
 
+@short_repr()
 @dataclass(frozen=True, eq=False)
 class Walks:
     """Walks, one after another; the rows of walk i are `offsets[i]` to `offsets[i + 1]`.

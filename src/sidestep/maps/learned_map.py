@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int
 
 from sidestep._arguments import to_finite, to_floats, to_mask, to_states
 from sidestep._files import read_array, read_json, write_array, write_arrays, write_json
+from sidestep._repr import short_repr
 from sidestep.errors import InputError, check, check_instance, check_not_negative, input_errors, to_number, to_path
 from sidestep.io.maps import read_map, write_map
 from sidestep.robots.planners import GoalPlan, ModelPlanner
@@ -42,6 +43,7 @@ _BUMP_FACTORS = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 """The factors of the bump cost at which paths are planned where a risk is named."""
 
 
+@short_repr()
 @dataclass(frozen=True, eq=False)
 class PlannedPath:
     """A path that was planned in a learned map.
@@ -78,6 +80,7 @@ class PlannedPath:
         return self.open_probability >= 1 - to_number(max_risk, "max_risk", least=0, most=1)
 
 
+@short_repr()
 @dataclass(frozen=True, eq=False)
 class LearnedMap:
     """A learned map.

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Scalar
 
 from sidestep._arguments import to_finite
+from sidestep._repr import short_repr
 from sidestep.errors import InputError, describe, to_number
 from sidestep.tabular.arrays import to_jax
 
@@ -231,6 +232,7 @@ BACKUPS: Mapping[str, Callable[[], Backup]] = MappingProxyType(
 """The backups by the names that settings and the command line use."""
 
 
+@short_repr()
 class Behavior(eqx.Module):
     """How agents act: the backup that they value states with, their inverse temperature and their lapses.
 

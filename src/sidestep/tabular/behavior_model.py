@@ -24,6 +24,7 @@ from jax.scipy.special import logit
 from jaxtyping import Array, ArrayLike, Float, Int, Shaped
 
 from sidestep._arguments import to_finite, to_integers, to_states
+from sidestep._repr import short_repr
 from sidestep.errors import check, check_choice, check_instance, describe, to_list, to_number
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior
@@ -40,6 +41,7 @@ _COST_MEAN, _COST_STD = -4.0, 2.0
 """The mean and the standard deviation of the prior of k."""
 
 
+@short_repr()
 class BehaviorParameters(NamedTuple):
     """The learned numbers, unconstrained; None for what is known.
 
@@ -58,6 +60,7 @@ class BehaviorParameters(NamedTuple):
     cost_parameters: Float[Array, " states"] | None = None
 
 
+@short_repr("behavior", "parameters", "person", "features", "aimed_at")
 class BehaviorModel(eqx.Module):
     """How agents behave: what is known, and what is learned; made by `behavior_model`.
 

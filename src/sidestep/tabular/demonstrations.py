@@ -1,7 +1,7 @@
 """Demonstrations: the moves of agents as flat arrays, one trajectory after another, and the tasks that they pursued."""
 
 from collections.abc import Sequence
-from typing import Any, Generic, NamedTuple
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,9 +11,15 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from typing_extensions import TypeVar
 
 from sidestep._arguments import to_integers, to_mask, to_states
+from sidestep._repr import short_repr
 from sidestep.errors import InputError, check, check_instance, describe, to_count, to_list
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.tasks import Task, stack_tasks
+
+if TYPE_CHECKING:
+    import pyarrow
+
+    from sidestep.tabular.demonstration_tables import Labels
 
 Tasks = TypeVar("Tasks", bound=eqx.Module, default=Any)
 """The type of the tasks: arrays in discrete worlds (`Task`), functions in continuous ones (`ContinuousTask`)."""
@@ -42,6 +48,7 @@ class Trajectory(NamedTuple):
     truncated: bool = False
 
 
+@short_repr("trajectories", "states", "actions", "tasks", "weights", "person")
 class Demonstrations(eqx.Module, Generic[Tasks]):
     """The moves (s, a, s′) of many trajectories on many tasks, one after another; made by `gather`.
 
@@ -53,6 +60,7 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         trajectory: The index of the trajectory of each move; 0, 1, … in order.
         tasks: All tasks, stacked.
         weights: How much each move counts in the likelihood of discrete worlds; 1 by default.
+        person: The person of each move; None where persons are not told apart.
 
     Example:
         >>> from sidestep.tabular.grid import Grid
@@ -69,6 +77,7 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
     trajectory: Int[Array, " moves"]
     tasks: Tasks
     weights: Float[Array, " moves"] = eqx.field(default=None)
+    person: Int[Array, " moves"] | None = None
 
     def __post_init__(self) -> None:
         if self.weights is None:
@@ -105,6 +114,110 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         mask = to_mask(trajectories, "trajectories", (self.trajectories,))
         weights = np.asarray(mask, dtype=np.float64)[np.asarray(self.trajectory)]
         return eqx.tree_at(lambda demonstrations: demonstrations.weights, self, to_jax(weights))
+
+    @classmethod
+    def from_table(
+        cls,
+        table: Any,
+        tasks: Task | Sequence[Task],
+        *,
+        state: str = "state",
+        action: str = "action",
+        next_state: str | None = None,
+        walk: str | None = "walk",
+        step: str | None = None,
+        task: str | None = None,
+        subject: str | None = None,
+        weight: str | None = None,
+        labels: "Labels | None" = None,
+    ) -> "Demonstrations[Task]":
+        """Return the demonstrations in a table of pandas, polars, pyarrow or another library that speaks Arrow.
+
+        A row is a move. Without a column of next states, the next state is that of the walk's next row, and the last
+        row of a walk holds its final state, without an action.
+
+        Args:
+            table: Anything with Arrow's PyCapsule interface (`__arrow_c_stream__`) or the DataFrame interchange
+                protocol.
+            tasks: The tasks that the column `task` counts through; a single one needs no such column.
+            state: The column with the state before each move; states, actions, tasks and persons are whole numbers from
+                0, or labels.
+            action: The column with the action.
+            next_state: The column with the state after each move; an empty cell is the state of the next row.
+            walk: The column that tells walks apart, by numbers or texts; None for a single walk. Walks are numbered as
+                they appear.
+            step: The column by which the rows of a walk are ordered; by default they are in order.
+            task: The column with the task of each walk.
+            subject: The column with the person of each walk.
+            weight: The column with how much each move counts.
+            labels: The names of states, actions, tasks and persons, where cells hold names.
+
+        Returns:
+            The moves of all walks, one after another, with their tasks.
+
+        Raises:
+            InputError: With row and column, for a column that is missing or of another kind, an empty cell, a state,
+                action or task that does not exist, a label that is not known, moves that do not follow each other, a
+                walk without a move or that goes on after a terminal state, and two tasks or persons in one walk.
+
+        Example:
+            >>> from sidestep.tabular.grid import Grid
+            >>> from sidestep.tabular.tasks import reach
+            >>> table = {"walk": ["a", "a", "a"], "state": [0, 1, 2], "action": [3, 3, None]}
+            >>> shown = Demonstrations.from_table(table, reach(Grid.unknown(rows=1, columns=3), 2))
+            >>> shown.next_states.tolist()
+            [1, 2]
+        """
+        from sidestep.tabular.demonstration_tables import Columns, Labels, read_moves
+
+        columns = Columns(state, action, next_state, walk, step, task, subject, weight)
+        return read_moves(table, tasks, columns, labels or Labels())
+
+    def to_table(self: "Demonstrations[Task]", labels: "Labels | None" = None) -> "pyarrow.Table":
+        """Return the moves as a `pyarrow.Table`, which `to_pandas()` and `polars.from_arrow` convert.
+
+        Args:
+            labels: Names of states, actions, tasks and persons; without them these are numbers.
+
+        Returns:
+            A row for each move, with the columns `walk`, `step`, `state`, `action`, `next_state`, `task`, `subject`
+            where there are persons, and `weight`.
+
+        Raises:
+            InputError: Where there are too few labels.
+
+        Example:
+            >>> from sidestep.tabular.grid import Grid
+            >>> from sidestep.tabular.tasks import reach
+            >>> walk = Trajectory(np.array([0, 1, 2]), np.array([3, 3]), task=0)
+            >>> shown = gather([walk, walk], [reach(Grid.unknown(rows=1, columns=3), 2)])
+            >>> shown.to_table()["next_state"].to_pylist()
+            [1, 2, 1, 2]
+        """
+        from sidestep.tabular.demonstration_tables import Labels, write_moves
+
+        return write_moves(self, labels or Labels())
+
+    def __getitem__(self, chosen: Any) -> "Demonstrations[Tasks]":
+        """Return some trajectories, numbered anew; all tasks stay, so that their numbers do.
+
+        Args:
+            chosen: A slice, indices (which may repeat), or whether each trajectory is chosen.
+
+        Raises:
+            InputError: For no trajectory, and for one that does not exist.
+        """
+        from sidestep.tabular.selection import choose
+
+        return choose(self, chosen)
+
+    __iter__ = None
+    """Not defined: `len` counts moves, and indices count trajectories."""
+
+    @property
+    def persons(self) -> Int[np.ndarray, " trajectories"] | None:
+        """Return the person of each trajectory; None where persons are not told apart."""
+        return None if self.person is None else np.asarray(self.person)[self.first_moves()]
 
     def first_moves(self) -> Int[np.ndarray, " trajectories"]:
         """Return the index of the first move of each trajectory."""

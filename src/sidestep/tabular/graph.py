@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
 from sidestep._arguments import to_integers, to_mask
+from sidestep._repr import short_repr
 from sidestep.errors import check, check_instance
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.grid import Cell, Grid
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     import scipy.sparse
 
 
+@short_repr()
 class Graph(eqx.Module):
     """The possible outcomes of each action, and its length; made by `graph` or `grid_graph`.
 

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 
 from sidestep._arguments import to_finite, to_floats, to_integers, to_states
+from sidestep._repr import short_repr
 from sidestep.errors import InputError, check, check_choice, to_count, to_number
 
 Connectivity = Literal[4, 8]
@@ -38,6 +39,7 @@ class Cell(IntEnum):
     OCCUPIED = 1
 
 
+@short_repr("shape", "resolution", "origin", "connectivity", "known")
 @dataclass(frozen=True, eq=False)
 class Grid:
     """The geometry of a map, what is known of its cells, and the moves on it.

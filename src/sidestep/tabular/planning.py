@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from sidestep._arguments import to_key, to_states
 from sidestep._programs import keep_program
+from sidestep._repr import short_repr
 from sidestep.errors import NotConverged, check, check_instance, to_count
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior, HardMax, tied_where_lost
@@ -27,6 +28,7 @@ from sidestep.tabular.solvers.base import is_reachable
 from sidestep.tabular.tasks import Task
 
 
+@short_repr()
 class Plan(eqx.Module):
     """A policy for one task under a model; made by `plan`.
 
@@ -209,6 +211,7 @@ def _first_best(
     return jnp.argmax(among >= largest - 64 * jnp.finfo(advantages.dtype).eps * size, axis=-1)
 
 
+@short_repr()
 class RollOuts(NamedTuple):
     """Trajectories of several agents that follow a policy; made by `roll_out`.
 

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from sidestep._repr import short_repr
 from sidestep.errors import check, check_choice, check_instance, to_count
 from sidestep.tabular.backups import Backup, Behavior, Gradient
 from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
@@ -89,6 +90,7 @@ class SolveOptions(eqx.Module):
         return self.solver or default_solver(backup, states)
 
 
+@short_repr("values", "action_values", "sweeps", "residual", "converged")
 class Solution(eqx.Module):
     """The values of a task under a model, with a leading `tasks` axis for several tasks; made by `solve`.
 

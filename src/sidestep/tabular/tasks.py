@@ -20,12 +20,14 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
 from sidestep._arguments import to_finite, to_floats, to_mask
+from sidestep._repr import short_repr
 from sidestep.errors import InputError, check, check_instance, check_positive, describe, to_list, to_number
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.grid import Cell, Grid
 
 
+@short_repr()
 class Task(eqx.Module):
     """One task, or with a leading `tasks` axis on every field several; made by `reach`, `task` and `stack_tasks`.
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sidestep._repr import short_repr
 from sidestep._typing import FloatTree
 from sidestep.errors import check
 from sidestep.tabular.graph import Graph
@@ -19,6 +20,7 @@ from sidestep.tabular.graph import Graph
 _Model = TypeVar("_Model", bound="TransitionModel")
 
 
+@short_repr()
 class TransitionModel(eqx.Module):
     """Probabilities T_θ on a graph; a new family of models is a subclass with `probabilities`.
 

@@ -1,0 +1,292 @@
+"""Demonstrations as tables: one row for each move, in any library that has the Arrow PyCapsule interface.
+
+pandas, polars, pyarrow, DuckDB and others hand their tables over by `__arrow_c_stream__`, so none of them is needed. A
+table has a row for each move: its walk, state and action. The next state is that of the row below, unless there is a
+column for it. The last row of a walk without such a column has no action: it holds the final state.
+"""
+
+from collections.abc import Hashable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from jaxtyping import Bool, Float, Int, Shaped
+
+from sidestep.errors import InputError, check, input_errors
+from sidestep.tabular.arrays import to_jax
+from sidestep.tabular.demonstrations import Demonstrations, flat_moves
+from sidestep.tabular.tasks import Task, stack_tasks
+
+_NONE = -1
+"""The number of an empty cell."""
+
+
+class Labels(NamedTuple):
+    """Names of what arrays number: the first label is that of number 0.
+
+    Attributes:
+        states, actions, tasks, persons: Texts or whole numbers, each once; empty where numbers have no names.
+
+    Example:
+        >>> Labels(states=("home", "road", "work")).states[2]
+        'work'
+    """
+
+    states: Sequence[Hashable] = ()
+    actions: Sequence[Hashable] = ()
+    tasks: Sequence[Hashable] = ()
+    persons: Sequence[Hashable] = ()
+
+
+class Columns(NamedTuple):
+    """The names of a table's columns; None for those that it does not have.
+
+    Attributes:
+        state, action, next_state, walk, step, task, subject, weight: As the arguments of `Demonstrations.from_table`.
+    """
+
+    state: str = "state"
+    action: str = "action"
+    next_state: str | None = None
+    walk: str | None = None
+    step: str | None = None
+    task: str | None = None
+    subject: str | None = None
+    weight: str | None = None
+
+
+def read_moves(table: Any, tasks: Task | Sequence[Task], columns: Columns, labels: Labels) -> Demonstrations[Task]:
+    """Return the demonstrations in a table; `Demonstrations.from_table` describes the arguments and the errors.
+
+    Args:
+        table: The table.
+        tasks: The tasks.
+        columns: The names of its columns.
+        labels: The names of states, actions, tasks and persons.
+    """
+    rows = _Rows(_as_arrow(table), columns)
+    stacked = _stacked(tasks)
+    states = stacked.terminal.shape[-1]
+    walk, order = _walks(rows)
+    state = rows.numbers("state", labels.states, states)
+    action = rows.numbers("action", labels.actions, empty=True)
+    task = rows.numbers("task", labels.tasks, len(stacked.terminal)) if columns.task else np.zeros(len(rows), np.int64)
+    check(columns.task or len(stacked.terminal) == 1, "several tasks: expected a column with the task", field="task")
+    person = rows.numbers("subject", labels.persons) if columns.subject else None
+    weight = rows.weights() if columns.weight else np.ones(len(rows))
+    after = rows.numbers("next_state", labels.states, states, empty=True) if columns.next_state else None
+    number = rows.number[order]
+    walk, state, action, task = (each[order] for each in (walk, state, action, task))
+    weight = weight[order]
+    after = np.full(len(state), _NONE) if after is None else after[order]
+    last = np.append(walk[1:] != walk[:-1], True)
+    next_state = _next_states(rows, number, last, state, action, after)
+    moves = action != _NONE
+    _check_walks(rows, number, walk, task, "task")
+    ended = moves & np.asarray(stacked.terminal)[task, state]
+    rows.check(~ended, number, "the walk goes on after a terminal state of its task", "state")
+    if person is not None:
+        person = person[order]
+        _check_walks(rows, number, walk, person, "subject")
+    return Demonstrations(
+        *(flat_moves([each[moves]]) for each in (state, action, next_state, task, walk)),
+        tasks=stacked,
+        weights=to_jax(weight[moves]),
+        person=None if person is None else flat_moves([person[moves]]),
+    )
+
+
+def write_moves(demonstrations: Demonstrations[Task], labels: Labels) -> pa.Table:
+    """Return demonstrations as a table; `Demonstrations.to_table` describes it.
+
+    Args:
+        demonstrations: The moves.
+        labels: The names of states, actions, tasks and persons.
+    """
+    walk = np.asarray(demonstrations.trajectory)
+    step = np.arange(len(walk)) - demonstrations.first_moves()[walk]
+    names = labels.states, labels.actions, labels.states, labels.tasks
+    fields = "state", "action", "next_state", "task"
+    arrays = (demonstrations.states, demonstrations.actions, demonstrations.next_states, demonstrations.task)
+    columns: dict[str, Any] = {"walk": walk, "step": step}
+    for field, array, labeled in zip(fields, arrays, names, strict=True):
+        columns[field] = _labeled(np.asarray(array), labeled, field)
+    if demonstrations.person is not None:
+        columns["subject"] = _labeled(np.asarray(demonstrations.person), labels.persons, "subject")
+    columns["weight"] = np.asarray(demonstrations.weights)
+    return pa.table({name: pa.array(values) for name, values in columns.items()})
+
+
+class _Rows:
+    """The rows of a table, with errors that name row and column."""
+
+    def __init__(self, table: pa.Table, columns: Columns):
+        self.table, self.columns = table, columns
+        self.number = np.arange(1, len(table) + 1)
+        for name in filter(None, columns):
+            expected = f"expected one of {', '.join(table.column_names)}"
+            count = table.column_names.count(name)
+            check(count == 1, f"the table has {count} such columns: {expected}", source="table", field=name)
+        check(len(table), "expected at least one row", source="table")
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def check(
+        self, valid: Bool[np.ndarray, " rows"], number: Int[np.ndarray, " rows"], message: str, kind: str
+    ) -> None:
+        """Raise `InputError` for the first row of the table that is not valid; `kind` is a field of `Columns`."""
+        if not valid.all():
+            raise InputError(message, source="table", row=int(number[~valid].min()), field=self.name(kind))
+
+    def name(self, kind: str) -> str:
+        return getattr(self.columns, kind) or kind
+
+    def column(self, kind: str) -> pa.Array:
+        """Return a column in one piece, with NaN as an empty cell, and categories as what they stand for."""
+        column = self.table[self.name(kind)].combine_chunks()
+        if pa.types.is_dictionary(column.type) or pa.types.is_string_view(column.type):
+            column = pa.array(column.to_pylist())  # Arrow has few functions for texts of polars
+        if pa.types.is_floating(column.type):
+            column = pa.array(column.to_numpy(zero_copy_only=False), from_pandas=True)
+        return column
+
+    def numbers(
+        self, kind: str, labels: Sequence[Hashable], count: int | None = None, empty: bool = False
+    ) -> Int[np.ndarray, " rows"]:
+        """Return a column of whole numbers, or of labels as their numbers; −1 where a cell is empty, if it may be."""
+        column = self.column(kind)
+        missing = np.asarray(column.is_null())
+        if not empty:
+            self.check(~missing, self.number, "expected a value, found an empty cell", kind)
+        if len(labels):
+            numbers = self._places(column, labels, kind)
+        else:
+            numbers = self._whole(column, kind)
+            most = "" if count is None else f"…{count - 1}"
+            for row in np.flatnonzero(~missing & ((numbers < 0) | (numbers >= (count or np.inf))))[:1]:
+                message = f"expected a whole number in 0{most or ' and above'}, found {numbers[row]}"
+                raise InputError(message, source="table", row=int(row) + 1, field=self.name(kind))
+        return np.where(missing, _NONE, numbers)
+
+    def _places(self, column: pa.Array, labels: Sequence[Hashable], kind: str) -> Int[np.ndarray, " rows"]:
+        """Return the place of each cell among labels."""
+        known = {label: place for place, label in enumerate(labels)}
+        check(len(known) == len(labels), "expected labels that appear once", source="labels", field=kind)
+        places = {None: _NONE, **known}
+        for row, cell in enumerate(column.to_pylist(), start=1):
+            if cell not in places:
+                message = f"expected one of the labels {_some(labels)}, found {cell!r}"
+                raise InputError(message, source="table", row=row, field=self.name(kind))
+        return np.array([places[cell] for cell in column.to_pylist()], np.int64)
+
+    def _whole(self, column: pa.Array, kind: str) -> Int[np.ndarray, " rows"]:
+        """Return a column of whole numbers, 0 where a cell is empty."""
+        of_type = pa.types.is_integer(column.type) or pa.types.is_floating(column.type) or pa.types.is_null(column.type)
+        message = f"expected whole numbers (or labels=Labels(…) that name them), found {column.type}"
+        check(of_type, message, source="table", field=self.name(kind))
+        filled = np.asarray(pc.fill_null(column, 0) if not pa.types.is_null(column.type) else np.zeros(len(self)))
+        whole = np.isfinite(filled) & (filled == np.round(filled)) & (np.abs(filled) < 2.0**31)
+        for row in np.flatnonzero(~whole)[:1]:
+            message = f"expected a whole number, found {filled[row]}"
+            raise InputError(message, source="table", row=int(row) + 1, field=self.name(kind))
+        return filled.astype(np.int64)
+
+    def weights(self) -> Float[np.ndarray, " rows"]:
+        """Return the weights of moves, 0 where a cell is empty and there is no action."""
+        with input_errors("expected numbers", pa.ArrowException, source="table", field=self.name("weight")):
+            weights = np.asarray(self.column("weight").cast(pa.float64()).fill_null(np.nan))
+        unused = np.isnan(weights) & np.asarray(self.column("action").is_null())
+        weights = np.where(unused, 0.0, weights)
+        valid = np.isfinite(weights) & (weights >= 0)
+        self.check(valid, self.number, "expected a finite number, at least 0", "weight")
+        return weights
+
+
+def _as_arrow(table: Any) -> pa.Table:
+    """Return any table as Arrow's."""
+    if not hasattr(table, "__arrow_c_stream__") and hasattr(table, "__dataframe__"):
+        from pyarrow.interchange import from_dataframe
+
+        return from_dataframe(table)
+    message = "expected a table of pandas, polars, pyarrow or another library with Arrow's PyCapsule interface"
+    with input_errors(message, Exception, source="table"):  # other libraries raise errors of many kinds
+        return pa.table(table)
+
+
+def _stacked(tasks: Task | Sequence[Task]) -> Task:
+    if isinstance(tasks, Task):
+        return tasks if tasks.terminal.ndim == 2 else stack_tasks([tasks])
+    return stack_tasks(tasks)
+
+
+def _walks(rows: _Rows) -> tuple[Int[np.ndarray, " rows"], Int[np.ndarray, " rows"]]:
+    """Return the walk of each row, numbered as they appear, and the rows walk by walk in the order of steps."""
+    walk = np.zeros(len(rows), np.int64)
+    if rows.columns.walk:
+        column = rows.column("walk")
+        rows.check(~np.asarray(column.is_null()), rows.number, "expected a value, found an empty cell", "walk")
+        walk = np.asarray(column.dictionary_encode().indices).astype(np.int64)
+    if not rows.columns.step:
+        return walk, np.argsort(walk, kind="stable")
+    column = rows.column("step")
+    kinds = ("integer", "floating", "temporal", "decimal")
+    ordered = any(getattr(pa.types, f"is_{kind}")(column.type) for kind in kinds)
+    check(ordered, f"expected numbers or times, found {column.type}", source="table", field=rows.name("step"))
+    rows.check(~np.asarray(column.is_null()), rows.number, "expected a value, found an empty cell", "step")
+    rank = np.unique(column.to_numpy(zero_copy_only=False), return_inverse=True)[1]
+    order = np.lexsort((rank, walk))
+    repeated = (np.diff(walk[order], prepend=-1) == 0) & (np.diff(rank[order], prepend=-1) == 0)
+    rows.check(~repeated, rows.number[order], "the walk has another row with the same step", "step")
+    return walk, order
+
+
+def _next_states(
+    rows: _Rows,
+    number: Int[np.ndarray, " rows"],
+    last: Bool[np.ndarray, " rows"],
+    state: Int[np.ndarray, " rows"],
+    action: Int[np.ndarray, " rows"],
+    after: Int[np.ndarray, " rows"],
+) -> Int[np.ndarray, " rows"]:
+    """Return the state after each move; −1 in rows with a final state."""
+    final = action == _NONE
+    below = np.append(state[1:], _NONE)
+    rows.check(last | ~final, number, "expected an action: only the last row of a walk may be without one", "action")
+    first = np.append(True, last[:-1])
+    rows.check(~(first & final), number, "expected at least one move in a walk, found a final state only", "action")
+    rows.check(~(final & (after != _NONE)), number, "a row with a next state needs an action", "action")
+    message = "the last row of a walk needs a next state, or no action where it holds the final state"
+    rows.check(~last | final | (after != _NONE), number, message, "next_state" if rows.columns.next_state else "action")
+    differs = ~last & (after != _NONE) & (after != below)
+    message = "expected the state of the walk's next row"
+    rows.check(~differs, number, message, "next_state")
+    return np.where(last, after, below)
+
+
+def _check_walks(
+    rows: _Rows,
+    number: Int[np.ndarray, " rows"],
+    walk: Int[np.ndarray, " rows"],
+    values: Int[np.ndarray, " rows"],
+    kind: str,
+) -> None:
+    """Raise `InputError` unless a value is the same in all rows of a walk."""
+    changes = (np.diff(walk, prepend=-1) == 0) & (np.diff(values, prepend=_NONE) != 0)
+    rows.check(~changes, number, "expected the same value in all rows of a walk", kind)
+
+
+def _labeled(numbers: Int[np.ndarray, " moves"], labels: Sequence[Hashable], field: str) -> Shaped[np.ndarray, "_"]:
+    """Return the labels of numbers, or the numbers where there are no labels."""
+    if not len(labels):
+        return numbers
+    check(numbers.max() < len(labels), f"expected {numbers.max() + 1} labels, found {len(labels)}", field=field)
+    named = np.empty(len(labels), object)
+    named[:] = labels
+    return named[numbers]
+
+
+def _some(labels: Sequence[Hashable]) -> str:
+    shown = ", ".join(map(repr, labels[:5]))
+    return shown if len(labels) <= 5 else f"{shown}, …"
