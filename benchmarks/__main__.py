@@ -23,6 +23,7 @@ BENCHMARKS = {
     "fits": "large maps end to end: hide walls, simulate walks, learn, score",
     "intervals": "how often 95 % intervals of β, a lapse and three logits cover the truth",
     "rollouts": "roll-outs of continuous worlds: speed, and the noise of gradient estimators",
+    "wind": "wind in the plane learned by roll-outs from actions, beside its exact posterior",
     "enumeration": "the sampler and the mean field against the exact posterior of small worlds",
     "people": "walls learned from real walks in the twelve Tartarus mazes",
     "baselines": "all methods of `sidestep compare`: walls, held-out actions, robots with new goals",

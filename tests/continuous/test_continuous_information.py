@@ -118,7 +118,7 @@ def test_laplace_of_vector_actions_has_the_information_of_a_normal_policy():
     result = sc.fit_dynamics(
         Drift(vector(TRUTH), vector(NOISE)), demos, ss.Behavior(ss.LogSumExp(), beta),
         sc.gaussian_policy(jax.random.key(0), 1, demos.states, depth=0, spread=0.3),
-        sc.Planner(horizon=8, batch_size=16, samples=2, candidates=8, learning_rate=0.03, critic_width=4),
+        sc.Planner(horizon=8, batch_size=16, samples=2, candidates=16, learning_rate=0.03, critic_width=4),
         prior=ss.Normal(0.0, VARIANCE), terms=("actions",), estimator="pathwise",
         schedule=sc.Schedule(iterations=200, policy_warmup=60, batch_size=60, learning_rate=0.02),
     )  # fmt: skip
@@ -146,15 +146,15 @@ def test_laplace_of_linear_dynamics_has_the_covariance_of_least_squares():
 # Refusals
 
 
-def test_laplace_of_a_continuous_fit_before_its_maximum_raises():
-    early = learn(("transitions",), schedule=sc.Schedule(2, learning_rate=1e-3, drift_tolerance=1e3))
-    with pytest.raises(ss.InputError, match=r"standard errors from it \(over the last quarter"):
-        ss.laplace(early)
+def test_laplace_of_a_continuous_fit_away_from_its_maximum_raises():
+    away = eqx.tree_at(lambda fit: fit.dynamics.parameters, fitted(("transitions",)), vector(1.0))
+    with pytest.raises(ss.InputError, match=r"standard errors from it \(the maximum is"):
+        ss.laplace(away)
 
 
 def test_laplace_of_a_continuous_fit_that_has_not_converged_raises():
-    early = learn(("transitions",), schedule=sc.Schedule(2, learning_rate=1e-3, drift_tolerance=1e-9))
-    with pytest.raises(ss.InputError, match="'fit': expected a fit that converged: over the last quarter"):
+    early = learn(("actions",), schedule=sc.Schedule(2, policy_warmup=0, learning_rate=1e-3, distance_tolerance=1e-9))
+    with pytest.raises(ss.InputError, match="'fit': expected a fit that converged: the maximum is"):
         ss.laplace(early)
 
 

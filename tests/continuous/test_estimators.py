@@ -14,7 +14,7 @@ import sidestep as ss
 import sidestep.continuous as sc
 from helpers import small_worlds
 from helpers.small_worlds import ACTIONS, GAIN, OFFSET, PLACES, SPREAD, STATES, TASKS, WHICH, Linear, exact_values
-from sidestep.continuous.estimators import check_estimator, with_control_variates
+from sidestep.continuous.estimators import check_estimator, jackknife, with_control_variates
 from sidestep.continuous.policies import ScaledNetwork
 
 pytestmark = pytest.mark.slow
@@ -108,6 +108,47 @@ def test_value_gradient_score_in_table_is_unbiased_for_any_critic(name, critic):
     critics = {"no": None, "an exact": critic_of(values), "a wrong": critic_of(wrong)}
     sample = drawn(3, MANY, TABLE, BEHAVIORS[name], EVERYWHERE, WEIGHTS, critic=critics[critic])
     assert_agrees(sample, exact, precision=0.03)
+
+
+@eqx.filter_jit
+def quadratic_estimates(keys):
+    """Independent estimates of Σ Q² ∇Q in the table, in rows."""
+    agent = sc.Agent(TABLE.dynamics, TABLE.policy, SOFT)
+
+    def one(key):
+        found, _ = sc.value_gradient(agent, EVERYWHERE, key, jnp.square, horizon=HORIZON, samples=4)
+        return ravel_pytree(found)[0]
+
+    return jax.lax.map(one, keys, batch_size=100)
+
+
+def test_value_gradient_quadratic_weights_of_two_rollouts_are_unbiased():
+    """The jackknife leaves no bias of a quadratic function; without it, the variance of Q̂ would be added to Q²."""
+
+    def total(parameters):
+        pi = small_worlds.policy_table(TABLE.policy)
+        _, q = exact_values(TABLE, parameters, pi, HORIZON, small_worlds.entropies(pi) / BETA)
+        return jnp.sum(q[WHICH, PLACES] ** 3) / 3
+
+    exact = np.asarray(ravel_pytree(jax.grad(total)(TABLE.dynamics.parameters))[0])
+    sample = np.asarray(quadratic_estimates(jax.random.split(jax.random.key(4), 4000)))
+    assert_agrees(sample, exact, precision=0.03)
+
+
+def test_jackknife_of_a_square_subtracts_the_variance_of_the_mean():
+    q = jnp.asarray(np.random.default_rng(3).normal(size=(2, 3, 5)))
+    expected = np.mean(q, axis=-1) ** 2 - np.var(q, axis=-1, ddof=1) / 5
+    np.testing.assert_allclose(jackknife(jnp.square, q), expected)
+    np.testing.assert_allclose(jackknife(jnp.square, q[..., :1]), q[..., 0] ** 2)
+
+
+def test_jackknife_of_a_softmax_has_a_tenth_of_the_bias():
+    values, noise = np.array([0.5, 0.0, -1.0]), np.random.default_rng(4).normal(size=(40_000, 3, 4))
+    q, right = jnp.asarray(values[:, None] + 0.7 * noise), jax.nn.softmax(jnp.asarray(values))
+    plain = jax.nn.softmax(q.mean(axis=-1), axis=1).mean(axis=0) - right
+    corrected = jackknife(lambda mean: jax.nn.softmax(mean, axis=1), q).mean(axis=0) - right
+    assert np.abs(plain).max() > 0.005
+    assert np.abs(corrected).max() < 0.1 * np.abs(plain).max() + 0.001
 
 
 def test_value_gradient_score_error_falls_as_root_of_rollouts():

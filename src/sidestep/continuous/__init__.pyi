@@ -67,7 +67,9 @@ from .planner import (
 )
 from .likelihood import FitProgress as FitProgress, Schedule as Schedule
 from .fit import ContinuousFit as ContinuousFit, fit_dynamics as fit_dynamics
+from .verification import Verification as Verification
 
 # lattices and demonstrations
 from .lattice import Lattice as Lattice, LatticePlanner as LatticePlanner
+from .oracle import LatticeComparison as LatticeComparison, compare_with_lattice as compare_with_lattice
 from .simulation import gather_trajectories as gather_trajectories, simulate_trajectories as simulate_trajectories

@@ -28,6 +28,7 @@ from sidestep.continuous.likelihood import FitProblem, FitProgress, Schedule
 from sidestep.continuous.planner import Planner, PlannerState, plan_policy
 from sidestep.continuous.policies import Agent, SomePolicy
 from sidestep.continuous.tasks import task_at
+from sidestep.continuous.verification import Verification, verify
 from sidestep.errors import NotConverged, check
 from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
 from sidestep.inference.priors import Normal, Prior
@@ -39,6 +40,10 @@ if TYPE_CHECKING:
     from sidestep.continuous.information import RolloutInformation
 
 Family = TypeVar("Family", bound=Dynamics)
+_NEWTON_STEPS = 3
+"""The most steps by which a fit is refined."""
+_NOISE_OF_STEPS = 1.5
+"""The noise of a step, as a multiple of that of the last verification: the steps' noise averages out."""
 
 
 @short_repr("dynamics", "planner_state", "problem", "message", "converged")
@@ -46,23 +51,20 @@ class ContinuousFit(eqx.Module, Generic[Family, SomePolicy]):
     """The result of a fit.
 
     Attributes:
-        dynamics: The family at the mean of θ over the last quarter of the iterations.
+        dynamics: The family at the learned θ.
         planner_state: The agent's policy, its critic and their optimizers.
         problem: What was maximized: demonstrations, prior, settings; with the dynamics and policy at the start.
         history: A `FitProgress` an iteration.
-        drift: The largest distance, over parameters, between the means of θ over the last eighth and over the eighth
-            before; as a fraction of the distance that steps of the full learning rate in one direction would give.
-        policy_gap: The policy's, on average over the last quarter.
-        converged: Whether drift and policy gap are within the tolerances of the schedule.
-        message: The values of both.
+        verification: How far θ is from the maximum, by independent rollouts.
+        converged: Whether the verification's figures are within the tolerances of the schedule.
+        message: These figures.
     """
 
     dynamics: Family
     planner_state: PlannerState[SomePolicy]
     problem: FitProblem
     history: tuple[FitProgress, ...] = eqx.field(static=True)
-    drift: float = eqx.field(static=True)
-    policy_gap: float = eqx.field(static=True)
+    verification: Verification
     converged: bool = eqx.field(static=True)
     message: str = eqx.field(static=True)
 
@@ -88,13 +90,13 @@ class ContinuousFit(eqx.Module, Generic[Family, SomePolicy]):
 class _State(eqx.Module):
     """The state that a fit carries from iteration to iteration.
 
-    `sums` are of θ: over the last quarter of the iterations but its second half, and over that half.
+    `total` is the sum of θ over the last quarter of the iterations.
     """
 
     parameters: FloatTree
     moments: Tree
     planner_state: Tree
-    sums: Float[Array, "2 parameters"]
+    total: Float[Array, " parameters"]
 
 
 def fit_dynamics(
@@ -165,7 +167,7 @@ def fit_dynamics(
         saver.save(eqx.filter(state, eqx.is_array), history)
         if report:
             report(history[-1], dynamics.with_parameters(state.parameters))
-    return _result(problem, state, history)
+    return _refined(problem, state, history, jax.random.fold_in(key, schedule.iterations))
 
 
 def problem_fingerprint(problem: Tree) -> str:
@@ -186,8 +188,8 @@ def _initialize(problem: FitProblem, key: PRNGKeyArray) -> _State:
     demos, parameters = problem.demonstrations, problem.agent.dynamics.parameters
     planner_state = problem.planner.initialize(key, problem.agent, task_at(demos.tasks, demos.task), demos.states)
     flat = jax.eval_shape(lambda: ravel_pytree(parameters)[0])
-    sums = jax.device_put(np.zeros((2, *flat.shape), flat.dtype))
-    return _State(parameters, problem.schedule.adam().init(parameters), planner_state, sums)
+    total = jax.device_put(np.zeros(flat.shape, flat.dtype))
+    return _State(parameters, problem.schedule.adam().init(parameters), planner_state, total)
 
 
 @eqx.filter_jit
@@ -195,42 +197,55 @@ def _step(problem: FitProblem, state: _State, key: PRNGKeyArray, iteration: Arra
     """Make one step of the policy, its critic and the model."""
     schedule, planner_state = problem.schedule, state.planner_state
     model_key, *policy_keys = jax.random.split(key, schedule.policy_steps)
+    fraction = schedule.fraction(iteration)
     if "actions" in problem.terms:
         for policy_key in policy_keys:
-            planner_state = problem.improve_policy(state.parameters, planner_state, policy_key)
-    planner_state, slope, numbers = problem.objective_gradient(state.parameters, planner_state, model_key)
+            planner_state = problem.improve_policy(state.parameters, planner_state, policy_key, fraction)
+    planner_state, slope, numbers = problem.objective_gradient(state.parameters, planner_state, model_key, fraction)
     step, moments = schedule.adam().update(slope, state.moments)
     parameters = optax.apply_updates(state.parameters, step)
-    begin, middle, end = _last_quarter(schedule)
-    within = jnp.stack([(begin <= iteration) & (iteration < middle), (middle <= iteration) & (iteration < end)])
-    sums = state.sums + within[:, None] * ravel_pytree(parameters)[0]
-    return _State(parameters, moments, planner_state, sums), numbers
+    late = iteration >= schedule.iterations - _last_quarter(schedule)
+    total = state.total + late * ravel_pytree(parameters)[0]
+    return _State(parameters, moments, planner_state, total), numbers
 
 
-def _last_quarter(schedule: Schedule) -> tuple[int, int, int]:
-    """Return the first iterations of the last two eighths, and their end."""
-    eighth = max(1, schedule.iterations // 8)
-    return max(0, schedule.iterations - 2 * eighth), schedule.iterations - eighth, schedule.iterations
+def _last_quarter(schedule: Schedule) -> int:
+    """Return the number of the iterations in the last quarter."""
+    return max(1, schedule.iterations // 4)
 
 
-def _result(problem: FitProblem, state: _State, history: list[FitProgress]) -> ContinuousFit:
+def _refined(problem: FitProblem, state: _State, history: list[FitProgress], key: PRNGKeyArray) -> ContinuousFit:
+    """Return the result, after Newton steps from the mean of θ over the last quarter of the iterations.
+
+    The k-th step goes one part of k + 1, so that the noise of all of them averages out (Robbins and Monro 1951); but
+    one that is much longer than its noise goes the whole way. Each has rollouts of its own, and so has the last
+    verification, which no step follows.
+    """
     schedule = problem.schedule
-    learned, drift = _mean_and_drift(schedule, problem.agent.dynamics, state)
-    gap = float(np.mean([progress.policy_gap for progress in history[_last_quarter(schedule)[0] :]]))
-    converged = bool(drift <= schedule.drift_tolerance) and abs(gap) <= schedule.policy_gap_tolerance
-    message = (
-        f"over the last quarter parameters drifted by up to {drift:.2g} of what their steps allow (tolerance "
-        f"{schedule.drift_tolerance:g}), and the policy gap was {gap:.2g} (tolerance {schedule.policy_gap_tolerance:g})"
-    )
-    return ContinuousFit(learned, state.planner_state, problem, tuple(history), float(drift), gap, converged, message)
+    flat, to_parameters = ravel_pytree(state.parameters)
+    flat = np.asarray(state.total, np.float64) / _last_quarter(schedule)
+    planner_state, step = state.planner_state, 0
+    while True:
+        dynamics = problem.agent.dynamics.with_parameters(to_parameters(jnp.asarray(flat, state.total.dtype)))
+        policy_key, rollout_key = jax.random.split(jax.random.fold_in(key, step))
+        if "actions" in problem.terms:
+            for iteration in range(_last_quarter(schedule) // 2):
+                inner = jax.random.fold_in(policy_key, iteration)
+                planner_state = _follow(problem, dynamics.parameters, planner_state, inner)
+        last = step == _NEWTON_STEPS
+        noise = schedule.noise_tolerance * (1.0 if last else _NOISE_OF_STEPS)
+        verified = verify(problem, dynamics, planner_state, rollout_key, noise=noise)
+        near = verified.distance <= schedule.distance_tolerance / 3 and verified.noise <= schedule.noise_tolerance
+        if near or last:
+            break
+        step += 1
+        flat = flat + verified.step * (1.0 if verified.distance > 2 * verified.noise else 1 / (step + 1))
+    converged, message = verified.passes(schedule), verified.message(schedule)
+    return ContinuousFit(dynamics, planner_state, problem, tuple(history), verified, converged, message)
 
 
 @eqx.filter_jit
-def _mean_and_drift(schedule: Schedule, dynamics: Dynamics, state: _State) -> tuple[Dynamics, Array]:
-    """Return the dynamics at the mean of θ over the last quarter of the iterations, and the drift of θ."""
-    begin, middle, end = _last_quarter(schedule)
-    flat, to_parameters = ravel_pytree(state.parameters)
-    former, latter = state.sums / jnp.asarray([[middle - begin], [end - middle]], flat.dtype)
-    distance = jnp.cumsum(schedule.rate()(jnp.arange(end)))
-    possible = distance[middle:end].mean() - distance[begin:middle].mean()
-    return dynamics.with_parameters(to_parameters((former + latter) / 2)), jnp.abs(latter - former).max() / possible
+def _follow(problem: FitProblem, parameters: FloatTree, state: Tree, key: PRNGKeyArray) -> Tree:
+    """Make one step of the policy and its critic, at the rates of the last iteration."""
+    last = jnp.asarray(problem.schedule.iterations)
+    return problem.improve_policy(parameters, state, key, problem.schedule.fraction(last))

@@ -15,42 +15,26 @@ from the agent's, values and errors are wrong together.
 """
 
 from dataclasses import replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from sidestep._typing import FloatTree, Tree
 from sidestep.continuous.dynamics import Dynamics
-from sidestep.continuous.estimators import sample_surrogates
-from sidestep.continuous.likelihood import ActionLikelihood, FitProblem
+from sidestep.continuous.halves import gather_halves
+from sidestep.continuous.likelihood import FitProblem
 from sidestep.continuous.planner import PlannerState
-from sidestep.continuous.policies import Agent, FinitePolicy, Starts
-from sidestep.continuous.rollouts import q_estimates
-from sidestep.continuous.tasks import task_at
 from sidestep.errors import check, check_count
 from sidestep.inference.information import Information, Simulation, Vectors
 from sidestep.inference.normal_posterior import Laplace
 from sidestep.inference.objective import Parameters
 from sidestep.tabular.backups import BoltzmannAverage
 from sidestep.tabular.behavior_model import BehaviorParameters
-
-_ROLLOUTS = 2**13
-"""The most rollouts at a time, for their memory."""
-
-
-class _Halves(NamedTuple):
-    """What the two halves of the rollouts say of some moves.
-
-    `factors` are √π β (∇Q − Σ π ∇Q) of every candidate, `scores` the gradients of ln π of the observed choices.
-    """
-
-    factors: Float[Array | np.ndarray, "2 moves candidates parameters"]
-    scores: Float[Array | np.ndarray, "2 moves parameters"]
 
 
 class RolloutInformation(Information):
@@ -92,8 +76,9 @@ class RolloutInformation(Information):
         self.parameters: Parameters = Parameters(dynamics.parameters, BehaviorParameters())
         self.message: str = message
         self._problem = problem
-        exact = np.asarray(ravel_pytree(_slope(problem, dynamics.parameters))[0], np.float64)
-        halves = _halves(problem, dynamics, planner_state, samples, seed) if uses_actions else _nothing(len(exact))
+        exact = rollout_free_slope(problem, dynamics.parameters)
+        data = problem, dynamics, planner_state, samples, seed
+        halves = _factors_and_scores(*data) if uses_actions else _nothing(len(exact))
         self._factors, self._scores = (np.asarray(part, np.float64) for part in halves)
         self.gradient: Float[np.ndarray, " parameters"] = self._scores.mean(axis=0).sum(axis=0) - exact
 
@@ -105,7 +90,7 @@ class RolloutInformation(Information):
         """
         first, second = self._factors.reshape(2, -1, self.size)
         of_actions = (vectors @ first.T) @ second + (vectors @ second.T) @ first
-        return _products(self._problem, self.parameters.model, vectors) + of_actions / 2
+        return rollout_free_products(self._problem, self.parameters.model, vectors) + of_actions / 2
 
     def of_prior(self, vectors: Vectors) -> Vectors:
         """Return the products with the prior's part of H alone.
@@ -113,7 +98,7 @@ class RolloutInformation(Information):
         Args:
             vectors: One a row.
         """
-        return _products(replace(self._problem, terms=("actions",)), self.parameters.model, vectors)
+        return rollout_free_products(replace(self._problem, terms=("actions",)), self.parameters.model, vectors)
 
     def simulation(self, normal: Laplace) -> Simulation:
         """Return the errors by rollouts.
@@ -131,70 +116,26 @@ class RolloutInformation(Information):
         return Simulation(float(errors.max(initial=0.0)), squared_distance)
 
 
-def _nothing(size: int) -> _Halves:
-    return _Halves(jnp.zeros((2, 0, 0, size)), jnp.zeros((2, 0, size)))
+def _nothing(size: int) -> tuple[Array, Array]:
+    return jnp.zeros((2, 0, 0, size)), jnp.zeros((2, 0, size))
 
 
-def _halves(
+def _factors_and_scores(
     problem: FitProblem, dynamics: Dynamics, planner_state: PlannerState[Any], samples: int, seed: int
-) -> _Halves:
-    """Return what both halves of the rollouts say of all moves, computed batch by batch."""
-    agent = replace(problem.agent, dynamics=dynamics, policy=planner_state.policy)
-    policy, count = agent.policy, len(problem.demonstrations)
-    candidates = len(policy.actions) if isinstance(policy, FinitePolicy) else 1 + problem.planner.candidates
-    size = min(count, max(1, _ROLLOUTS // (samples * candidates)))
-    moves = np.resize(np.arange(count), (-(-count // size), size))  # the last batch is filled up with the first moves
-    keys = jax.random.split(jax.random.key(seed), len(moves))
-    parts = [
-        _batch_halves(problem, agent, planner_state, key, jnp.asarray(batch), samples)
-        for key, batch in zip(keys, moves, strict=True)
-    ]
-    return _Halves(*(np.concatenate(leaves, axis=1)[:, :count] for leaves in zip(*parts, strict=True)))
+) -> tuple[np.ndarray, np.ndarray]:
+    batches = list(gather_halves(problem, dynamics, planner_state, samples, jax.random.key(seed)))
+    factors, scores = (np.concatenate(parts, axis=1) for parts in zip(*(each[:2] for each in batches), strict=True))
+    return factors, scores
 
 
-@eqx.filter_jit
-def _batch_halves(
-    problem: FitProblem,
-    agent: Agent[Any],
-    planner_state: PlannerState[Any],
-    key: PRNGKeyArray,
-    moves: Array,
-    samples: int,
-) -> _Halves:
-    demos, planner = problem.demonstrations, problem.planner
-    choice_key, rollout_key = jax.random.split(key)
-    tasks, states, observed = task_at(demos.tasks, demos.task[moves]), demos.states[moves], demos.actions[moves]
-    drawn, probabilities = planner.candidate_actions(choice_key, agent.policy, tasks, states)
-    likelihood = ActionLikelihood(agent, Starts(tasks, states, drawn), observed)
-    starts, _ = likelihood.candidates(probabilities)
-    half = samples // 2
+def rollout_free_slope(problem: FitProblem, parameters: FloatTree) -> Float[np.ndarray, " parameters"]:
+    """Return the gradient of minus the transitions' term and the prior.
 
-    def of_candidate(task: Tree, state: Array, choice: Array, key: PRNGKeyArray) -> tuple[Array, Array]:
-        """Return ∇Q and Q of both halves of the rollouts."""
-        start = Starts(jax.tree.map(lambda leaf: leaf[None], task), state[None], choice[None, None])
-        size = {"horizon": planner.horizon, "samples": 2 * half}
-
-        def means(parameters: FloatTree) -> tuple[Array, Array]:
-            surrogates, rollouts = sample_surrogates(
-                agent, parameters, start, key, planner_state.critic, problem.estimator, **size
-            )
-            return surrogates.reshape(2, half).mean(axis=1), q_estimates(rollouts)[..., 0].reshape(2, half).mean(axis=1)
-
-        slopes, q = jax.jacrev(means, has_aux=True)(agent.dynamics.parameters)
-        return jax.vmap(lambda slope: ravel_pytree(slope)[0])(slopes), q
-
-    # the candidates of one start share their random numbers
-    of_start = jax.vmap(of_candidate, (None, None, 0, None))
-    keys = jax.random.split(rollout_key, len(moves))
-    by_candidate = jax.vmap(of_start)(starts.tasks, starts.states, starts.choices, keys)
-    slopes, q = (jnp.moveaxis(leaf, 2, 0) for leaf in by_candidate)  # the halves first
-    pi = likelihood.probabilities(q.mean(axis=0))[..., None]
-    # drawn choices have less spread than the policy, by the part that each has in their mean
-    drawn_again = 0.0 if isinstance(agent.policy, FinitePolicy) else jnp.sum(pi**2, axis=1, keepdims=True)
-    beyond = slopes - jnp.sum(pi * slopes, axis=2, keepdims=True)
-    factors = agent.behavior.beta * jnp.sqrt(pi / (1 - drawn_again)) * beyond
-    weights = jnp.stack([likelihood.weights(each) for each in q[::-1]])  # each half has the weights of the other
-    return _Halves(factors, jnp.sum(weights[..., None] * slopes, axis=2))
+    Args:
+        problem: The problem.
+        parameters: θ.
+    """
+    return np.asarray(ravel_pytree(_slope(problem, parameters))[0], np.float64)
 
 
 @eqx.filter_jit
@@ -204,8 +145,14 @@ def _slope(problem: FitProblem, parameters: FloatTree) -> Tree:
     return jax.grad(lambda parameters: problem.rollout_free_loss(parameters, moves)[0])(parameters)
 
 
-def _products(problem: FitProblem, parameters: FloatTree, vectors: Vectors) -> Vectors:
-    """Return the products of vectors with the information of transitions and prior."""
+def rollout_free_products(problem: FitProblem, parameters: FloatTree, vectors: Vectors) -> Vectors:
+    """Return the products of vectors with the information of transitions and prior.
+
+    Args:
+        problem: The problem.
+        parameters: θ.
+        vectors: One a row.
+    """
     flat, unravel = ravel_pytree(parameters)
     directions = jax.vmap(unravel)(jnp.asarray(vectors, flat.dtype))
     leaves = jax.tree.leaves(_slope_changes(problem, parameters, directions))

@@ -124,6 +124,14 @@ class LatticePlanner(eqx.Module):
     behavior: Behavior
     lattice: Lattice
 
+    def landing(self, mean: Vector) -> tuple[Int[Array, " landing"], Float[Array, " landing"]]:
+        """Return the points where an outcome leads, and their probabilities: those of interpolation, without its noise.
+
+        Args:
+            mean: The mean next state of the outcome.
+        """
+        return self.lattice.interpolation_weights(mean)
+
     def tabular_model(self) -> TabularModel:
         """Return the transition model of the lattice over the world.
 
@@ -139,7 +147,7 @@ class LatticePlanner(eqx.Module):
 
         def outcomes(state: Vector, action: Array) -> tuple[Array, Array]:
             log_probabilities, means = self.dynamics.outcomes(state, action)
-            points, weights = jax.vmap(self.lattice.interpolation_weights)(means)
+            points, weights = jax.vmap(self.landing)(means)
             return points.ravel(), (jnp.exp(log_probabilities)[:, None] * weights).ravel()
 
         at_points = jax.vmap(jax.vmap(outcomes, (None, 0)), (0, None))
@@ -175,7 +183,8 @@ class LatticePlanner(eqx.Module):
 
         def value(action: Array) -> Array:
             log_probabilities, means = self.dynamics.outcomes(state, action)
-            after = jax.vmap(lambda place: self.lattice.interpolate(values, place))(means)
+            points, weights = jax.vmap(self.landing)(means)
+            after = jnp.sum(values[points] * weights, axis=1)
             return task.reward(state, action) + task.discount * jnp.exp(log_probabilities) @ after
 
         return jax.vmap(value)(self.actions)

@@ -70,8 +70,11 @@ class Schedule(eqx.Module):
         batch_size: Demonstrated moves of a step.
         learning_rate: That of Adam, in units of θ; it falls to a twentieth along a cosine.
         policy_steps: Steps of the policy for each of the model's, one of them with the model's own rollouts.
-        drift_tolerance: The largest drift of a converged fit.
+        distance_tolerance: The largest distance of a converged fit from the maximum, in posterior standard deviations,
+            as `Verification` has it; the noise of this distance may be two thirds of it.
         policy_gap_tolerance: The largest policy gap of a converged fit, on either side of 0.
+        verification_samples: The most rollouts of each candidate of each move that verify the end of a fit, 8 or more;
+            as few are taken as make the noise small enough.
 
     Raises:
         InputError: For counts that are too small, and rates or tolerances not above 0.
@@ -81,24 +84,38 @@ class Schedule(eqx.Module):
         0.05
     """
 
-    iterations: int = eqx.field(default=400, static=True)
-    policy_warmup: int = eqx.field(default=200, static=True)
+    iterations: int = eqx.field(default=300, static=True)
+    policy_warmup: int = eqx.field(default=150, static=True)
     batch_size: int = eqx.field(default=32, static=True)
     learning_rate: float = eqx.field(default=0.05, static=True)
     policy_steps: int = eqx.field(default=1, static=True)
-    drift_tolerance: float = eqx.field(default=0.5, static=True)
+    distance_tolerance: float = eqx.field(default=0.75, static=True)
     policy_gap_tolerance: float = eqx.field(default=0.1, static=True)
+    verification_samples: int = eqx.field(default=256, static=True)
 
     def __check_init__(self):
-        # the drift is a difference between two iterations or more
-        for name, least in {"iterations": 2, "policy_warmup": 0, "batch_size": 1, "policy_steps": 1}.items():
-            check_count(getattr(self, name), least, name)
-        for name in ("learning_rate", "drift_tolerance", "policy_gap_tolerance"):
+        least = {"iterations": 2, "policy_warmup": 0, "batch_size": 1, "policy_steps": 1, "verification_samples": 8}
+        for name, count in least.items():
+            check_count(getattr(self, name), count, name)
+        for name in ("learning_rate", "distance_tolerance", "policy_gap_tolerance"):
             check_positive(getattr(self, name), name)
+
+    @property
+    def noise_tolerance(self) -> float:
+        """The largest noise of the distance of a converged fit."""
+        return self.distance_tolerance * 2 / 3
 
     def rate(self) -> optax.Schedule:
         """Return the learning rate as a function of the iteration."""
         return optax.cosine_decay_schedule(self.learning_rate, self.iterations, alpha=0.05)
+
+    def fraction(self, iteration: Int[Array, ""]) -> Float[Array, ""]:
+        """Return the rate of an iteration as a fraction of the first one's; the policy's and the critic's fall with it.
+
+        Args:
+            iteration: Its number, from 0.
+        """
+        return jnp.asarray(self.rate()(iteration)) / self.learning_rate
 
     def adam(self) -> optax.GradientTransformation:
         """Return the model's optimizer; with β₂ = 0.99 it forgets the rare large gradients of rollouts quickly."""
@@ -142,22 +159,25 @@ class FitProblem(eqx.Module):
         message = f"expected a density above 0 for every transition, found the logarithm {densities[move]}"
         check(not wrong.any(), message, source=f"trajectory {which[move] + 1}", field="log_prob")
 
-    def improve_policy(self, parameters: Tree, state: PlannerState[Any], key: PRNGKeyArray) -> PlannerState[Any]:
+    def improve_policy(
+        self, parameters: Tree, state: PlannerState[Any], key: PRNGKeyArray, fraction: Float[Array, ""]
+    ) -> PlannerState[Any]:
         """Make a step of the policy and its critic by rollouts from a batch of moves; the model stays the same.
 
         Args:
             parameters: θ.
             state: The policy, its critic and their optimizers.
             key: Draws everything random.
+            fraction: Of the learning rates of policy and critic.
 
         Returns:
             The next state of policy and critic.
         """
         batch_key, rollout_key = jax.random.split(key)
-        return self._action_terms(parameters, state, self._draw_moves(batch_key), rollout_key)[0]
+        return self._action_terms(parameters, state, self._draw_moves(batch_key), rollout_key, fraction)[0]
 
     def objective_gradient(
-        self, parameters: Tree, state: PlannerState[Any], key: PRNGKeyArray
+        self, parameters: Tree, state: PlannerState[Any], key: PRNGKeyArray, fraction: Float[Array, ""]
     ) -> tuple[PlannerState[Any], Tree, FitProgress]:
         """Estimate the gradient of minus the objective from one batch of moves.
 
@@ -165,6 +185,7 @@ class FitProblem(eqx.Module):
             parameters: θ.
             state: The policy, its critic and their optimizers.
             key: Draws everything random.
+            fraction: Of the learning rates of policy and critic.
 
         Returns:
             The next state of the planner, the gradient, and the figures of the fit.
@@ -178,7 +199,7 @@ class FitProblem(eqx.Module):
         actions = zero = jnp.zeros_like(prior)
         figures = zero, zero, zero
         if "actions" in self.terms:
-            state, action_slope, actions, plan = self._action_terms(parameters, state, moves, rollout_key)
+            state, action_slope, actions, plan = self._action_terms(parameters, state, moves, rollout_key, fraction)
             slope = jax.tree.map(jnp.add, slope, action_slope)
             figures = plan.expected_return, plan.entropy, plan.policy_gap
         values = transitions + prior + actions, actions, transitions, prior
@@ -203,7 +224,7 @@ class FitProblem(eqx.Module):
         return -(transitions + prior), (transitions, prior)
 
     def _action_terms(
-        self, parameters: Tree, state: PlannerState[Any], moves: _Moves, key: PRNGKeyArray
+        self, parameters: Tree, state: PlannerState[Any], moves: _Moves, key: PRNGKeyArray, fraction: Array
     ) -> tuple[PlannerState[Any], Tree, Array, PlanProgress]:
         """Estimate the actions' term by rollouts from the states of a batch of moves.
 
@@ -221,7 +242,7 @@ class FitProblem(eqx.Module):
         size = {"horizon": planner.horizon, "samples": planner.samples}
         method = {"critic": state.critic, "estimator": self.estimator}
         gradient, rollouts = value_gradient(agent, starts, rollout_key, likelihood.weights, **size, **method)
-        improved, progress = planner.update(state, agent.behavior, rollouts, probabilities)
+        improved, progress = planner.update(state, agent.behavior, rollouts, probabilities, fraction)
         q, scale = q_estimates(rollouts)[..., 0].mean(axis=-1), len(demos) / len(moves)
         slope = jax.tree.map(lambda leaf: -scale * leaf, gradient)
         return improved, slope, scale * likelihood.log_probs(q).sum(), progress

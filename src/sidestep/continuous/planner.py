@@ -32,7 +32,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Int, PRNGKeyArray, Shaped
+from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
 
 from sidestep._typing import Tree
 from sidestep.continuous.dynamics import PerCandidate, PerSample, Real, check_finite
@@ -52,7 +52,7 @@ class PlanProgress(NamedTuple):
         expected_return: The mean of Σ γ^i R_i over the starts.
         gradient: The norm of the policy's gradient, in units of reward.
         entropy: The mean over the starts, in nats.
-        policy_gap: The gap between the policy and its own Q estimates (`policy_gap`). It is near 0 for
+        policy_gap: The gap between the policy and its own Q estimates (`policy_gaps`). It is near 0 for
             a converged policy; noise is subtracted, so it can be below 0.
     """
 
@@ -85,7 +85,7 @@ class Planner(eqx.Module):
     Attributes:
         horizon: τ, the number of moves of a rollout, 1 or more.
         batch_size: The starts of a step. (The iterations of a fit use `Schedule.batch_size` instead.)
-        samples: Rollouts of each candidate action, 2 or more, because `policy_gap` compares halves of them.
+        samples: Rollouts of each candidate action, 2 or more, because `policy_gaps` compares halves of them.
         candidates: Candidate actions of each start where actions are vectors; of a finite set, all are tried.
         learning_rate: That of Adam, for the policy.
         critic_rate: That of Adam, for the critic.
@@ -104,7 +104,7 @@ class Planner(eqx.Module):
     batch_size: int = eqx.field(default=32, static=True)
     samples: int = eqx.field(default=4, static=True)
     candidates: int = eqx.field(default=8, static=True)
-    learning_rate: float = eqx.field(default=3e-3, static=True)
+    learning_rate: float = eqx.field(default=1e-2, static=True)
     critic_rate: float = eqx.field(default=1e-2, static=True)
     critic_width: int = eqx.field(default=64, static=True)
     critic_steps: int = eqx.field(default=8, static=True)
@@ -164,7 +164,12 @@ class Planner(eqx.Module):
         return choices, jnp.full(choices.shape[:2], 1 / self.candidates, features.dtype)
 
     def update(
-        self, state: PlannerState[SomePolicy], behavior: Behavior, rollouts: Rollout, probabilities: PerCandidate
+        self,
+        state: PlannerState[SomePolicy],
+        behavior: Behavior,
+        rollouts: Rollout,
+        probabilities: PerCandidate,
+        fraction: Real | float = 1.0,
     ) -> tuple[PlannerState[SomePolicy], PlanProgress]:
         """Make one step with the policy and several with its critic.
 
@@ -173,6 +178,7 @@ class Planner(eqx.Module):
             behavior: The agent's backup and β.
             rollouts: With axes (starts, candidates, samples).
             probabilities: Those of the candidates, from `candidate_actions`.
+            fraction: Of both learning rates, in (0, 1].
 
         Returns:
             The next state, and the figures of the policy before the step.
@@ -180,14 +186,15 @@ class Planner(eqx.Module):
         policy, critic = state.policy, state.critic
         gradient = policy_gradient(policy, critic, rollouts, probabilities)
         step, policy_moments = optax.adam(self.learning_rate).update(gradient, state.policy_moments)
+        step = jax.tree.map(lambda leaf: fraction * leaf, step)
         adam = optax.adam(self.critic_rate)
-        critic, critic_moments = fit_critic(critic, adam, state.critic_moments, rollouts, self.critic_steps)
+        critic, critic_moments = fit_critic(critic, adam, state.critic_moments, rollouts, self.critic_steps, fraction)
         after = PlannerState(eqx.apply_updates(policy, step), critic, policy_moments, critic_moments)
         expected_return = jnp.sum(probabilities * discounted_returns(rollouts).mean(axis=-1), axis=1).mean()
         tasks = jax.tree.map(lambda leaf: leaf[:, 0, 0], rollouts.task)
         entropy = jax.vmap(policy.entropy)(task_features(tasks, rollouts.states[:, 0, 0, 0])).mean()
         advantages = rollouts.policy_advantages(policy)[..., 0, 0]
-        gap = policy_gap(behavior, advantages, q_estimates(rollouts)[..., 0], probabilities)
+        gap = policy_gaps(behavior, advantages, q_estimates(rollouts)[..., 0], probabilities).mean()
         figures = expected_return, optax.tree.norm(gradient), entropy, gap
         return after, PlanProgress(0, *figures)  # pyright: ignore[reportArgumentType]
 
@@ -349,7 +356,12 @@ def policy_gradient(policy: Policy, critic: Critic, rollouts: Rollout, probabili
 
 
 def fit_critic(
-    critic: Critic, optimizer: optax.GradientTransformation, moments: Tree, rollouts: Rollout, steps: int
+    critic: Critic,
+    optimizer: optax.GradientTransformation,
+    moments: Tree,
+    rollouts: Rollout,
+    steps: int,
+    fraction: Real | float = 1.0,
 ) -> tuple[Critic, Tree]:
     """Regress a critic on returns-to-go, one step of the optimizer for each of `steps` minibatches.
 
@@ -362,6 +374,7 @@ def fit_critic(
         moments: Its state.
         rollouts: One rollout or, with leading axes, many.
         steps: The number of steps, 1 or more.
+        fraction: Of the learning rate, in (0, 1].
 
     Returns:
         The critic and the state of the optimizer.
@@ -381,6 +394,7 @@ def fit_critic(
     def step(carry: tuple[Tree, Tree], batch: tuple[Array, Array, Array, Array]) -> tuple[tuple, None]:
         learned, moments = carry
         change, moments = optimizer.update(jax.grad(loss)(learned, *batch), moments)
+        change = jax.tree.map(lambda leaf: fraction * leaf, change)
         return (optax.apply_updates(learned, change), moments), None
 
     (learned, moments), _ = jax.lax.scan(step, (learned, moments), batches)
@@ -407,8 +421,10 @@ def minibatches(
     return jnp.swapaxes(flat[: size * count].reshape(size, count, *leaf.shape[4:]), 0, 1)
 
 
-def policy_gap(behavior: Behavior, advantages: PerCandidate, q: PerSample, probabilities: PerCandidate) -> Real:
-    """Return the mean gap between a policy and its own Q estimates.
+def policy_gaps(
+    behavior: Behavior, advantages: PerCandidate, q: PerSample, probabilities: PerCandidate
+) -> Float[Array, " starts"]:
+    """Return the gap between a policy and its own Q estimates, for each start.
 
     For soft agents it is the divergence of π_λ from exp βQ̂ in nats, for optimal ones the gain of the best action in
     units of reward. Two independent halves of the samples give the noise of Q̂, which is subtracted.
@@ -420,13 +436,13 @@ def policy_gap(behavior: Behavior, advantages: PerCandidate, q: PerSample, proba
         probabilities: Those of the candidates, which add up to 1 for each start.
 
     Returns:
-        A single number, in nats or units of reward.
+        A number for each start, in nats or units of reward.
     """
     half = q.shape[-1] // 2
     halves = q[..., :half].mean(axis=-1), q[..., -half:].mean(axis=-1)
     if isinstance(behavior.backup, HardMax):
         best = jnp.take_along_axis(halves[1], halves[0].argmax(axis=1)[:, None], axis=1)[:, 0]
-        return (best - jnp.sum(probabilities * halves[1], axis=1)).mean()
+        return best - jnp.sum(probabilities * halves[1], axis=1)
 
     # with d = q_λ − βQ̂ the divergence is E d + ln E exp(−d)
     difference = advantages - behavior.beta * (halves[0] + halves[1]) / 2
@@ -435,7 +451,7 @@ def policy_gap(behavior: Behavior, advantages: PerCandidate, q: PerSample, proba
     # noise in Q̂ adds half its variance under π
     noise = behavior.beta * (halves[0] - halves[1]) / 2
     noise = noise - jnp.sum(probabilities * noise, axis=1, keepdims=True)
-    return (divergence - 0.5 * jnp.sum(probabilities * noise**2, axis=1)).mean()
+    return divergence - 0.5 * jnp.sum(probabilities * noise**2, axis=1)
 
 
 def check_starts(states: States, task: Int[Array, " starts"], tasks: ContinuousTask) -> None:
