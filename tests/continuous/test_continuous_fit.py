@@ -370,7 +370,7 @@ FIRST_BACK = int(np.argmax(CHOICES == 0)) + 1
     ({"demonstrations": changed(states=NAN)}, "states, row 5: expected finite numbers"),
     ({"demonstrations": changed(task=DEMONSTRATIONS.task.at[1].set(1))}, r"'task': expected tasks in 0…0"),
     ({"demonstrations": with_tasks(eqx.tree_at(lambda task: task.discount, NEAR, jnp.asarray(0.0)))},
-     "'discount': expected a number above 0 and at most 1, found 0"),
+     "'discount': expected a finite number above 0 and at most 1, found 0"),
     ({"dynamics": broken(jnp.nan)}, f"trajectory {FIRST_BACK}, field 'log_prob': .* found the logarithm nan"),
     ({"dynamics": broken(-jnp.inf)}, "'log_prob': expected a density above 0 .* found the logarithm -inf"),
     ({"dynamics": Drift(vector(jnp.nan), vector(NOISE))}, "'parameters': expected finite numbers"),

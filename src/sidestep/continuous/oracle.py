@@ -113,11 +113,12 @@ def compare_with_lattice(fit: ContinuousFit[Any, Any], lattice: Lattice) -> Latt
     check((ratio >= 1 / 1.5).all(), message, field="lattice")
     reach = tuple(int(count) for count in np.ceil(3 * ratio))
     planner = NoisyPlanner(dynamics, policy.actions, problem.agent.behavior, lattice, reach)
+    world = planner.tabular_model().graph
     total, slope = 0.0, -rollout_free_slope(problem, dynamics.parameters)
     for index in np.unique(np.asarray(demos.task)):
         own = np.flatnonzero(np.asarray(demos.task) == index)
         task = task_at(demos.tasks, int(index))
-        check_proper(planner.tabular_task(task), planner.behavior, len(policy.actions))
+        check_proper(planner.tabular_task(task), planner.behavior, world)
         value, gradient, converged = _log_likelihood(
             dynamics.parameters, planner, task, demos.states[own], demos.actions[own]
         )
