@@ -109,7 +109,7 @@ def test_fit_with_a_person_for_each_trajectory_instead_of_each_task_is_refused()
 
 def test_split_by_person_without_a_number_for_each_trajectory_raises():
     walk = Trajectory(np.array([1, 2]), np.array([3]), task=0)
-    with pytest.raises(InputError, match="field 'person': expected a whole number for each trajectory"):
+    with pytest.raises(InputError, match="field 'person': expected whole numbers of shape"):
         split_by_person(gather([walk, walk], tasks_of()), np.asarray([0]))
 
 
@@ -169,17 +169,17 @@ def test_tasks_of_with_costs_charges_the_state_that_is_aimed_at():
 def test_behavior_model_of_wrong_arguments_raises():
     behavior, features = Behavior(LogSumExp(), 5.0), np.zeros((3, 1, 1))
     refused: list[tuple[dict[str, Any], str]] = [
-        ({"learn": ["lapses"]}, r"'learn': expected some of .*'lapses'"),
-        ({"learn": ["discount"], "discount": 1.0}, r"'discount': .*between 0 and 1"),
+        ({"learn": ["lapses"]}, r"'learn': expected one of .*'lapses'"),
+        ({"learn": ["discount"], "discount": 1.0}, r"'discount': .*above 0 and below 1"),
         ({"person": np.array([0, 2])}, r"'person': expected persons numbered from 0"),
         ({"features": features * np.nan}, r"'features': expected finite numbers"),
-        ({"features": features, "reward_weights": np.full(1, np.inf)}, r"'reward_weights': expected 1 finite numbers"),
+        ({"features": features, "reward_weights": np.full(1, np.inf)}, r"'reward_weights': expected finite numbers"),
         ({"aimed_at": np.full((30, 4), 30)}, r"'aimed_at': expected states in 0…29"),
     ]
     for arguments, message in refused:
         with pytest.raises(InputError, match=message):
             behavior_model(behavior, **arguments)
-    with pytest.raises(InputError, match=r"'lapse': expected a probability"):
+    with pytest.raises(InputError, match=r"'lapse': expected a finite number, at least 0 and below 1"):
         Behavior(LogSumExp(), 5.0, lapse=1.0)
-    with pytest.raises(InputError, match=r"'tempering': expected a number above 0"):
+    with pytest.raises(InputError, match=r"'tempering': expected a finite number above 0"):
         fit(OPEN, walks(Behavior(BoltzmannAverage(), 20.0), 2), behavior, tempering=0.0)

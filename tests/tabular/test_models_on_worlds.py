@@ -115,7 +115,7 @@ def test_farm_known_model_stops_the_wrong_machine_and_swaps_machines():
     assert surely(model, beside_first + 2, LEFT) == 3 * 0 + 0  # the first machine stands there
     assert surely(model, 3 * 0 + 2, UP) == 3 * 0 + 2  # but not by staying there
     np.testing.assert_allclose(FARM.model().probabilities()[beside_first, RIGHT], 0.5)
-    with pytest.raises(InputError, match="terrain"):
+    with pytest.raises(InputError, match="machine"):
         Farm(np.zeros((2, 2), int), MACHINE).model()
 
 

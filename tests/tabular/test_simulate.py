@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import dijkstra
 
+import sidestep as ss
 from sidestep.errors import InputError
 from sidestep.io.demonstrations import demonstrations_from_walks, walks_from_trajectories
 from sidestep.io.walks import read_walks, write_walks
@@ -89,14 +90,30 @@ def test_simulate_of_equal_tasks_draws_independent_walks():
     assert [walk.states.tolist() for walk in walks[:20]] != [walk.states.tolist() for walk in walks[20:]]
 
 
-@pytest.mark.parametrize(("cells", "start", "moves"), [
-    (np.array([[0, 1, 0, 0, 0, 0]]), 0, None),  # walled in
-    (CORRIDOR, 0, 4),  # five moves are needed
-    (CORRIDOR, 0, 1),
-])  # fmt: skip
-def test_simulate_of_agents_that_cannot_arrive_raises(cells, start, moves):
-    with pytest.raises(InputError, match=rf"task 0: an agent from state {start} had not arrived after"):
-        walked(Grid(cells), [5], [[4, start]], moves=moves)
+def test_simulate_of_agents_that_cannot_arrive_raises():
+    walled_in = Grid(np.array([[0, 1, 0, 0, 0, 0]]))
+    with pytest.raises(InputError, match=r"task 0: an agent from state 0 had not arrived after"):
+        walked(walled_in, [5], [[4, 0]], moves=None)
+
+
+@pytest.mark.parametrize("moves", [1, 4])
+def test_simulate_with_too_few_moves_returns_truncated_walks(moves):
+    """Five moves are needed from state 0, and one from state 4."""
+    arrived, stopped = walked(Grid(CORRIDOR), [5], [[4, 0]], moves=moves)
+    assert arrived.states.tolist() == [4, 5]
+    assert not arrived.truncated
+    assert stopped.states.tolist() == list(range(moves + 1))
+    assert stopped.truncated
+
+
+def test_simulate_of_a_continuing_task_stops_at_the_limit():
+    world = ss.tabular_model(ss.graph([[[1], [0]], [[0], [1]]]), np.ones((2, 2, 1)))
+    endless = ss.task(np.array([0.0, 1.0]), 0.9, np.zeros(2, bool))
+    [walk] = ss.simulate(jax.random.key(0), world, [endless], [[0]], max_moves=300)
+    assert walk.truncated
+    assert walk.states.tolist() == [0] + [1] * 300
+    with pytest.raises(InputError, match="had not arrived"):
+        ss.simulate(jax.random.key(0), world, [endless], [[0]])
 
 
 def test_simulate_arriving_with_the_last_move_is_allowed():

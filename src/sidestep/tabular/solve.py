@@ -112,7 +112,7 @@ class Solution(eqx.Module):
         >>> from sidestep.tabular.grid import Grid
         >>> from sidestep.tabular.models import true_model
         >>> from sidestep.tabular.tasks import reach
-        >>> grid = Grid(np.zeros((1, 3), dtype=int))
+        >>> grid = Grid(jnp.zeros((1, 3), dtype=int))
         >>> bool(solve(true_model(grid), reach(grid, 2), Behavior(HardMax())).converged)
         True
     """
@@ -171,7 +171,7 @@ def solve(
         >>> from sidestep.tabular.grid import Grid
         >>> from sidestep.tabular.models import true_model
         >>> from sidestep.tabular.tasks import reach
-        >>> grid = Grid(np.zeros((1, 3), dtype=int))
+        >>> grid = Grid(jnp.zeros((1, 3), dtype=int))
         >>> solve(true_model(grid), reach(grid, 2, discount=0.5), Behavior(HardMax())).values.tolist()
         [0.25, 0.5, 1.0]
 

@@ -138,9 +138,9 @@ def tabular_model(
 
     Example:
         >>> from sidestep.tabular.graph import graph
-        >>> model = tabular_model(graph([[[0, 1]], [[1, 0]]]), [[[0.25, 0.75]], [[1.0, 0.0]]], known=True)
+        >>> model = tabular_model(graph([[[0, 1]], [[1, 0]]]), [[[0.5, 0.5]], [[1.0, 0.0]]], known=True)
         >>> model.probabilities().tolist(), model.parameters.shape
-        ([[[0.25, 0.75]], [[1.0, 0.0]]], (0, 2))
+        ([[[0.5, 0.5]], [[1.0, 0.0]]], (0, 2))
     """
     check_instance(world, Graph, "world")
     shape = tuple(world.successors.shape)
