@@ -131,7 +131,7 @@ def test_compare_ranks_behavior_above_transitions_alone(compared):
 def test_compare_scores_held_out_walks_by_the_map_of_the_others(data, compared):
     grid, _, walks = data
     drawn = np.random.default_rng(3).permutation(WALKS)
-    learned = learn_map(grid, walks.select(np.sort(drawn[8:])))
+    learned = learn_map(grid, walks.select(np.sort(drawn[8:])), MapConfig(seed=3))
     heldout = demonstrations_from_walks(walks.select(np.sort(drawn[:8])), grid)
     behavior = Behavior(BoltzmannAverage(), NEAR_OPTIMAL.beta, NEAR_OPTIMAL.lapse)
     expected = log_likelihood(learned.model, heldout, behavior, terms=("actions",)).actions / len(heldout)

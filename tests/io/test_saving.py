@@ -206,7 +206,10 @@ def of_class(name):
     (lambda description: description.update(version=2), r"expected version 1 of the format, found 2 \(by sidestep"),
     (lambda description: description.update(format="other"), "expected a sidestep result, found 'other'"),
     (lambda description: description.pop("result"), "the description is damaged"),
-    (lambda description: description["result"]["fields"].pop("discount"), "expected the fields reward, .*outcome_reward of"),
+    (
+        lambda description: description["result"]["fields"].pop("discount"),
+        "expected the fields reward, .*outcome_reward of",
+    ),
     (lambda description: description["result"]["fields"].update(discount={"jax": 99}), "the description is damaged"),
     (lambda description: description["result"]["fields"].update(discount={"odd": 0}), "the description is damaged"),
     (lambda description: description["result"]["fields"].update(discount=[0]), "the description is damaged"),

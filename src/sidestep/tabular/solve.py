@@ -108,11 +108,12 @@ class Solution(eqx.Module):
         start: The start of a later solve of the same task under a similar model.
 
     Example:
+        >>> import numpy as np
         >>> from sidestep.tabular.backups import HardMax
         >>> from sidestep.tabular.grid import Grid
         >>> from sidestep.tabular.models import true_model
         >>> from sidestep.tabular.tasks import reach
-        >>> grid = Grid(jnp.zeros((1, 3), dtype=int))
+        >>> grid = Grid(np.zeros((1, 3), dtype=int))
         >>> bool(solve(true_model(grid), reach(grid, 2), Behavior(HardMax())).converged)
         True
     """
@@ -167,11 +168,12 @@ def solve(
         ImproperTask: For a task without values (see `check_proper`). Under `jit` this is not checked.
 
     Example:
+        >>> import numpy as np
         >>> from sidestep.tabular.backups import HardMax
         >>> from sidestep.tabular.grid import Grid
         >>> from sidestep.tabular.models import true_model
         >>> from sidestep.tabular.tasks import reach
-        >>> grid = Grid(jnp.zeros((1, 3), dtype=int))
+        >>> grid = Grid(np.zeros((1, 3), dtype=int))
         >>> solve(true_model(grid), reach(grid, 2, discount=0.5), Behavior(HardMax())).values.tolist()
         [0.25, 0.5, 1.0]
 
