@@ -61,6 +61,7 @@ from .tabular.models.barriers import Barriers as Barriers, barriers_of as barrie
 
 # behavior: how agents choose their actions
 from .tabular.backups import (
+    Backup as Backup,
     Behavior as Behavior,
     BoltzmannAverage as BoltzmannAverage,
     HardMax as HardMax,
@@ -75,6 +76,7 @@ from .tabular.likelihood import (
 )
 from .tabular.proper import check_proper as check_proper
 from .tabular.solve import Solution as Solution, SolveOptions as SolveOptions, solve as solve
+from .tabular.solvers.base import Solver as Solver
 from .tabular.solvers.gauss_seidel import GaussSeidel as GaussSeidel
 from .tabular.solvers.jacobi import Jacobi as Jacobi
 

@@ -43,6 +43,10 @@ class Backup(eqx.Module):
 
     Attributes:
         above_maximum: Whether the backup is never below the best action's value; otherwise it is never above.
+
+    Example:
+        >>> isinstance(HardMax(), Backup)
+        True
     """
 
     above_maximum: ClassVar[bool] = False

@@ -209,6 +209,11 @@ class Solver(eqx.Module):
     Attributes:
         tolerance: The relative change at which to stop, above 0; by default 1e-10 in 64-bit and 1e-5 in 32-bit numbers.
         max_sweeps: When to stop without convergence.
+
+    Example:
+        >>> import sidestep as ss
+        >>> isinstance(ss.Jacobi(), ss.Solver)
+        True
     """
 
     tolerance: eqx.AbstractVar[Tolerance]
