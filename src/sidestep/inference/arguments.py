@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from sidestep.errors import check, check_instance, to_list, to_number
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.behavior_model import BehaviorModel
-from sidestep.tabular.checks import check_behavior, check_demonstrations, check_features, check_model, check_persons
+from sidestep.tabular.checks import check_behavior, check_demonstrations, check_model, check_persons
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import ALL_TERMS, Terms, check_terms
 from sidestep.tabular.models import TransitionModel
@@ -34,9 +34,8 @@ def check_evidence(
     to_number(tempering, "tempering", above=0, most=1)
     check_terms(terms)
     check_model(model)
-    check_behavior(behavior, learned=True)
+    check_behavior(behavior, model.graph)
     check_demonstrations(demonstrations, model.graph)
-    check_features(behavior, model.graph)
     check_persons(behavior, len(demonstrations.tasks.terminal))
 
 

@@ -1,9 +1,21 @@
-"""NumPy arrays as JAX arrays, without a compilation."""
+"""NumPy arrays as JAX arrays, without a compilation, and whether arrays are known."""
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Shaped
+
+
+def is_traced(*trees: Any) -> bool:
+    """Return whether JAX is tracing any array of some trees, so that its numbers are not known.
+
+    Args:
+        trees: Of arrays and other things.
+    """
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def to_jax(array: Shaped[ArrayLike, "..."], dtype: type | np.dtype | None = None) -> Shaped[Array, "..."]:

@@ -128,7 +128,7 @@ class HardMax(Backup):
         del available
         best = jax.lax.stop_gradient(q.max(axis=-1))
         weights = jax.lax.stop_gradient(self.weights(q, beta))
-        return best + jnp.sum(weights * _zero_with_gradient(q), axis=-1)
+        return best + jnp.sum(weights * zero_with_gradient(q), axis=-1)
 
     def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
         """Return one over the number of best actions, for each of them."""
@@ -158,11 +158,11 @@ class BoltzmannAverage(Backup):
     def value(self, q: ActionValues, beta: Float[Scalar, ""], available: Available | None = None) -> Values:
         """Return the average of the actions' values under π."""
         del available
-        return jnp.sum(self.fixed_policy_weights(q, beta) * _finite(q), axis=-1)
+        return jnp.sum(self.fixed_policy_weights(q, beta) * finite_or_zero(q), axis=-1)
 
     def weights(self, q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
         """Return π(1 + β(Q − V)), eq. 8: the effect of an action's value directly and through its probability."""
-        policy, q = self.fixed_policy_weights(q, beta), _finite(q)
+        policy, q = self.fixed_policy_weights(q, beta), finite_or_zero(q)
         value = jnp.sum(policy * q, axis=-1, keepdims=True)
         return policy * (1 + beta * (q - value))
 
@@ -331,12 +331,20 @@ def _exponents(q: ActionValues, beta: Float[Scalar, ""]) -> ActionValues:
     return jnp.where(never, -jnp.inf, beta * jnp.where(never, 0, q - best))
 
 
-def _finite(q: ActionValues) -> ActionValues:
-    """Return q, and 0 instead of −∞; an infinite number times a weight of 0 would be NaN."""
-    return jnp.where(jnp.isneginf(q), 0, q)
+def finite_or_zero(numbers: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return numbers, and 0 instead of −∞: an infinite number times a weight of 0 would be NaN.
+
+    Args:
+        numbers: Values, or action values.
+    """
+    return jnp.where(jnp.isneginf(numbers), 0, numbers)
 
 
-def _zero_with_gradient(q: ActionValues) -> ActionValues:
-    """Return zeros that have the gradient of q."""
-    finite = _finite(q)
+def zero_with_gradient(q: ActionValues) -> ActionValues:
+    """Return zeros that have the gradient of q, where it is finite.
+
+    Args:
+        q: Q of the actions.
+    """
+    finite = finite_or_zero(q)
     return finite - jax.lax.stop_gradient(finite)

@@ -1,27 +1,16 @@
 """Checks that tasks, behavior and demonstrations are of a model's world; what JAX is tracing is not looked at."""
 
-from typing import Any
-
 import jax
 import numpy as np
-from jax.core import Tracer
 
 from sidestep.errors import InputError, check, check_instance
+from sidestep.tabular.arrays import is_traced
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.behavior_model import BehaviorModel
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.tasks import Task
-
-
-def is_traced(*trees: Any) -> bool:
-    """Return whether JAX is tracing any array of some trees, so that its numbers are not known.
-
-    Args:
-        trees: Of arrays and other things.
-    """
-    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def check_model(model: TransitionModel) -> None:
@@ -51,13 +40,14 @@ def check_persons(behavior: Behavior | BehaviorModel | None, tasks: int) -> None
         check(own == tasks, message, field="person")
 
 
-def check_features(behavior: Behavior | BehaviorModel | None, world: Graph) -> None:
-    """Raise `InputError` unless the features and aims of a behavior model are of the world of a graph.
+def check_behavior(behavior: Behavior | BehaviorModel, world: Graph) -> None:
+    """Raise `InputError` unless something is a behavior, or a behavior model of the world of a graph.
 
     Args:
         behavior: The behavior.
         world: The graph of a model.
     """
+    check_instance(behavior, (Behavior, BehaviorModel), "behavior")
     if isinstance(behavior, BehaviorModel):
         shape = world.states, world.actions
         for field in ("features", "aimed_at"):
@@ -65,16 +55,6 @@ def check_features(behavior: Behavior | BehaviorModel | None, world: Graph) -> N
             axes = shape if own is None else own.shape[:2]
             fits = all(axis in (1, size) for axis, size in zip(axes, shape, strict=True))
             check(fits, f"expected {shape} states and actions, or 1 instead, found {axes}", field=field)
-
-
-def check_behavior(behavior: Behavior | BehaviorModel, *, learned: bool = False) -> None:
-    """Raise `InputError` unless something is a behavior.
-
-    Args:
-        behavior: The behavior.
-        learned: Whether a `BehaviorModel` is one too.
-    """
-    check_instance(behavior, (Behavior, BehaviorModel) if learned else Behavior, "behavior")
 
 
 def check_task(task: Task, world: Graph, field: str = "task") -> None:

@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from typing_extensions import TypeVar
 
 from sidestep._arguments import to_integers, to_mask, to_states
 from sidestep._repr import short_repr
 from sidestep.errors import InputError, check, check_instance, describe, to_count, to_list
-from sidestep.tabular.arrays import to_jax
+from sidestep.tabular.arrays import is_traced, to_jax
 from sidestep.tabular.tasks import Task, stack_tasks
 
 if TYPE_CHECKING:
@@ -366,7 +365,7 @@ def pad_to_power_of_two(demonstrations: Demonstrations[Task]) -> Demonstrations[
     Args:
         demonstrations: Moves and tasks of a discrete world.
     """
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(demonstrations)):
+    if is_traced(demonstrations):
         return demonstrations
 
     def padded(tree: Any, count: int, least: int) -> tuple[Any, Bool[np.ndarray, " padded"]]:

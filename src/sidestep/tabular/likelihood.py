@@ -17,21 +17,19 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from sidestep.errors import check
-from sidestep.tabular.arrays import to_jax
+from sidestep.tabular.arrays import is_traced, to_jax
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
 from sidestep.tabular.checks import (
     check_behavior,
     check_demonstrations,
-    check_features,
     check_model,
     check_persons,
-    is_traced,
 )
 from sidestep.tabular.demonstrations import Demonstrations, next_power_of_two, pad_to_power_of_two
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.proper import check_proper
-from sidestep.tabular.solve import Solution, SolveOptions, solve
+from sidestep.tabular.solve import Solution, SolveOptions, expected_reward, solve
 from sidestep.tabular.solvers.base import WarmStart, advantages
 from sidestep.tabular.tasks import Task
 
@@ -135,10 +133,9 @@ def check_likelihood(
         ImproperTask: For tasks without values.
     """
     check_model(model)
-    check_behavior(behavior, learned=True)
+    check_behavior(behavior, model.graph)
     check_demonstrations(demonstrations, model.graph)
     agents = as_behavior_model(behavior)
-    check_features(behavior, model.graph)
     check_persons(behavior, len(demonstrations.tasks.terminal))
     check_deadline(demonstrations, options)
     if not is_traced(model, demonstrations, behavior):
@@ -395,9 +392,9 @@ def visited_advantages(
     after = values[task[:, None, None], model.graph.successors[states]]
     probabilities, available = model.probabilities()[states], model.graph.available
     reward = tasks.reward[task, states if tasks.reward.shape[1] > 1 else 0].astype(values.dtype)
-    if tasks.outcome_reward is not None:
-        of_outcomes = tasks.outcome_reward[task, states if tasks.outcome_reward.shape[1] > 1 else 0]
-        reward = reward + jnp.sum(probabilities * of_outcomes.astype(values.dtype), axis=-1)
+    own = tasks.outcome_reward
+    of_outcomes = None if own is None else own[task, states if own.shape[1] > 1 else 0]
+    reward = expected_reward(reward, of_outcomes, probabilities)
     mask = available[states if len(available) > 1 else jnp.zeros_like(states)]
     discount = tasks.discount[task, None].astype(values.dtype)
     return advantages(values[task, states], after, probabilities, reward, mask, discount)

@@ -17,10 +17,10 @@ from sidestep._arguments import to_key, to_states
 from sidestep._programs import keep_program
 from sidestep._repr import short_repr
 from sidestep.errors import NotConverged, check, check_instance, to_count
-from sidestep.tabular.arrays import to_jax
+from sidestep.tabular.arrays import is_traced, to_jax
 from sidestep.tabular.backups import Behavior, HardMax, tied_where_lost
 from sidestep.tabular.behavior_model import BehaviorModel
-from sidestep.tabular.checks import check_behavior, check_features, check_model, check_task, is_traced
+from sidestep.tabular.checks import check_behavior, check_model, check_task
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.proper import check_proper
 from sidestep.tabular.solve import Solution, SolveOptions, solve
@@ -142,8 +142,7 @@ def plan(
     tasks = task.terminal.shape[:-1]
     check(not tasks, f"expected one task, found a stack of {tasks}", field="task")
     if behavior is not None:
-        check_behavior(behavior, learned=True)
-        check_features(behavior, model.graph)
+        check_behavior(behavior, model.graph)
     agent = behavior or Behavior(HardMax())
     if isinstance(agent, BehaviorModel):
         task, agent = agent.tasks_of(task), agent.behavior_of(person)

@@ -9,9 +9,9 @@ is sufficient, not necessary, and the entropy bonus of a log-sum-exp agent count
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sidestep.errors import ImproperTask
+from sidestep.errors import ImproperTask, check_instance
 from sidestep.tabular.backups import Behavior, LogSumExp
-from sidestep.tabular.checks import check_behavior, check_task
+from sidestep.tabular.checks import check_task
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.tasks import Task
 
@@ -42,7 +42,7 @@ def check_proper(task: Task, behavior: Behavior, world: Graph, horizon: int | No
         >>> check_proper(goal, Behavior("logsumexp", beta=10.0), grid_graph(grid))
     """
     check_task(task, world)
-    check_behavior(behavior)
+    check_instance(behavior, Behavior, "behavior")
     endless = np.atleast_1d(np.asarray(task.discount)) == 1
     if horizon is not None or not endless.any():
         return

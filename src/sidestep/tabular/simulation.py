@@ -82,15 +82,11 @@ def simulate(
     for index, (task, own) in enumerate(zip(tasks, starts, strict=True)):
         begin = to_states(own, world.graph.states, f"starts[{index}]")
         person = _person_of(behavior, index)
-        made = plan(world, task, behavior, person=person, options=options)
+        policy = _policy_of(world, task, behavior, person, options)
         if not len(begin):
             continue
         key, own_key = jax.random.split(key)
-        policy = made.policy
-        if options.deadline and behavior is not None:
-            agents = as_behavior_model(behavior)
-            policy = policy_by_time(world, agents.tasks_of(task), agents.behavior_of(person), options)
-        states, actions, arrived = _followed(own_key, world, policy, np.asarray(made.terminal), begin, limit)
+        states, actions, arrived = _followed(own_key, world, policy, np.asarray(task.terminal), begin, limit)
         if max_moves is None and not options.deadline and not arrived.all():
             raise InputError(
                 f"an agent from state {int(begin[np.argmin(arrived)])} had not arrived after {limit} moves: "
@@ -101,6 +97,20 @@ def simulate(
             taken = int((own_actions >= 0).sum())
             trajectories.append(Trajectory(own_states[: taken + 1], own_actions[:taken], index, not ended))
     return trajectories
+
+
+def _policy_of(
+    world: TransitionModel,
+    task: Task,
+    behavior: Behavior | BehaviorModel | None,
+    person: int | None,
+    options: SolveOptions,
+) -> Float[Array, "*moves states actions"]:
+    """Return the policy of agents, with a deadline one for each move."""
+    if not options.deadline or behavior is None:
+        return plan(world, task, behavior, person=person, options=options).policy
+    agents = as_behavior_model(behavior)
+    return policy_by_time(world, agents.tasks_of(task), agents.behavior_of(person), options)
 
 
 def _person_of(behavior: Behavior | BehaviorModel | None, task: int) -> int | None:

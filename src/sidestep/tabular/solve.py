@@ -21,9 +21,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sidestep._repr import short_repr
 from sidestep.errors import check, check_choice, check_instance, to_count
-from sidestep.tabular.backups import Backup, Behavior, Gradient
+from sidestep.tabular.arrays import is_traced
+from sidestep.tabular.backups import Backup, Behavior, Gradient, finite_or_zero
 from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
-from sidestep.tabular.checks import check_behavior, check_features, check_model, check_persons, check_task, is_traced
+from sidestep.tabular.checks import check_behavior, check_model, check_persons, check_task
 from sidestep.tabular.implicit import fixed_point
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.proper import check_proper
@@ -183,11 +184,10 @@ def solve(
     """
     options = options or SolveOptions()
     check_instance(options, SolveOptions, "options")
-    check_behavior(behavior, learned=True)
-    agents = as_behavior_model(behavior)
     check_model(model)
     check_task(task, model.graph)
-    check_features(behavior, model.graph)
+    check_behavior(behavior, model.graph)
+    agents = as_behavior_model(behavior)
     if task.terminal.ndim == 2:
         check_persons(behavior, len(task.terminal))
     if not is_traced(model, task, behavior):
@@ -245,12 +245,29 @@ def _solve(
             time = jnp.zeros_like(visited) if times is None else times
             here, leads_to = later[time, visited], later[time[:, None, None], process.successors[visited]]
             advantages = base.advantages(here, leads_to, rows, reward, available, process.discount)
-        q = base.finite_or_zero(here)[:, None] + advantages
+        q = finite_or_zero(here)[:, None] + advantages
         next_start = base.WarmStart(jax.lax.stop_gradient(values), start.adjoint, result.order)
         info = result.sweeps, result.residual, result.converged
         return Solution(values, after, q, advantages, *info, next_start)
 
     return (jax.vmap(one) if tasks else one)(task, begin, visited, times, everywhere, betas)
+
+
+def expected_reward(
+    reward: Float[Array, "#states #actions"],
+    outcome_reward: Float[Array, "#states #actions #outcomes"] | None,
+    probabilities: Float[Array, "states actions outcomes"],
+) -> Float[Array, "#states #actions"]:
+    """Return R(s, a) + Σ_s′ T(s, a, s′) R(s, a, s′), in units of reward.
+
+    Args:
+        reward: R(s, a).
+        outcome_reward: R(s, a, s′) of each outcome; None for none.
+        probabilities: T of each outcome.
+    """
+    if outcome_reward is None:
+        return reward
+    return reward + jnp.sum(probabilities * outcome_reward.astype(probabilities.dtype), axis=-1)
 
 
 def decision_process(
@@ -267,7 +284,6 @@ def decision_process(
     """
     cast = (leaf.astype(probabilities.dtype) for leaf in (task.reward, task.terminal_reward, task.discount))
     reward, terminal_reward, discount = cast
-    if task.outcome_reward is not None:
-        reward = reward + jnp.sum(probabilities * task.outcome_reward.astype(probabilities.dtype), axis=-1)
+    reward = expected_reward(reward, task.outcome_reward, probabilities)
     structure = task.terminal, model.graph.available
     return base.DecisionProcess(model.graph.successors, probabilities, reward, terminal_reward, *structure, discount)

@@ -16,13 +16,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
 from sidestep._arguments import to_finite, to_floats, to_mask
 from sidestep._repr import short_repr
 from sidestep.errors import InputError, check, check_instance, check_positive, describe, to_list, to_number
-from sidestep.tabular.arrays import to_jax
+from sidestep.tabular.arrays import is_traced, to_jax
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.grid import Cell, Grid
 
@@ -167,7 +166,7 @@ def stack_tasks(tasks: Sequence[Task]) -> Task:
 
     def stacked(*leaves: Array) -> Array:
         shape = np.broadcast_shapes(*(leaf.shape for leaf in leaves))
-        if any(isinstance(leaf, Tracer) for leaf in leaves):
+        if is_traced(leaves):
             return jnp.stack([jnp.broadcast_to(leaf, shape) for leaf in leaves])
         return to_jax(np.stack([np.broadcast_to(np.asarray(leaf), shape) for leaf in leaves]))
 

@@ -53,7 +53,7 @@ from jaxtyping import Array, Bool, Float, Int, Scalar
 
 from sidestep._arguments import to_finite
 from sidestep.errors import to_count
-from sidestep.tabular.backups import Backup, Gradient
+from sidestep.tabular.backups import Backup, Gradient, finite_or_zero, zero_with_gradient
 
 Beta = Float[Scalar, ""]
 Values = Float[Array, " states"]
@@ -110,11 +110,6 @@ def advantages(
     gained = reward + discount * jnp.sum(probabilities * differences, axis=-1) - (1 - discount) * here
     never = ~available | jnp.any(is_lost & (probabilities > 0), axis=-1)
     return jnp.where(never, -jnp.inf, gained)
-
-
-def finite_or_zero(values: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return values, and 0 instead of −∞."""
-    return jnp.where(jnp.isneginf(values), 0, values)
 
 
 class WarmStart(NamedTuple):
@@ -291,8 +286,7 @@ def at_fixed_policy(
 ) -> Float[Array, " states"]:
     """Return the backup's value with the gradient of the average under its policy, held fixed (eqs. 9 and 10)."""
     weights, value = jax.lax.stop_gradient((backup.fixed_policy_weights(q, beta), backup.value(q, beta, available)))
-    finite = finite_or_zero(q)
-    return value + jnp.sum(weights * (finite - jax.lax.stop_gradient(finite)), axis=-1)
+    return value + jnp.sum(weights * zero_with_gradient(q), axis=-1)
 
 
 def lower_bound(process: DecisionProcess) -> Float[Array, ""]:
