@@ -182,10 +182,7 @@ def _places(network: "DiGraph", positions: Positions | None) -> dict[int, tuple[
     import networkx
 
     if positions is None:
-        whole = networkx.is_weakly_connected(network)
-        # the energy of Kamada and Kawai needs a path between any two states
-        layout = networkx.kamada_kawai_layout if whole else networkx.circular_layout
-        places = layout(network.to_undirected())
+        places = networkx.kamada_kawai_layout(network.to_undirected())
     else:
         places = positions if isinstance(positions, Mapping) else dict(enumerate(np.asarray(positions)))
     missing = [state for state in network if state not in places]
