@@ -148,3 +148,7 @@ from .tabular.planning import Plan as Plan, RollOuts as RollOuts, plan as plan, 
 
 # evaluation
 from .evaluation.evaluate import evaluate as evaluate, plan_paths as plan_paths
+
+# pictures of small worlds
+from .plotting.graphs import figure_graph as figure_graph
+from .plotting.heat_maps import figure_plan as figure_plan

@@ -61,14 +61,16 @@ def test_from_table_of_a_row_for_each_state_is_what_gather_makes(library):
 
 def test_from_table_with_steps_takes_rows_in_any_order():
     columns = rows_of_states()
-    columns["time"] = list(range(len(columns["walk"])))
+    columns["time"] = columns["seen"] = list(range(len(columns["walk"])))
     shuffled = np.random.default_rng(0).permutation(len(columns["walk"]))
     frame = pd.DataFrame(columns).iloc[shuffled]
-    read = ss.Demonstrations.from_table(frame, TASKS, task="task", step="time")
+    read = ss.Demonstrations.from_table(frame, TASKS, task="task", step="time", weight="seen")
     paths = {tuple(path) for path in map(np.ndarray.tolist, read.paths())}
     assert paths == {tuple(path) for path, _, _ in WALKS}
     by_walk = dict(zip(pd.unique(frame["walk"]), map(np.ndarray.tolist, read.paths()), strict=True))
     assert by_walk["c"] == WALKS[0][0]
+    begins = {"c": 0.0, "a": 4.0, "b": 6.0}  # the row, and so the weight, of the first move
+    assert [float(read.weights[at]) for at in read.first_moves()] == [begins[name] for name in by_walk]
 
 
 def test_from_table_with_labels_numbers_them():

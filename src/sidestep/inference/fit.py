@@ -197,7 +197,8 @@ def fit(
             writes the file, all must see it.)
 
     Returns:
-        The learned model, and how the optimization ended.
+        The learned model, and how the optimization ended. `laplace` gives what was learned standard errors, by second
+        derivatives of the posterior.
 
     Raises:
         InputError: For arguments of other types or out of range, or that exclude each other, demonstrations in another

@@ -72,7 +72,7 @@ def log_likelihood(
     """Return log L(θ) of demonstrations by agents that act as `behavior` describes and know `model`.
 
     Args:
-        model: The transition model; differentiable in its parameters θ.
+        model: The transition model; differentiable in its parameters θ, twice with the exact gradient (`jax.hessian`).
         demonstrations: Moves and tasks. One compiled function serves demonstrations of many lengths.
         behavior: The policy that values of actions lead to; after a fit, `fit.behavior`.
         terms: The terms that count, "actions", "transitions" or both.
