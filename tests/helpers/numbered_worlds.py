@@ -1,14 +1,21 @@
 """Small maps, and tasks as the Gauss–Seidel sweeps read them: with their states numbered in an order."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid, TransitionModel
+from sidestep.tabular.solvers.bounds import MoveCosts
 from sidestep.tabular.solvers.native import HostProcess, inverse_permutation
 from sidestep.tabular.solvers.ordering import NumberedProcess, number_process, order_by_distance
 from sidestep.tabular.tasks import Task
+
+_ZERO: Any = np.float64(0)
+NO_COSTS = MoveCosts(_ZERO, _ZERO)
+"""Moves without a cost bound no error below that of the discount."""
 
 
 def some_map(rows: int = 20, columns: int = 21, seed: int = 0) -> ObstacleGrid:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers.numbered_worlds import host_process, numbered_process, order_of
+from helpers.numbered_worlds import NO_COSTS, host_process, numbered_process, order_of
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid
@@ -93,7 +93,9 @@ def test_sweep_loop_pipelined_equals_waiting(kind, fraction):
     loops = []
     for bandwidth in (process.bandwidth, 10**9):
         same = process._replace(bandwidth=bandwidth)
-        loops.append(SweepLoop(same, values.copy(), greedy.copy(), positions, backup, np.float64(1e-9), 500, 500))
+        loops.append(
+            SweepLoop(same, values.copy(), greedy.copy(), positions, backup, NO_COSTS, np.float64(1e-9), 500, 500)
+        )
         assert loops[-1].run().converged
     pipelined, waiting = loops
     assert any(block[-1] + 2 * process.bandwidth < pipelined.blocks[-1][0] for block in pipelined.blocks)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.numbered_worlds import numbered_process, order_of, some_map
+from helpers.numbered_worlds import NO_COSTS, numbered_process, order_of, some_map
 from helpers.problems import BACKUPS, generic_task, random_problem
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.grid import Grid
@@ -161,7 +161,9 @@ def converged_loop():
     values = np.asarray(solution.values)[order]
     backup, positions = NativeBackup(KERNELS[BoltzmannAverage], one, 0 * one), np.arange(420, dtype=np.int32)
     process = numbered_process(model, task, order)
-    loop = SweepLoop(process, values.copy(), positions.copy(), positions, backup, np.float64(1e-11), 1000, 1000)
+    loop = SweepLoop(
+        process, values.copy(), positions.copy(), positions, backup, NO_COSTS, np.float64(1e-11), 1000, 1000
+    )
     assert loop.run().converged
     return loop, values
 

@@ -26,6 +26,7 @@ from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.models.barriers import NO_BARRIER, Barriers, barriers_of
 from sidestep.tabular.proper import check_proper
 from sidestep.tabular.solvers.base import SolveResult, WarmStart
+from sidestep.tabular.solvers.bounds import MoveCosts
 from sidestep.tabular.solvers.gauss_seidel import KERNELS
 from sidestep.tabular.solvers.native import HostProcess, NativeBackup, NativeEquation
 from sidestep.tabular.solvers.values import solve_values
@@ -359,12 +360,19 @@ def _solved(equation: NativeEquation) -> Float[np.ndarray, " states"]:
     process, states = equation.process, len(equation.process.terminal)
     best = np.where(process.available, process.reward, -np.inf).max(axis=-1)
     worst = best[~process.terminal].min(initial=0.0)
-    # as `base.lower_bound`
+    # as `bounds.lower_bound`
     bound = np.float64(worst / (1 - process.discount) if process.discount < 1 else -np.inf)
-    arrays: Any = np.empty(states), np.empty(states, np.int32), *(np.empty((), kind) for kind in (int, float, bool))
+    no_cost: Any = np.float64(0)
+    arrays: Any = (
+        np.empty(states),
+        np.empty(states, np.int32),
+        *(np.empty((), kind) for kind in (int, float, float, bool)),
+    )
     start: Any = np.full(states, -np.inf), np.zeros(0), np.full(states, -1, np.int32)
     result = SolveResult(*arrays)
-    solve_values(_MAX_SWEEPS, result, equation, bound, WarmStart(*start), np.ones(states, bool))
+    solve_values(
+        _MAX_SWEEPS, result, equation, bound, MoveCosts(no_cost, no_cost), WarmStart(*start), np.ones(states, bool)
+    )
     if not result.converged:
         raise NotConverged(f"the values of a task did not converge in {_MAX_SWEEPS} sweeps")
     return np.where(np.isneginf(arrays[0]), NEG_INF, arrays[0])

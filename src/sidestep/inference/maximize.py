@@ -337,7 +337,8 @@ def _check_start(problem: Problem, progress: Progress, solves: list[SolveSummary
     if not converged.all():
         raise NotConverged(
             f"values did not converge for task(s) {np.flatnonzero(~converged).tolist()} (residual up to "
-            f"{residual.max():.2g}): a smaller β, more sweeps or another backup may help"
+            f"{residual.max():.2g}): 64-bit numbers (`jax_enable_x64`), more sweeps, a smaller β or another backup may "
+            "help"
         )
     if unreachable.any():
         task, choice = np.argwhere(unreachable)[0]

@@ -117,7 +117,8 @@ def plan(
         behavior: The agent's, π ∝ exp βQ; None for the optimal policy. With a `BehaviorModel`, such as that of a fit,
             the task has its discount, reward weights and costs.
         person: The person that plans, where a `BehaviorModel` distinguishes them; by default a typical one.
-        options: How values are computed; by default `SolveOptions()`.
+        options: How values are computed; by default `SolveOptions()`. With a deadline the plan is that of the first
+            action; later ones are in `log_policies`.
 
     Returns:
         The probabilities of actions and the intended next state of every state, with the values.
@@ -154,8 +155,9 @@ def plan(
     solution = made.solution
     if not bool(solution.converged):
         raise NotConverged(
-            f"values still changed by {float(solution.residual):.2g} in sweep {int(solution.sweeps)}: "
-            "a smaller β, more sweeps or another backup may help"
+            f"values still changed by {float(solution.residual):.2g} in sweep {int(solution.sweeps)}, with errors of "
+            f"up to {float(solution.error):.2g}: 64-bit numbers (`jax_enable_x64`), more sweeps, a smaller β or "
+            "another backup may help"
         )
     return made
 

@@ -91,7 +91,7 @@ class SolveOptions(eqx.Module):
         return self.solver or default_solver(backup, states)
 
 
-@short_repr("values", "action_values", "sweeps", "residual", "converged")
+@short_repr("values", "action_values", "sweeps", "residual", "error", "converged")
 class Solution(eqx.Module):
     """The values of a task under a model, with a leading `tasks` axis for several tasks; made by `solve`.
 
@@ -105,7 +105,10 @@ class Solution(eqx.Module):
             exact where values are far larger than their differences. Policies depend on these.
         sweeps: The number of times that each state was solved, on average; the horizon where it is finite.
         residual: The largest relative change in the last sweep; 0 for a finite horizon.
-        converged: Whether the residual is within the solver's tolerance.
+        error: A bound of |V − V*| in the states that had to be solved, in units of reward; an estimate for the
+            Boltzmann average, ∞ where none is known, 0 for a finite horizon.
+        converged: Whether the residual is within the solver's tolerance, and the error within the root of this
+            tolerance times the largest |V|.
         start: The start of a later solve of the same task under a similar model.
 
     Example:
@@ -125,6 +128,7 @@ class Solution(eqx.Module):
     advantages: Float[Array, "*tasks visited actions"]
     sweeps: Int[Array, "*tasks"]
     residual: Float[Array, "*tasks"]
+    error: Float[Array, "*tasks"]
     converged: Bool[Array, "*tasks"]
     start: base.WarmStart
 
@@ -234,8 +238,8 @@ def _solve(
             rules = behavior.backup, beta, options.horizon, options.gradient
             values, later = base.finite_horizon(process, *rules)
             after = later[0]
-            sweeps, residual = jnp.asarray(options.horizon), jnp.asarray(0, values.dtype)
-            result = base.SolveResult(values, start.order, sweeps, residual, jnp.isfinite(values).all())
+            sweeps, none = jnp.asarray(options.horizon), jnp.asarray(0, values.dtype)
+            result = base.SolveResult(values, start.order, sweeps, none, none, jnp.isfinite(values).all())
             rows = probabilities[some]
         if visited is None:
             here, advantages = after, process.advantages(after)
@@ -247,7 +251,7 @@ def _solve(
             advantages = base.advantages(here, leads_to, rows, reward, available, process.discount)
         q = finite_or_zero(here)[:, None] + advantages
         next_start = base.WarmStart(jax.lax.stop_gradient(values), start.adjoint, result.order)
-        info = result.sweeps, result.residual, result.converged
+        info = result.sweeps, result.residual, result.error, result.converged
         return Solution(values, after, q, advantages, *info, next_start)
 
     return (jax.vmap(one) if tasks else one)(task, begin, visited, times, everywhere, betas)

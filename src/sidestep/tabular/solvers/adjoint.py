@@ -50,7 +50,7 @@ def vjp_of_process(
         # nothing to solve, or nothing that it could be solved for
         residual = 0.0 if total == 0 else np.nan
         _fill(residual, result.values, *by)
-        native.write_info(result, order, native.SolveInfo(0, residual, bool(total == 0)))
+        native.write_info(result, order, native.SolveInfo(0, residual, 0.0, bool(total == 0)))
         return
     problem = adjoint_kernels.AdjointProblem(equation.backup, exact, values, order, position)
     known = np.where(np.isfinite(first), first, number(0))
@@ -131,7 +131,7 @@ class _AdjointSolve(NamedTuple):
             if left <= tolerance or np.isnan(remaining):
                 break
             threshold = max(finest, _FINER * threshold)
-        return native.SolveInfo(-(-pushed // states), left, bool(left <= tolerance))
+        return native.SolveInfo(-(-pushed // states), left, 0.0, bool(left <= tolerance))
 
     def omission_cost(self, region: Bool[np.ndarray, " states"]) -> float:
         """Return the cost of the states outside the region that were not solved, as a part of Σ |λ V|."""

@@ -179,8 +179,6 @@ class BellmanEquation(NamedTuple):
 class SolveResult(NamedTuple):
     """The result of a solver, and how the solve went.
 
-    The error is larger than the residual by up to 1/(1 − rate of convergence).
-
     Attributes:
         values: V, or λ.
         order: As in `WarmStart`.
@@ -188,13 +186,16 @@ class SolveResult(NamedTuple):
         residual: The largest change in the last sweep relative to the value itself (or to what its actions are worth
             without staying, where that is larger), so that small values far from a goal count as much as large ones.
             Of the states that had to be solved; of an adjoint, it may be the cost of those left out.
-        converged: Whether the residual is within the tolerance.
+        error: A bound of |V − V*| (see `bounds`), of the states that had to be solved; ∞ where none is known. Of an
+            adjoint, an estimate, or 0 where the residual is one.
+        converged: Whether the residual is within the tolerance, and the error within `largest_error` if it is known.
     """
 
     values: Float[Array, " states"]
     order: Int[Array, " ordered"]
     sweeps: Int[Array, ""]
     residual: Float[Array, ""]
+    error: Float[Array, ""]
     converged: Bool[Array, ""]
 
 
@@ -287,15 +288,3 @@ def at_fixed_policy(
     """Return the backup's value with the gradient of the average under its policy, held fixed (eqs. 9 and 10)."""
     weights, value = jax.lax.stop_gradient((backup.fixed_policy_weights(q, beta), backup.value(q, beta, available)))
     return value + jnp.sum(weights * zero_with_gradient(q), axis=-1)
-
-
-def lower_bound(process: DecisionProcess) -> Float[Array, ""]:
-    """Return a lower bound of the values: below discount 1, the best action of the worst state for ever; else −∞."""
-    dtype = process.probabilities.dtype
-    best = jnp.where(process.available, process.reward, -jnp.inf).max(axis=-1)
-    worst = jnp.where(process.terminal, jnp.inf, jnp.broadcast_to(best, process.terminal.shape)).min()
-    worst = jnp.where(jnp.isfinite(worst), worst, 0)
-    one_minus_discount = 1 - process.discount
-    is_discounted = one_minus_discount > 0
-    bound = jnp.where(is_discounted, worst / jnp.where(is_discounted, one_minus_discount, 1), -jnp.inf)
-    return bound.astype(dtype)

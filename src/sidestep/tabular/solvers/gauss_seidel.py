@@ -28,6 +28,7 @@ from sidestep.errors import InputError
 from sidestep.tabular.backups import Backup, BoltzmannAverage, Gradient, HardMax, LogSumExp, Mellowmax
 from sidestep.tabular.solvers import base, native
 from sidestep.tabular.solvers.base import BellmanEquation, Region, Values, WarmStart
+from sidestep.tabular.solvers.bounds import lower_bound, move_costs
 
 KERNELS: dict[type[Backup], int] = {
     HardMax: native.HARD_MAX,
@@ -78,8 +79,9 @@ class GaussSeidel(base.Solver):
         """Return V of the fixed point; of all states where the start's values turn out to be of no use."""
         # another solver may have left an order of no states
         order = start.order if start.order.shape == start.values.shape else _no_order(len(start.values))
-        bound = base.lower_bound(equation.process)
-        arguments = (self._native_equation(equation), bound, start._replace(order=order), region)
+        process, backup, beta = equation
+        limits = lower_bound(process), move_costs(process, backup, beta)
+        arguments = (self._native_equation(equation), *limits, start._replace(order=order), region)
         solve = partial(_solve_values, self.max_sweeps)
         return native.call_host(solve, arguments, _result_shapes(start.values, order))
 
@@ -137,6 +139,6 @@ def _no_order(states: int) -> Array:
 
 def _result_shapes(values: Array, order: Array) -> Any:
     """Return a `SolveResult` of shapes."""
-    types = jax.dtypes.canonicalize_dtype(int), values.dtype, jnp.dtype(bool)
+    types = jax.dtypes.canonicalize_dtype(int), values.dtype, values.dtype, jnp.dtype(bool)
     info = [jax.ShapeDtypeStruct((), dtype) for dtype in types]
     return base.SolveResult(*native.shapes_of((values, order)), *info)

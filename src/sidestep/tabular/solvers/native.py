@@ -93,6 +93,7 @@ class SolveInfo(NamedTuple):
 
     sweeps: int
     residual: float
+    error: float
     converged: bool
 
 

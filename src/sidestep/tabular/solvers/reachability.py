@@ -71,10 +71,14 @@ def reaching_kernel(actions: int, outcomes: int) -> native.NativeFunction:
     @native.compiled()
     def reach(order, successors, probabilities, available, finite, reached):  # pragma: no cover
         """Mark the states that reach a marked one by safe actions, in passes over an order and back."""
-        changed = True
-        while changed:
+        changed, left = True, 0
+        for state in range(len(order)):
+            left += finite[state] and not reached[state]
+        while changed and left > 0:
             changed = False
             for way in range(2):
+                if left == 0:
+                    continue
                 for index in range(len(order)):
                     state = order[index if way == 0 else len(order) - 1 - index]
                     if reached[state] or not finite[state]:
@@ -89,5 +93,7 @@ def reaching_kernel(actions: int, outcomes: int) -> native.NativeFunction:
                                 arrives = arrives or reached[after]
                         if safe and arrives:
                             reached[state] = changed = True
+                            left -= 1
+                            break
 
     return reach

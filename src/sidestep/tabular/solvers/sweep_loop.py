@@ -10,7 +10,8 @@ all, a sweep over every state comes first, so that the others roughly follow.
    before the next one. Its states stay in the processor's cache, and the nearer blocks have converged when it begins.
    For these two backups the states beyond the block are shifted, in the first 16 rounds (those of step 1 included).
 3. When no block begins with a change beyond the tolerance, a sweep over all states, without skips or shifts and as in
-   Jacobi iteration, decides whether the values have converged.
+   Jacobi iteration, decides whether the values have converged. Where the bound of the error (`bounds`) is too large,
+   the rounds go on to a smaller tolerance.
 
 The other backups are not shifted: on a real map (mellowmax, the depot) it saved nothing.
 """
@@ -24,6 +25,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sidestep.tabular.solvers import native
+from sidestep.tabular.solvers.bounds import MoveCosts
 from sidestep.tabular.solvers.ordering import NumberedProcess
 from sidestep.tabular.solvers.value_kernels import SweepHistory, sweep_kernel
 
@@ -42,6 +44,8 @@ _SHIFTED_ROUNDS = 16
 """The most rounds with shifts: two states that move each other may never converge."""
 _MOST_REPETITIONS = 30
 """The most sweeps over a block in a round."""
+_FINER = 0.1
+"""The factor between one tolerance and the next where the error is too large."""
 _SKIP = 0.25
 """The part of the tolerance that counts as no change, so that what is skipped does not add up beyond it."""
 
@@ -63,6 +67,7 @@ class SweepLoop:
         values: The values, changed in place.
         greedy_successor: Of each state, by the first values; changed in place.
         positions: The states that are to be solved, ascending.
+        costs: What bounds the number of moves.
         tolerance, max_sweeps, max_rounds: When to stop.
         history: What the sweeps leave for later ones.
         blocks: `positions` in blocks.
@@ -77,6 +82,7 @@ class SweepLoop:
     greedy_successor: Int[np.ndarray, " states"]
     positions: Int[np.ndarray, " solved"]
     backup: native.NativeBackup
+    costs: MoveCosts
     tolerance: np.floating
     max_sweeps: int
     max_rounds: int
@@ -95,13 +101,24 @@ class SweepLoop:
             shift_from = 0 if self.backup.kind in _SHIFTED_BACKUPS else len(self.values)
             self.sweep(np.arange(len(self.values), dtype=np.int32), shift_from)
         residual = self._shifted_rounds() if self.backup.kind in _SHIFTED_BACKUPS else np.inf
-        converged = False
+        largest_error, error, converged = (
+            float(np.sqrt(max(self.tolerance, np.finfo(self.values.dtype).eps))),
+            np.inf,
+            False,
+        )
         while not (converged or self._limit_reached() or np.isnan(residual)):
             residual = self._round_by_blocks() if residual > self.tolerance else residual
             if residual <= self.tolerance and not self._limit_reached():
-                residual = self.jacobi_sweep()
-                converged = bool(residual <= self.tolerance)
-        return native.SolveInfo(-(-self.solved // len(self.values)), float(residual), converged)
+                residual, change = self.jacobi_sweep()
+                by_discount, error, size = self._errors(change)
+                # the other bound may be far too large
+                is_near = not np.isfinite(by_discount) or by_discount <= largest_error * size
+                converged = bool(residual <= self.tolerance and is_near)
+                if not is_near:
+                    self.tolerance = self.tolerance * self.values.dtype.type(_FINER)
+                    if self.tolerance < np.finfo(self.values.dtype).eps:
+                        break
+        return native.SolveInfo(-(-self.solved // len(self.values)), float(residual), float(error), converged)
 
     def sweep(self, positions: Int[np.ndarray, " solved"], shift_from: int) -> float:
         """Sweep over some states, those from a position on shifted; return the largest change."""
@@ -110,8 +127,11 @@ class SweepLoop:
         self.solved += solved
         return change
 
-    def jacobi_sweep(self) -> float:
-        """Solve all states from the values as they are (step 3), on all cores; return the largest change."""
+    def jacobi_sweep(self) -> tuple[float, float]:
+        """Solve all states from the values as they are (step 3), on all cores.
+
+        Return the largest change relative to the values, and in their unit.
+        """
         self._begin_round()
         sweep = self._next_sweep()
         self.solved += len(self.positions)
@@ -121,12 +141,24 @@ class SweepLoop:
             return self._solve(into, sweep, self.positions[begin:end], shift_from=len(into), solve_all=True)[0]
 
         residual = float(np.max(native.map_ranges(solve, len(self.positions))))
+        known = self.positions[into[self.positions] > -np.inf]
+        change = float(np.abs(into[known] - self.values[known]).max(initial=0.0))
         self.values[:] = into
         # no state saw the new values of the others, whichever came first
         history, changed = self.history, self.history.last_changed == self.number
         self.number += 1
         history.last_changed[changed] = history.last_solved[changed] = self.number
-        return residual
+        return residual, change
+
+    def _errors(self, change: float) -> tuple[float, float, float]:
+        """Return the bounds of the error after such a change (`bounds.error_bounds`), and the largest value."""
+        known = self.values[self.values > -np.inf]
+        lowest, size = float(known.min(initial=np.inf)), float(np.abs(known).max(initial=0.0))
+        by_cost = float(self.costs.least) / max(float(self.costs.ending) - lowest, float(np.finfo(known.dtype).tiny))
+        rate, error = float(self.process.one_minus_discount), change + float(np.finfo(known.dtype).eps) * size
+        by_discount, smallest = (error / each if each > 0 else np.inf for each in (rate, max(by_cost, rate)))
+        # a number that the results' type does not hold is of no use
+        return by_discount, (smallest if smallest < float(np.finfo(known.dtype).max) else np.inf), size
 
     def _shifted_rounds(self) -> float:
         """Step 1; return the largest change in the last round, infinite if the first values were restored."""

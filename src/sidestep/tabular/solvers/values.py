@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sidestep.tabular.solvers.base import SolveResult, WarmStart
+from sidestep.tabular.solvers.bounds import MoveCosts
 from sidestep.tabular.solvers.native import NativeEquation, SolveInfo, inverse_permutation, map_ranges, write_info
 from sidestep.tabular.solvers.ordering import NumberedProcess, number_process, order_by_distance
 from sidestep.tabular.solvers.reachability import finite_states_on_host
@@ -34,6 +35,7 @@ def solve_values(
     into: SolveResult,
     equation: NativeEquation,
     bound: np.floating,
+    costs: MoveCosts,
     start: WarmStart,
     region: Bool[np.ndarray, " states"],
 ) -> None:
@@ -44,6 +46,7 @@ def solve_values(
         into: The result.
         equation: What is to be solved, and how well.
         bound: A lower bound of the values.
+        costs: What bounds the number of moves.
         start: Values and an order.
         region: The states that have to be solved.
     """
@@ -51,7 +54,7 @@ def solve_values(
     numbers = (process.probabilities, process.reward, process.terminal_reward, process.discount)
     if any(np.isnan(np.min(part)) for part in (*numbers, equation.backup.beta, equation.tolerance)):
         into.values[:] = np.nan
-        write_info(into, order, SolveInfo(0, np.nan, False))
+        write_info(into, order, SolveInfo(0, np.nan, np.inf, False))
         return
 
     if inverse_permutation(order) is None:
@@ -69,13 +72,13 @@ def solve_values(
         positions = np.arange(len(order), dtype=np.int32)
         if not region.all():
             positions = positions[region[begun.order]]
-        rules = equation.backup, equation.tolerance, max_sweeps, max_rounds
+        rules = equation.backup, costs, equation.tolerance, max_sweeps, max_rounds
         info = SweepLoop(begun.process, begun.values, begun.greedy_successor, positions, *rules).run()
         into.values[begun.order] = begun.values
         into.order[:] = begun.order
         return info
 
-    info = SolveInfo(0, np.inf, False)
+    info = SolveInfo(0, np.inf, np.inf, False)
     if (values > -np.inf).any():
         digits = -np.log10(max(equation.tolerance, np.finfo(values.dtype).eps))
         trusted = min(int(np.ceil(_TRUST * max(1.0, digits))), max_sweeps)
