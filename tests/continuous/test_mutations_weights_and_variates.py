@@ -64,8 +64,14 @@ def test_with_control_variates_in_the_table_equal_dense_sums():
     agent = sc.Agent(TABLE.dynamics, TABLE.policy, SOFT)
     actions = jnp.broadcast_to(jnp.arange(ACTIONS), (len(PLACES), ACTIONS))
     starts = sc.Starts(sc.task_at(TABLE.tasks, WHICH), PLACES, actions)
-    rolled = sc.sample_rollouts(agent, starts, jax.random.key(0), horizon=horizon, samples=2)
-    variates = np.asarray(with_control_variates(agent, rolled, some_critic(values)).transition_control_variates)
+
+    @eqx.filter_jit
+    def draw(critic):
+        rolled = sc.sample_rollouts(agent, starts, jax.random.key(0), horizon=horizon, samples=2)
+        return with_control_variates(agent, rolled, critic)
+
+    rolled = draw(some_critic(values))
+    variates = np.asarray(rolled.transition_control_variates)
 
     transitions = np.zeros((STATES, ACTIONS, STATES))
     successors, chances = np.asarray(TABLE.dynamics.model.graph.successors), TABLE.dynamics.model.probabilities()
