@@ -8,12 +8,12 @@ import pytest
 from helpers.spread import GOALS, STEP, at, demonstrations
 from helpers.walled import BLANK
 from sidestep.inference.batching import MEMORY, BatchPlan, plan_batches
-from sidestep.inference.objective import Objective, Problem
+from sidestep.inference.objective import Objective, Parameters, Problem
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.behavior_model import behavior_model
 from sidestep.tabular.demonstrations import Trajectory, gather
-from sidestep.tabular.graph import grid_graph
+from sidestep.tabular.graph import graph, grid_graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import ALL_TERMS, log_likelihood
 from sidestep.tabular.models import ObstacleGrid, TabularModel
@@ -21,7 +21,7 @@ from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.solvers.gauss_seidel import GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.solvers.native import cores
-from sidestep.tabular.tasks import reach
+from sidestep.tabular.tasks import reach, task
 
 SOLVERS = {"jacobi": Jacobi(), "gauss_seidel": GaussSeidel()}
 BEHAVIOR = Behavior(BoltzmannAverage(), 10.0)
@@ -87,6 +87,25 @@ def test_evaluate_equals_likelihood_and_prior_for_every_batch_size(name, memory)
     np.testing.assert_allclose([result.actions, result.transitions, result.prior], parts, rtol=1e-9)
     assert result.objective == pytest.approx(parts.sum(), rel=1e-9)
     np.testing.assert_allclose(result.gradient.model, gradient, rtol=1e-9, atol=1e-9 * np.abs(gradient).max())
+
+
+def test_evaluate_of_one_choice_has_tempered_actions_and_the_prior_of_behavior():
+    """Five choices gain 1, two gain nothing, and log β is 3 where it started at 2: with x = σ(−β) all is known."""
+    model = TabularModel(graph(np.array([[[1], [1]], [[1], [1]]])), jnp.zeros((2, 2, 1)))
+    gain = task(np.array([[1.0, 0.0], [0.0, 0.0]]), 0.9, np.arange(2) == 1)
+    demos = gather([Trajectory(np.array([0, 1]), np.array([action]), 0) for action in (0, 0, 1, 0, 0, 1, 0)], [gain])
+    agents = behavior_model(Behavior(BoltzmannAverage(), 2.0), ["beta"])
+    problem = Problem(model, agents, demos, Normal(0.5, 2.0), ALL_TERMS, SolveOptions(solver=Jacobi()), 0.3)
+    objective, beta = Objective(problem), 3.0
+    learned = agents.parameters._replace(log_beta=jnp.log(jnp.asarray([beta])))
+    result, _ = objective.evaluate(Parameters(model.parameters, learned), objective.cold_starts())
+    apart, x = np.log(beta / 2), 1 / (1 + np.exp(beta))
+    assert result.actions == pytest.approx(0.3 * (5 * np.log(1 - x) + 2 * np.log(x)), rel=1e-9)
+    assert result.prior == pytest.approx(-(apart**2) / 2 - 4 * 0.5**2 / 4, rel=1e-12)
+    assert result.transitions == 0
+    assert result.objective == pytest.approx(result.actions + result.prior, rel=1e-12)
+    slope = result.gradient.behavior.log_beta
+    np.testing.assert_allclose(slope, [-0.3 * beta * (5 * x - 2 * (1 - x)) + apart], rtol=1e-9)
 
 
 def test_batches_of_several_data_sizes_have_equal_shapes():

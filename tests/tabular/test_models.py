@@ -11,7 +11,7 @@ from helpers.problems import dense, dense_obstacles, dense_tabular, random_probl
 from sidestep.errors import InputError
 from sidestep.tabular.graph import graph, grid_graph
 from sidestep.tabular.grid import Cell, Grid
-from sidestep.tabular.models import ObstacleGrid, TabularModel, true_model
+from sidestep.tabular.models import ObstacleGrid, SlipperyGrid, TabularModel, closed, road_network, true_model
 
 seeds = st.integers(0, 2**32 - 1)
 connectivities = pytest.mark.parametrize("connectivity", [4, 8])
@@ -191,3 +191,29 @@ def test_with_parameters_leaves_the_model_as_it_was():
     moved = model.with_parameters(jnp.asarray([0.0, float(np.log(3))]))
     np.testing.assert_allclose(moved.blocked, [[0.5, 0.75]])
     np.testing.assert_allclose(model.blocked, [[0.5, 0.5]])
+
+
+# Slippery grids and roads
+
+
+def test_slippery_grid_in_the_open_slips_half_as_often_to_each_side():
+    """From the middle of nine free cells, with P(slip) = .3; and nothing stays."""
+    model = SlipperyGrid(Grid(np.full((3, 3), F)), slip=float(np.log(0.3 / 0.7)))
+    ahead, to_sides = [1, 7, 3, 5], [(3, 5), (3, 5), (1, 7), (1, 7)]
+    expected = np.zeros((4, 9))
+    for action, (straight, sides) in enumerate(zip(ahead, to_sides, strict=True)):
+        expected[action, straight], expected[action, list(sides)] = 0.7, 0.15
+    np.testing.assert_allclose(dense(model)[4], expected, rtol=1e-12, atol=1e-15)
+
+
+def test_road_network_by_turn_closes_turns_in_the_order_in_which_they_are_given():
+    """Turns come in any order; action k of a link is the k-th of its turns."""
+    turns = np.array([[2, 0], [0, 1], [1, 0], [0, 2], [1, 2], [2, 1], [0, 0]])
+    logits = np.linspace(-2, 2, len(turns))
+    shut = 1 / (1 + np.exp(-logits))
+    model = road_network(turns, np.ones(3), logits, by_turn=True)
+    np.testing.assert_allclose(closed(model), shut, rtol=1e-12)
+    actions = [0, 0, 0, 1, 1, 1, 2]
+    for (begin, onto), action, probability in zip(turns, actions, shut, strict=True):
+        assert model.graph.successors[begin, action].tolist() == [onto, begin]
+        np.testing.assert_allclose(model.probabilities()[begin, action], [1 - probability, probability], rtol=1e-12)

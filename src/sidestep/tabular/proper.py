@@ -54,7 +54,7 @@ def check_proper(task: Task, behavior: Behavior, world: Graph, horizon: int | No
     has_bonus, beta = isinstance(behavior.backup, LogSumExp), float(behavior.beta)
     bonus = np.log(available.sum(axis=1)) / beta if has_bonus else np.zeros(world.states)
     for index, ends in zip(np.flatnonzero(endless), terminal, strict=True):
-        gains = _largest_rewards(task, int(index), world, available, ends)
+        gains = _largest_rewards(task, int(index), world, available, ends, bonus)
         if (gains >= 0).any():
             raise ImproperTask(
                 "at discount 1 every action must cost something unless it surely ends the task: "
@@ -75,12 +75,13 @@ def _largest_rewards(
     world: Graph,
     available: Bool[np.ndarray, "states actions"],
     terminal: Bool[np.ndarray, " s"],
+    bonus: Float[np.ndarray, " states"],
 ) -> Float[np.ndarray, " states"]:
     """Return the largest reward of an action of each state that another action may follow; −∞ where there is none."""
     reward = np.asarray(task.reward).reshape(-1, *task.reward.shape[-2:])[index]
     if task.outcome_reward is None:
         gains = np.where(available, reward, -np.inf).max(axis=1)
-        if not (gains[~terminal] >= 0).any():
+        if not (gains >= -bonus)[~terminal].any():
             # no action gains, whether it ends the task or not
             return np.where(terminal, -np.inf, gains)
         of_outcomes = reward[..., None]
