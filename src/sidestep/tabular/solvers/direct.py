@@ -170,8 +170,8 @@ def adjoint_step(linear: Linearization, cotangent: Values, adjoint: Values) -> D
 def adjoint_error(linear: Linearization, cotangent: Values, adjoint: Values, discount: Float[Array, ""]) -> Array:
     """Return about how far λ is off, from what is left of its equation.
 
-    Below discount 1 that is no more than Σ |g + Wᵀλ − λ| / (1 − γ), for weights of at least 0. At discount 1 it is about
-    the part of max |λ| that this sum is of Σ |g|, because λ is linear in g.
+    Below discount 1 that is no more than Σ |g + Wᵀλ − λ| / (1 − γ), for weights of at least 0. At discount 1 it is
+    about the part of max |λ| that this sum is of Σ |g|, because λ is linear in g.
 
     Args:
         linear: The equations linearized at the fixed point.
