@@ -38,7 +38,7 @@ from .tabular.grid import Cell as Cell, Grid as Grid
 from .tabular.reward import Reward as Reward
 from .tabular.selection import join as join
 from .tabular.simulation import simulate as simulate
-from .tabular.tasks import Task as Task, reach as reach, stack_tasks as stack_tasks, task as task
+from .tabular.tasks import Task as Task, reach as reach, stack_tasks as stack_tasks, task as task, task_at as task_at
 
 # models: transition models of discrete worlds
 from .tabular.models import (

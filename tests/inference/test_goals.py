@@ -1,6 +1,7 @@
 """Unknown goals: the posterior over candidates, and what is learned with it."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -8,10 +9,11 @@ from sidestep.errors import InputError
 from sidestep.inference.fit import fit
 from sidestep.inference.goals import fit_goals, goal_posterior, weighted_demonstrations
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
+from sidestep.tabular.behavior_model import behavior_model
 from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import log_likelihood
-from sidestep.tabular.models import ObstacleGrid, true_model
+from sidestep.tabular.models import ObstacleGrid, tabular_model, true_model
 from sidestep.tabular.planning import plan
 from sidestep.tabular.simulation import simulate
 from sidestep.tabular.tasks import reach
@@ -102,3 +104,35 @@ def test_goal_posterior_of_a_path_past_all_candidates_raises():
     walk = Trajectory(states, np.array([2, 3]), 0)
     with pytest.raises(InputError, match=r"trajectory, row 2: continues after the terminal states of all candidates"):
         goal_posterior(WORLD, [trajectories()[0], walk], TASKS[:1], BEHAVIOR)
+
+
+def test_goal_posterior_by_a_behavior_model_is_that_of_its_behavior():
+    seen, learned = trajectories(cut=2), behavior_model(BEHAVIOR, learn=["beta"])
+    log_beta = jnp.full(1, np.log(3.0))
+    learned = learned.with_parameters(learned.parameters._replace(log_beta=log_beta))
+    posterior, log_likelihood = goal_posterior(WORLD, seen, TASKS, learned)
+    expected, total = goal_posterior(WORLD, seen, TASKS, Behavior(BoltzmannAverage(), 3.0))
+    np.testing.assert_allclose(posterior, expected, rtol=1e-9)
+    assert log_likelihood == pytest.approx(total)
+
+
+def test_goal_posterior_by_a_behavior_model_with_persons_is_refused():
+    persons = behavior_model(BEHAVIOR, learn=["beta"], person=np.arange(len(TASKS)))
+    with pytest.raises(InputError, match="persons"):
+        goal_posterior(WORLD, trajectories(), TASKS, persons)
+
+
+def test_fit_goals_with_a_learned_sharpness_has_the_posterior_by_what_was_learned():
+    seen, agents = trajectories(cut=2), behavior_model(Behavior(BoltzmannAverage(), 3.0), learn=["beta"])
+
+    def learn(model, shown):
+        return fit(model, shown, agents)
+
+    result = fit_goals(
+        tabular_model(WORLD.graph, WORLD.probabilities(), known=True), seen, TASKS, agents, learn, rounds=2
+    )
+    behavior = result.fit.behavior.behavior_of()
+    assert float(behavior.beta) > 6  # the walks have a sharpness of 30
+    expected, total = goal_posterior(WORLD, seen, TASKS, behavior, result.goal_probabilities)
+    np.testing.assert_allclose(result.posterior, expected, rtol=1e-9)
+    assert result.log_likelihoods[-1] == pytest.approx(total)

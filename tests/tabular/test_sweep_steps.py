@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import brentq
 from scipy.special import logsumexp
 
-from helpers.numbered_worlds import numbered_process, order_of, some_map
+from helpers.numbered_worlds import NO_COSTS, numbered_process, order_of, some_map
 from sidestep.tabular.solvers.native import BOLTZMANN, LOG_SUM_EXP, NativeBackup, compiled
 from sidestep.tabular.solvers.sweep_loop import SweepLoop
 from sidestep.tabular.solvers.value_kernels import Scratch, own_root
@@ -43,9 +43,9 @@ def test_jacobi_sweep_solves_each_state_as_if_it_were_the_only_one(kind):
     nearer = process.successors.min(axis=(1, 2))  # what each state is moved along with, elsewhere
 
     def swept(positions):
-        rules = backup, np.float64(1e-10), 100, 100
+        rules = backup, NO_COSTS, np.float64(1e-10), 100, 100
         loop = SweepLoop(process, values.copy(), nearer.copy(), np.asarray(positions, np.int32), *rules)
-        return loop.jacobi_sweep(), loop.values
+        return loop.jacobi_sweep()[0], loop.values
 
     residual, together = swept(np.arange(states))
     alone = [swept([position]) for position in range(states)]

@@ -15,7 +15,6 @@ References:
 
 from dataclasses import replace
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -27,6 +26,7 @@ from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, true_model
 from sidestep.tabular.planning import Plan, plan
+from sidestep.tabular.tasks import task_at
 
 _Visits = Float[np.ndarray, " cells"]
 _MAX_LOGIT = 6.0
@@ -82,7 +82,7 @@ def _predict(
     states, actions, task = (np.asarray(getattr(demonstrations, name)) for name in ("states", "actions", "task"))
     first = demonstrations.first_moves()
     for index in range(len(demonstrations.tasks.terminal)):
-        own_task = jax.tree.map(lambda leaf, index=index: leaf[index], demonstrations.tasks)
+        own_task = task_at(demonstrations.tasks, index)
         agents = plan(model, own_task, behavior)
         own = task == index
         total += float(np.log(np.asarray(agents.policy)[states[own], actions[own]]).sum())

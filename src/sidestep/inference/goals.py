@@ -26,10 +26,12 @@ from jaxtyping import Float
 
 from sidestep._arguments import to_finite
 from sidestep._repr import short_repr
-from sidestep.errors import InputError, NotConverged, check_count, check_function, check_instance, to_list, to_number
+from sidestep.errors import InputError, NotConverged, check, check_count, check_function, to_list, to_number
 from sidestep.inference.arguments import check_tasks
 from sidestep.inference.fit import Fit, Model
 from sidestep.tabular.backups import Behavior
+from sidestep.tabular.behavior_model import BehaviorModel
+from sidestep.tabular.checks import check_behavior
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory, flatten, gather, to_trajectories
 from sidestep.tabular.likelihood import log_policies
 from sidestep.tabular.models import TransitionModel
@@ -76,7 +78,7 @@ def goal_posterior(
     model: TransitionModel,
     trajectories: Sequence[Trajectory],
     candidates: Sequence[Task],
-    behavior: Behavior,
+    behavior: Behavior | BehaviorModel,
     goal_probabilities: Float[np.ndarray, " candidates"] | Sequence[float] | None = None,
 ) -> tuple[Float[np.ndarray, "trajectories candidates"], float]:
     """Return the posterior of each trajectory's goal, and the actions' log-likelihood.
@@ -85,7 +87,7 @@ def goal_posterior(
         model: The transition model.
         trajectories: Their tasks do not matter.
         candidates: The tasks that may be the goals.
-        behavior: The behavior of the agents.
+        behavior: The behavior of the agents; a `BehaviorModel` must not distinguish persons.
         goal_probabilities: p_g, by default equal.
 
     Returns:
@@ -109,7 +111,9 @@ def goal_posterior(
         1
     """
     tasks, walks = check_tasks(model, candidates, "candidates"), _checked(trajectories, model)
-    check_instance(behavior, Behavior, "behavior")
+    check_behavior(behavior, model.graph)
+    alike = isinstance(behavior, Behavior) or behavior.person is None
+    check(alike, "expected a behavior model that does not distinguish persons, found persons", field="behavior")
     if goal_probabilities is None:
         goal_probabilities = np.full(len(tasks), 1 / len(tasks))
     probabilities = np.asarray(to_finite(goal_probabilities, "goal_probabilities", (len(tasks),), least=0, most=1))
@@ -130,7 +134,7 @@ def fit_goals(
     model: Model,
     trajectories: Sequence[Trajectory],
     candidates: Sequence[Task],
-    behavior: Behavior,
+    behavior: Behavior | BehaviorModel,
     learn: Callable[[Model, Demonstrations], Fit[Model]],
     *,
     rounds: int = 40,
@@ -144,7 +148,8 @@ def fit_goals(
         model: The transition model to start from.
         trajectories: Their tasks do not matter.
         candidates: The tasks that may be the goals.
-        behavior: The behavior of the agents.
+        behavior: The behavior of the agents. Of a `BehaviorModel`, goals have the posterior under what the last fit has
+            learned.
         learn: A fit of weighted demonstrations that starts at a model, with the same behavior.
         rounds: The largest number of rounds, at least 1.
         tolerance: The largest change of a posterior probability that counts as none.
@@ -180,6 +185,7 @@ def fit_goals(
     while True:
         result = learn(model, weighted_demonstrations(trajectories, candidates, posterior))
         model, goal_probabilities, before = result.model, posterior.mean(axis=0), posterior
+        behavior = result.behavior if isinstance(behavior, BehaviorModel) else behavior
         posterior, log_likelihood = goal_posterior(model, trajectories, candidates, behavior, goal_probabilities)
         history.append(log_likelihood)
         change = float(np.abs(posterior - before).max())
@@ -216,7 +222,7 @@ def _checked(trajectories: Sequence[Trajectory], model: TransitionModel) -> list
 
 
 def _trajectory_log_likelihoods(
-    task: Task, model: TransitionModel, trajectories: Sequence[Trajectory], behavior: Behavior
+    task: Task, model: TransitionModel, trajectories: Sequence[Trajectory], behavior: Behavior | BehaviorModel
 ) -> Float[np.ndarray, " trajectories"]:
     """Return Σ_t log π(a_t | s_t) of each trajectory for a task; −∞ if it continues after a terminal state."""
     moves = flatten([trajectory._replace(task=0) for trajectory in trajectories], stack_tasks([task]))

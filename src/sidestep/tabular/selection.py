@@ -11,7 +11,7 @@ from jaxtyping import Array, Int
 from sidestep.errors import check
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.demonstrations import Demonstrations, Tasks, flat_moves
-from sidestep.tabular.tasks import Task, stack_tasks
+from sidestep.tabular.tasks import Task, stack_tasks, task_at
 
 
 def choose(demonstrations: Demonstrations[Tasks], chosen: Any) -> Demonstrations[Tasks]:
@@ -77,7 +77,7 @@ def join(parts: Sequence[Demonstrations[Task]]) -> Demonstrations[Task]:
     check(len(set(states)) == 1, f"expected the same number of states in all parts, found {states}", field="parts")
     known = [part.person is not None for part in parts]
     check(all(known) or not any(known), "expected persons in all parts or in none", field="parts")
-    every = [jax.tree.map(lambda leaf, at=at: leaf[at], part.tasks) for part in parts for at in range(_count(part))]
+    every = [task_at(part.tasks, at) for part in parts for at in range(_count(part))]
     stacked = stack_tasks(every)
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(stacked)]
     _, first, which = np.unique(

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
-from sidestep._arguments import to_finite, to_floats, to_mask
+from sidestep._arguments import to_finite, to_floats, to_integers, to_mask
 from sidestep._repr import short_repr
 from sidestep.errors import InputError, check, check_instance, check_positive, describe, to_list, to_number
 from sidestep.tabular.arrays import is_traced, to_jax
@@ -171,6 +171,28 @@ def stack_tasks(tasks: Sequence[Task]) -> Task:
         return to_jax(np.stack([np.broadcast_to(np.asarray(leaf), shape) for leaf in leaves]))
 
     return jax.tree.map(stacked, *tasks)
+
+
+def task_at(tasks: Task, index: int) -> Task:
+    """Return one task of a stack.
+
+    Args:
+        tasks: The stack.
+        index: The index of the task; negative ones count from the end.
+
+    Raises:
+        InputError: For a single task, and the index of a task that does not exist.
+
+    Example:
+        >>> grid = Grid.unknown(rows=1, columns=3)
+        >>> task_at(stack_tasks([reach(grid, 0), reach(grid, 2)]), 1).terminal.tolist()
+        [False, False, True]
+    """
+    check_instance(tasks, Task, "tasks")
+    check(tasks.terminal.ndim > 1, "expected a stack of tasks, found a single task", field="tasks")
+    count = len(tasks.terminal)
+    at = int(to_integers(index, "index", (), least=-count, most=count - 1))
+    return jax.tree.map(lambda leaf: leaf[at], tasks)
 
 
 def with_state_costs(tasks: Task, costs: Float[Array, " states"], aimed_at: Int[Array, "states actions"]) -> Task:

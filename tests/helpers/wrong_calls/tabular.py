@@ -65,6 +65,10 @@ CASES = [
         ("a task of another world", lambda: ss.plan(MODEL, ss.task(np.zeros(7), 0.9, np.arange(7) == 3)), "task"),
         ("stack_tasks of two worlds", lambda: ss.stack_tasks([TASK, OTHER_TASK]), "tasks"),
         ("stack_tasks of one task", lambda: ss.stack_tasks(TASK), "tasks"),
+        ("task_at of one task", lambda: ss.task_at(TASK, 0), "tasks"),
+        ("task_at of a state", lambda: ss.task_at(3, 0), "tasks"),
+        ("task_at of a task that does not exist", lambda: ss.task_at(ss.stack_tasks([TASK]), 1), "index"),
+        ("task_at of half a task", lambda: ss.task_at(ss.stack_tasks([TASK]), 0.5), "index"),
         ("stack_tasks of states", lambda: ss.stack_tasks([3]), "tasks"),
     ]),
     *labeled("graphs", [
