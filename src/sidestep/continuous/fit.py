@@ -29,7 +29,7 @@ from sidestep.continuous.planner import Planner, PlannerState, plan_policy
 from sidestep.continuous.policies import Agent, SomePolicy
 from sidestep.continuous.tasks import task_at
 from sidestep.continuous.verification import Verification, verify
-from sidestep.errors import NotConverged, check
+from sidestep.errors import NotConverged, check, check_function, to_count
 from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
 from sidestep.inference.priors import Normal, Prior
 from sidestep.tabular.backups import Behavior
@@ -42,8 +42,8 @@ if TYPE_CHECKING:
 Family = TypeVar("Family", bound=Dynamics)
 _NEWTON_STEPS = 3
 """The most steps by which a fit is refined."""
-_NOISE_OF_STEPS = 1.5
-"""The noise of a step, as a multiple of that of the last verification: the steps' noise averages out."""
+_FOLLOWING_RATE = 0.5
+"""Where the policy's rate begins before each verification, as a fraction of the first iteration's."""
 
 
 @short_repr("dynamics", "planner_state", "problem", "message", "converged")
@@ -142,8 +142,13 @@ def fit_dynamics(
     References:
         Eqs. 6, 11 and 12 of the paper.
     """
-    agent, schedule = Agent(dynamics, policy, behavior), schedule or Schedule()
-    problem = FitProblem(agent, demonstrations, prior or Normal(), planner, schedule, terms, estimator)
+    agent, schedule = Agent(dynamics, policy, behavior), Schedule() if schedule is None else schedule
+    seed = to_count(seed, "seed", 0)
+    if report is not None:
+        check_function(report, "report")
+    problem = FitProblem(
+        agent, demonstrations, Normal() if prior is None else prior, planner, schedule, terms, estimator
+    )
     saver = Saver(checkpoint, problem_fingerprint((problem, seed)) if checkpoint is not None else "")
     warmup_key, key = jax.random.split(jax.random.key(seed))
     initial_key, warmup_key = jax.random.split(warmup_key)
@@ -229,14 +234,10 @@ def _refined(problem: FitProblem, state: _State, history: list[FitProgress], key
         dynamics = problem.agent.dynamics.with_parameters(to_parameters(jnp.asarray(flat, state.total.dtype)))
         policy_key, rollout_key = jax.random.split(jax.random.fold_in(key, step))
         if "actions" in problem.terms:
-            for iteration in range(_last_quarter(schedule) // 2):
-                inner = jax.random.fold_in(policy_key, iteration)
-                planner_state = _follow(problem, dynamics.parameters, planner_state, inner)
-        last = step == _NEWTON_STEPS
-        noise = schedule.noise_tolerance * (1.0 if last else _NOISE_OF_STEPS)
-        verified = verify(problem, dynamics, planner_state, rollout_key, noise=noise)
-        near = verified.distance <= schedule.distance_tolerance / 3 and verified.noise <= schedule.noise_tolerance
-        if near or last:
+            planner_state = _followed(problem, dynamics.parameters, planner_state, policy_key)
+        verified = verify(problem, dynamics, planner_state, rollout_key, noise=schedule.noise_tolerance)
+        near = verified.distance <= schedule.distance_tolerance / 3 and verified.passes(schedule)
+        if near or step == _NEWTON_STEPS:
             break
         step += 1
         flat = flat + verified.step * (1.0 if verified.distance > 2 * verified.noise else 1 / (step + 1))
@@ -244,8 +245,15 @@ def _refined(problem: FitProblem, state: _State, history: list[FitProgress], key
     return ContinuousFit(dynamics, planner_state, problem, tuple(history), verified, converged, message)
 
 
+def _followed(problem: FitProblem, parameters: FloatTree, state: Tree, key: PRNGKeyArray) -> Tree:
+    """Return the policy and its critic after a quarter of the iterations at one θ, with rates that fall."""
+    steps = _last_quarter(problem.schedule)
+    for step, fraction in enumerate(np.geomspace(_FOLLOWING_RATE, _FOLLOWING_RATE / 10, steps).astype(np.float32)):
+        state = _follow(problem, parameters, state, jax.random.fold_in(key, step), jnp.asarray(fraction))
+    return state
+
+
 @eqx.filter_jit
-def _follow(problem: FitProblem, parameters: FloatTree, state: Tree, key: PRNGKeyArray) -> Tree:
-    """Make one step of the policy and its critic, at the rates of the last iteration."""
-    last = jnp.asarray(problem.schedule.iterations)
-    return problem.improve_policy(parameters, state, key, problem.schedule.fraction(last))
+def _follow(problem: FitProblem, parameters: FloatTree, state: Tree, key: PRNGKeyArray, fraction: Array) -> Tree:
+    """Make one step of the policy and its critic."""
+    return problem.improve_policy(parameters, state, key, fraction)
