@@ -207,6 +207,28 @@ def test_fit_dynamics_few_iterations_are_not_converged():
     assert f"the maximum is {result.verification.distance:.2g} posterior standard deviations away" in result.message
 
 
+class SechDrift(LaplaceDrift):
+    """A drift with steps of a density in proportion to sech(s′ − s − a − θ)."""
+
+    def log_prob(self, state, action, next_state):
+        away = (next_state - state - action - self.parameters).sum()
+        return -jnp.logaddexp(away, -away)
+
+
+def test_fit_dynamics_newton_step_too_far_is_taken_back():
+    """Two away from a single move, Newton's step ends far beyond the maximum; a third of it ends near."""
+    demos = demonstrations_of(np.zeros(1), np.ones(1, int), np.zeros(1))
+    schedule = sc.Schedule(2, batch_size=1, learning_rate=1e-6)
+    prior = ss.Normal(0.0, 1e6)
+    result = sc.fit_dynamics(
+        SechDrift(vector(2.0)), demos, *AGENTS, prior=prior, terms=("transitions",), schedule=schedule
+    )
+    at = float(result.dynamics.parameters[0])
+    assert result.verification.distance == pytest.approx(abs(np.sinh(at)), abs=1e-3)
+    assert abs(at) < 0.6
+    assert result.converged
+
+
 def test_fit_dynamics_noise_above_its_tolerance_is_not_converged():
     schedule = sc.Schedule(16, policy_warmup=0, batch_size=30, distance_tolerance=0.01, verification_samples=8)
     result = learn(terms=("actions",), schedule=schedule)

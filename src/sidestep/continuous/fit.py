@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -219,30 +219,52 @@ def _last_quarter(schedule: Schedule) -> int:
     return max(1, schedule.iterations // 4)
 
 
+class _Verified(NamedTuple):
+    """A state that is verified: θ as one vector, policy and critic, and how far θ is from the maximum."""
+
+    flat: np.ndarray
+    planner_state: PlannerState[Any]
+    verification: Verification
+
+
+def _clearly_worse(after: Verification, before: Verification) -> bool:
+    """Return whether one state is farther from the maximum than another, by more than the noise of both."""
+    return bool(after.distance > before.distance + np.hypot(after.noise, before.noise))
+
+
 def _refined(problem: FitProblem, state: _State, history: list[FitProgress], key: PRNGKeyArray) -> ContinuousFit:
     """Return the result, after Newton steps from the mean of θ over the last quarter of the iterations.
 
     The k-th step goes one part of k + 1, so that the noise of all of them averages out (Robbins and Monro 1951); but
-    one that is much longer than its noise goes the whole way. Each has rollouts of its own, and so has the last
-    verification, which no step follows.
+    one that is much longer than its noise goes the whole way. One that leads clearly farther from the maximum is taken
+    back. Each has rollouts of its own, and so has the last verification, which no step follows.
     """
     schedule = problem.schedule
-    flat, to_parameters = ravel_pytree(state.parameters)
-    flat = np.asarray(state.total, np.float64) / _last_quarter(schedule)
-    planner_state, step = state.planner_state, 0
-    while True:
-        dynamics = problem.agent.dynamics.with_parameters(to_parameters(jnp.asarray(flat, state.total.dtype)))
-        policy_key, rollout_key = jax.random.split(jax.random.fold_in(key, step))
+    to_parameters = ravel_pytree(state.parameters)[1]
+
+    def family(flat: np.ndarray) -> Dynamics:
+        return problem.agent.dynamics.with_parameters(to_parameters(jnp.asarray(flat, state.total.dtype)))
+
+    def verified(flat: np.ndarray, planner_state: PlannerState[Any], step: int) -> _Verified:
+        dynamics, (policy_key, rollout_key) = family(flat), jax.random.split(jax.random.fold_in(key, step))
         if "actions" in problem.terms:
             planner_state = _followed(problem, dynamics.parameters, planner_state, policy_key)
-        verified = verify(problem, dynamics, planner_state, rollout_key, noise=schedule.noise_tolerance)
-        near = verified.distance <= schedule.distance_tolerance / 3 and verified.passes(schedule)
-        if near or step == _NEWTON_STEPS:
+        verification = verify(problem, dynamics, planner_state, rollout_key, noise=schedule.noise_tolerance)
+        return _Verified(flat, planner_state, verification)
+
+    best = verified(np.asarray(state.total, np.float64) / _last_quarter(schedule), state.planner_state, 0)
+    whole = True
+    for step in range(1, _NEWTON_STEPS + 1):
+        current = best.verification
+        if current.distance <= schedule.distance_tolerance / 3 and current.passes(schedule):
             break
-        step += 1
-        flat = flat + verified.step * (1.0 if verified.distance > 2 * verified.noise else 1 / (step + 1))
-    converged, message = verified.passes(schedule), verified.message(schedule)
-    return ContinuousFit(dynamics, planner_state, problem, tuple(history), verified, converged, message)
+        share = 1.0 if whole and current.distance > 2 * current.noise else 1 / (step + 1)
+        after = verified(best.flat + share * current.step, best.planner_state, step)
+        whole = not _clearly_worse(after.verification, current)
+        best = after if whole else best
+    last = best.verification
+    converged, message = last.passes(schedule), last.message(schedule)
+    return ContinuousFit(family(best.flat), best.planner_state, problem, tuple(history), last, converged, message)
 
 
 def _followed(problem: FitProblem, parameters: FloatTree, state: Tree, key: PRNGKeyArray) -> Tree:
