@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import sidestep as ss
-from helpers.wrong_calls import data, learning, maps, models, right, small, tabular
+from helpers.wrong_calls import continuous, data, learning, maps, models, right, small, tabular
 from sidestep.errors import InputError
 
-CASES = [*data.CASES, *models.CASES, *learning.CASES, *maps.CASES, *tabular.CASES]
+CASES = [*data.CASES, *models.CASES, *learning.CASES, *maps.CASES, *tabular.CASES, *continuous.CASES]
 RIGHT = right.CASES | tabular.RIGHT
 
 

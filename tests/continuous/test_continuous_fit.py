@@ -130,8 +130,8 @@ def test_fit_dynamics_vector_actions_give_the_true_drift():
 def test_fit_dynamics_policy_warmup_plans_for_the_first_model():
     """Without the actions' term there is no policy to plan."""
     by_both, by_transitions = fitted()[0], BOTH(terms=("transitions",))
-    # before each verification, the policy has as many steps as an eighth of the iterations
-    assert by_both.planner_state.policy_moments[0].count - (2 + 16) in (2, 4, 6, 8)
+    # before each verification, the policy has as many steps as a quarter of the iterations
+    assert by_both.planner_state.policy_moments[0].count - (2 + 16) in (4, 8, 12, 16)
     assert by_transitions.planner_state.policy_moments[0].count == 0
 
 
@@ -207,6 +207,28 @@ def test_fit_dynamics_few_iterations_are_not_converged():
     assert f"the maximum is {result.verification.distance:.2g} posterior standard deviations away" in result.message
 
 
+class SechDrift(LaplaceDrift):
+    """A drift with steps of a density in proportion to sech(s′ − s − a − θ)."""
+
+    def log_prob(self, state, action, next_state):
+        away = (next_state - state - action - self.parameters).sum()
+        return -jnp.logaddexp(away, -away)
+
+
+def test_fit_dynamics_newton_step_too_far_is_taken_back():
+    """Two away from a single move, Newton's step ends far beyond the maximum; a third of it ends near."""
+    demos = demonstrations_of(np.zeros(1), np.ones(1, int), np.zeros(1))
+    schedule = sc.Schedule(2, batch_size=1, learning_rate=1e-6)
+    prior = ss.Normal(0.0, 1e6)
+    result = sc.fit_dynamics(
+        SechDrift(vector(2.0)), demos, *AGENTS, prior=prior, terms=("transitions",), schedule=schedule
+    )
+    at = float(result.dynamics.parameters[0])
+    assert result.verification.distance == pytest.approx(abs(np.sinh(at)), abs=1e-3)
+    assert abs(at) < 0.6
+    assert result.converged
+
+
 def test_fit_dynamics_noise_above_its_tolerance_is_not_converged():
     schedule = sc.Schedule(16, policy_warmup=0, batch_size=30, distance_tolerance=0.01, verification_samples=8)
     result = learn(terms=("actions",), schedule=schedule)
@@ -238,6 +260,19 @@ def test_fit_dynamics_horizon_with_values_beyond_it_is_not_converged():
         prior=PRIOR, terms=("actions",), schedule=replace(LONG, policy_gap_tolerance=0.02),
     )  # fmt: skip
     assert result.verification.beyond_horizon > 0.02
+    assert "the horizon is too short: values at its end would move the policy by" in result.message
+    assert not result.converged
+
+
+def test_fit_dynamics_of_one_move_sees_the_values_after_it():
+    """Rewards are paid in the next state: one move looks at none, and its choices would change with them."""
+    schedule = sc.Schedule(4, policy_warmup=40, batch_size=MOVES, learning_rate=1e-3, verification_samples=8)
+    soft, myopic = ss.Behavior(ss.LogSumExp(), 1.5), sc.Planner(horizon=1, samples=2, critic_width=4)
+    settings = {"prior": PRIOR, "terms": ("actions",), "schedule": schedule}
+    result = sc.fit_dynamics(INITIAL, DEMONSTRATIONS, soft, POLICY, myopic, **settings)
+    # β γ Q differs between actions by the squares of where they lead
+    expected = log_policy(-0.5, STATES) - log_policy(-0.5, STATES).mean(axis=1, keepdims=True)
+    assert result.verification.beyond_horizon == pytest.approx(np.mean(expected**2) / 2, rel=0.2)
     assert "the horizon is too short: values at its end would move the policy by" in result.message
     assert not result.converged
 
@@ -416,11 +451,13 @@ def test_schedule_refuses_settings_out_of_range(setting, expected):
 def test_fit_dynamics_no_moves_are_refused():
     nothing = jax.tree.map(lambda leaf: leaf[:0], eqx.tree_at(lambda demos: demos.tasks, DEMONSTRATIONS, None))
     nothing = eqx.tree_at(lambda demos: demos.tasks, nothing, DEMONSTRATIONS.tasks, is_leaf=lambda leaf: leaf is None)
-    with pytest.raises(ss.InputError, match="'states': expected starts and a task for each, found 0"):
+    with pytest.raises(ss.InputError, match="'states': expected one or more starts, found shape"):
         sc.fit_dynamics(INITIAL, nothing, *AGENTS)
 
 
 def test_fit_dynamics_infinite_rewards_raise():
     demos = with_tasks(eqx.tree_at(lambda task: task.state_cost, NEAR, 1e308 * jnp.eye(1)))
-    with pytest.raises(ss.NotConverged, match="the figures ceased to be finite at iteration 0: dynamics or rewards"):
+    with pytest.raises(
+        ss.NotConverged, match="ceased to be finite at step 0: the first rollouts have features or returns"
+    ):
         sc.fit_dynamics(INITIAL, demos, *AGENTS, prior=PRIOR, terms=("actions",), schedule=LONG)

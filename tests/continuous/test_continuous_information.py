@@ -11,6 +11,7 @@ import pytest
 import sidestep as ss
 import sidestep.continuous as sc
 from helpers.families import Drift, vector
+from sidestep.continuous.information import RolloutInformation
 from sidestep.inference.decomposition import whole
 from sidestep.inference.normal_posterior import Laplace
 
@@ -126,6 +127,28 @@ def test_laplace_of_vector_actions_has_the_information_of_a_normal_policy():
     np.testing.assert_allclose(ss.laplace(result).standard_errors.model, [information**-0.5], rtol=0.05)
 
 
+def test_information_of_vector_actions_knows_the_noise_of_drawn_choices():
+    """The noise of the gradient over draws of choices and rollouts is what the difference of its halves says."""
+    task = sc.QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.eye(1), jnp.asarray(0.6))
+    random = np.random.default_rng(3)
+    states, actions = random.uniform(-2, 2, 60), random.normal(size=(60, 1))
+    demos = demonstrations_of(states, actions, states + actions[:, 0] + TRUTH, task)
+    result = sc.fit_dynamics(
+        Drift(vector(TRUTH), vector(NOISE)), demos, ss.Behavior(ss.LogSumExp(), 4.0),
+        sc.gaussian_policy(jax.random.key(0), 1, demos.states, depth=0, spread=0.5),
+        sc.Planner(horizon=2, batch_size=16, samples=2, candidates=4, critic_width=4),
+        prior=ss.Normal(0.0, VARIANCE), terms=("actions",), estimator="pathwise",
+        schedule=sc.Schedule(iterations=2, policy_warmup=0, verification_samples=8),
+    )  # fmt: skip
+    problem, dynamics, planner_state = result.problem, result.dynamics, result.planner_state
+    drawn = [RolloutInformation(problem, dynamics, planner_state, samples=8, seed=seed) for seed in range(24)]
+    noise = np.var([each.gradient[0] for each in drawn], ddof=1)
+    known = [
+        each.simulation(Laplace(each.parameters, *whole(each)))[1] * each.products(np.eye(1))[0, 0] for each in drawn
+    ]
+    assert np.mean(known) / 2 < noise < 2 * np.mean(known)
+
+
 def test_laplace_of_linear_dynamics_has_the_covariance_of_least_squares():
     states, choices, _ = walks()
     seen = np.column_stack([WAYS[choices], states])  # in the order of the parameters' names
@@ -159,7 +182,10 @@ def test_laplace_of_a_continuous_fit_that_has_not_converged_raises():
 
 
 def test_laplace_of_few_rollouts_raises():
-    few = fitted(("actions",), "score").information(samples=2)
+    with_wrong_critic = eqx.tree_at(
+        lambda fit: fit.planner_state.critic.spread, fitted(("actions",), "score"), jnp.asarray(10.0)
+    )
+    few = with_wrong_critic.information(samples=2)
     with pytest.raises(ss.InputError, match="'samples': expected a gradient without much noise"):
         ss.laplace(few)
 

@@ -122,7 +122,9 @@ def test_batch_tasks_task_at_returns_each():
     "tasks", [[], [pendulum_task(0.0), QUADRATIC], [sc.reach_region((1.0,), 1.0), sc.reach_region((1.0, 2.0), 1.0)]]
 )
 def test_batch_tasks_of_different_kinds_are_refused(tasks):
-    with pytest.raises(ss.InputError, match="field 'tasks': expected at least one task, all of a kind"):
+    with pytest.raises(
+        ss.InputError, match=r"field 'tasks': expected (at least 1, found 0|tasks of one kind and shape)"
+    ):
         sc.batch_tasks(tasks)
 
 

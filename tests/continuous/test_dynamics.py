@@ -40,6 +40,7 @@ class Evaluation(NamedTuple):
     differences: np.ndarray
     variates: np.ndarray
     linear: np.ndarray
+    of_scores: np.ndarray
     moved: np.ndarray
 
 
@@ -61,8 +62,10 @@ def evaluate(name) -> Evaluation:
         beside = jax.vmap(lambda flat: at(flat).log_prob(state, action, samples[0]))(flat + steps)
         variates = jax.vmap(dynamics.transition_control_variate, (None, None, None, 0))(curved, state, action, points)
         linear = jax.vmap(dynamics.transition_control_variate, (None, None, None, 0))(straight, state, action, samples)
+        of_score = jax.grad(lambda flat, point: at(flat).score_control_variate(curved, state, action, point))
+        of_scores = jax.vmap(of_score, (None, 0))(flat, points)
         moved = at(flat + 0.1).sample(keys[0], state, action) - samples[0]
-        return samples, log_probs, slope, beside, variates, linear, moved
+        return samples, log_probs, slope, beside, variates, linear, of_scores, moved
 
     keys = jax.random.split(jax.random.key(0, impl="unsafe_rbg"), SAMPLES)  # good enough, and compiles quickly
     both = jnp.concatenate([steps, -steps])
@@ -119,8 +122,19 @@ def test_transition_control_variate_has_mean_0_and_removes_linear_noise(name):
         np.testing.assert_allclose(seen.linear, expected - mean, atol=1e-6)
 
 
-def test_transition_control_variate_default_is_0():
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted((GAUSSIAN.keys() | {"table"}) - {"walls"}))  # known walls have no parameters
+def test_score_control_variate_derivative_has_mean_0(name):
+    seen = evaluate(name)
+    volume = 1.0 if name == "table" else np.asarray(GAUSSIAN[name].dynamics.noise).prod()
+    masses = np.exp(seen.log_probs) * volume
+    np.testing.assert_allclose(masses @ seen.of_scores, 0, atol=1e-6 * np.abs(seen.of_scores).max())
+    assert masses @ seen.of_scores**2 @ np.ones(seen.of_scores.shape[1]) > 1e-6
+
+
+def test_control_variates_default_is_0():
     assert not evaluate("Laplace").variates.any()
+    assert not evaluate("Laplace").of_scores.any()
 
 
 def test_table_dynamics_sample_frequencies_match_probabilities():
@@ -324,23 +338,25 @@ def test_pendulum_constants_not_above_0_are_refused(name, wrong):
 
 
 def test_pendulum_unknown_name_is_refused():
-    refused(lambda: sc.Pendulum(unknown=("color",)), match=r"'unknown': expected some of .*'length'.*, found .*color")
+    refused(
+        lambda: sc.Pendulum(unknown=("color",)), match="'unknown': expected one of gravity, mass, length, found 'color'"
+    )
 
 
 def test_point_mass_bad_settings_are_refused():
     refused(lambda: sc.PointMass(friction=0.0), match="'friction': expected a finite number above 0, found 0")
     refused(lambda: sc.PointMass(time_step=-0.1), match="'time_step': expected a finite number above 0")
-    refused(lambda: sc.PointMass(wind=(np.nan, 0.0)), match="'parameters': expected finite numbers")
+    refused(lambda: sc.PointMass(wind=(np.nan, 0.0)), match="'wind': expected finite numbers")
 
 
 def test_linear_gaussian_not_finite_is_refused():
-    refused(lambda: sc.LinearGaussian(jnp.eye(2) * jnp.inf, jnp.eye(2), NOISE), match="'parameters': expected finite")
+    refused(lambda: sc.LinearGaussian(jnp.eye(2) * jnp.inf, jnp.eye(2), NOISE), match="'state': expected finite")
 
 
 @pytest.mark.parametrize(("low", "high"), [((0, 0), (1, 0)), ((2, 0), (1, 1)), ((0, np.nan), (1, 1))])
 def test_corners_out_of_order_are_refused(low, high):
     low, high = vector(*low), vector(*high)
-    match = "field 'low, high': expected corners in order"
+    match = "field 'low, high': expected corners in order|field 'low': expected finite numbers, found nan"
     refused(lambda: sc.ObstacleMotion(WALLS, low, high, NOISE), match=match)
     refused(lambda: sc.radial_field(low, high, (2, 2)), match=match)
     refused(lambda: sc.network_field(jax.random.key(0), low, high), match=match)
@@ -348,9 +364,12 @@ def test_corners_out_of_order_are_refused(low, high):
 
 @pytest.mark.parametrize("counts", [(2,), (1, 3), (2, 2, 2), (0, 2)])
 def test_radial_field_fewer_than_two_centers_a_side_are_refused(counts):
-    refused(lambda: sc.radial_field(LOW, HIGH, counts), match="'counts': expected 2 numbers of at least 2")
+    refused(
+        lambda: sc.radial_field(LOW, HIGH, counts),
+        match=r"'counts': expected numbers of points(, at least 2,| of shape \(2,\),) found",
+    )
 
 
 def test_obstacle_motion_logits_not_finite_are_refused():
-    field = sc.radial_field(LOW, HIGH, (2, 2), logit=np.nan)
+    field = sc.RadialField(jnp.full(4, np.nan), jnp.zeros((4, 2)), width=1.0)
     refused(lambda: sc.ObstacleMotion(field, LOW, HIGH, NOISE), match="'parameters': expected finite numbers")

@@ -177,12 +177,12 @@ def test_action_values_between_points_look_one_move_ahead():
 @pytest.mark.parametrize(
     ("low", "high"), [([0, 0], [1, 0]), ([0, 2], [1, 1]), ([0, 0], [1, np.inf]), ([np.nan, 0], [1, 1])]
 )
-def test_lattice_corners_out_of_order_are_refused(low, high):
-    with pytest.raises(ss.InputError, match="field 'low, high': expected corners in order"):
+def test_lattice_corners_out_of_order_or_not_finite_are_refused(low, high):
+    with pytest.raises(ss.InputError, match=r"'low, high': expected corners in order|expected finite numbers, found"):
         sc.Lattice(jnp.asarray(low, float), jnp.asarray(high, float), (2, 2))
 
 
 @pytest.mark.parametrize(("counts", "periodic"), [((1, 2), None), ((2,), None), ((2, 2, 2), None), ((2, 2), (True,))])
 def test_lattice_fewer_than_two_points_a_side_are_refused(counts, periodic):
-    with pytest.raises(ss.InputError, match="field 'counts': expected 2 numbers of at least 2"):
+    with pytest.raises(ss.InputError, match=r"expected (numbers of points|booleans)(, at least 2| of shape \(2,\))"):
         sc.Lattice(jnp.zeros(2), jnp.ones(2), counts, periodic)

@@ -138,7 +138,7 @@ def test_make_critic_constant_returns_have_spread_1():
 
 @pytest.mark.parametrize("actions", [jnp.ones((1, 2)), jnp.zeros((0, 2)), jnp.asarray([[1.0], [np.nan]])])
 def test_finite_policy_fewer_than_two_finite_actions_are_refused(actions):
-    with pytest.raises(ss.InputError, match="field 'actions': expected two or more actions of finite numbers"):
+    with pytest.raises(ss.InputError, match=r"field 'actions': expected (two or more|finite numbers), found"):
         sc.finite_policy(KEY, actions, EXAMPLES)
 
 
@@ -150,7 +150,7 @@ def test_gaussian_policy_spread_not_above_0_is_refused(spread):
 
 @pytest.mark.parametrize("examples", [jnp.zeros((0, 3)), EXAMPLES.at[1, 1].set(jnp.inf)])
 def test_policy_without_finite_examples_is_refused(examples):
-    match = "field 'examples': expected one or more rows of finite numbers"
+    match = r"field 'examples': expected (one or more rows|finite numbers), found"
     with pytest.raises(ss.InputError, match=match):
         sc.finite_policy(KEY, ACTIONS, examples)
     with pytest.raises(ss.InputError, match=match):

@@ -14,20 +14,20 @@ With one outcome, s′ = m_θ(s, a) + noise · ε, and ε can be held fixed whil
 """
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float, PRNGKeyArray, Scalar, Shaped
 
+from sidestep._arguments import to_finite, to_integers
 from sidestep._repr import short_repr
 from sidestep._typing import ArrayTree, FloatTree, Tree
-from sidestep.errors import InputError, check
+from sidestep.errors import InputError, check, check_instance
 from sidestep.tabular.models import TransitionModel
 
 State = Shaped[Array, "*state"]
@@ -96,6 +96,19 @@ class Dynamics(eqx.Module):
         """
         return jnp.zeros((), jnp.result_type(float))
 
+    def score_control_variate(self, value: ValueFunction, state: State, action: Action, next_state: State) -> Real:
+        """Return a number with the derivative ∇ ln T(s, a, s′) v(s′) − ∇E[v(s′)] by θ, which has mean 0.
+
+        Score estimates subtract it; v is a function close to `value`. It is 0 unless a family defines it.
+
+        Args:
+            value: A function of the state, in units of reward; gradients by θ do not pass through it.
+            state: The state s.
+            action: The action a.
+            next_state: The next state s′.
+        """
+        return jnp.zeros((), jnp.result_type(float))
+
     def with_parameters(self: _Family, parameters: FloatTree) -> _Family:
         """Return the same family at another θ.
 
@@ -130,7 +143,7 @@ class GaussianDynamics(Dynamics):
     """Gaussian noise around one or several outcomes.
 
     A new family is a subclass with `outcomes`, and with `example_action` where actions do not have the state's shape.
-    A subclass that replaces `sample` or `log_prob` must replace `transition_control_variate` too, to keep its mean 0.
+    A subclass that replaces `sample` or `log_prob` must replace both control variates too, to keep their means 0.
 
     Attributes:
         noise: The standard deviation of every component of the state, above 0; it is not learned.
@@ -200,14 +213,38 @@ class GaussianDynamics(Dynamics):
             next_state: The next state s′.
         """
         outcomes = self.outcomes(state, action)
-        values, slopes = jax.vmap(jax.value_and_grad(value))(outcomes.means)
-        linear = values + jnp.sum(slopes * (next_state - outcomes.means), axis=-1)
+        values, linear, _ = _linear_values(value, outcomes, next_state)
         posterior = jax.nn.softmax(self._joint_log_probs(outcomes, next_state))
         return posterior @ linear - jnp.exp(outcomes.log_probabilities) @ values
+
+    def score_control_variate(self, value: ValueFunction, state: State, action: Action, next_state: State) -> Real:
+        """Return a number with the derivative Σ_k P(k | s′) ∇ ln (p_k N_k(s′)) v_k(s′) − ∇ Σ_k p_k v(m_k).
+
+        N_k(s′) is the density of outcome k, and v_k is linear as in `transition_control_variate`.
+
+        Args:
+            value: A function of the state, in units of reward; gradients by θ do not pass through it.
+            state: The state s.
+            action: The action a.
+            next_state: The next state s′.
+        """
+        outcomes, fixed = self.outcomes(state, action), jax.lax.stop_gradient
+        values, linear, slopes = map(fixed, _linear_values(value, fixed(outcomes), next_state))
+        joint, probabilities = self._joint_log_probs(outcomes, next_state), jnp.exp(outcomes.log_probabilities)
+        expected = probabilities @ values + jnp.sum(fixed(probabilities)[:, None] * slopes * outcomes.means)
+        return fixed(jax.nn.softmax(joint) * linear) @ joint - expected
 
     def _joint_log_probs(self, outcomes: Outcomes, next_state: State) -> Float[Array, " outcomes"]:
         """Return ln p_k + ln N(s′; m_k, diag(noise²))."""
         return outcomes.log_probabilities + norm.logpdf(next_state, outcomes.means, self.noise).sum(axis=-1)
+
+
+def _linear_values(
+    value: ValueFunction, outcomes: Outcomes, next_state: Vector
+) -> tuple[Float[Array, " outcomes"], Float[Array, " outcomes"], Float[Array, "outcomes dimensions"]]:
+    """Return v(m_k) of every outcome, v(m_k) + ∇v(m_k)·(s′ − m_k), and ∇v(m_k)."""
+    values, slopes = jax.vmap(jax.value_and_grad(value))(outcomes.means)
+    return values, values + jnp.sum(slopes * (next_state - outcomes.means), axis=-1), slopes
 
 
 class LinearGaussian(GaussianDynamics):
@@ -234,12 +271,15 @@ class LinearGaussian(GaussianDynamics):
     noise: Vector
 
     def __init__(self, state: Rows, action: Rows, noise: Vector):
-        self.noise = checked_noise(noise, len(state))
-        self.parameters = {"state": jnp.asarray(state), "action": jnp.asarray(action)}
-        fits = np.shape(state) == (len(state),) * 2 and np.ndim(action) == 2 and len(action) == len(state)
-        message = f"expected a square matrix and one with as many rows, found {np.shape(state)} and {np.shape(action)}"
-        check(fits, message, field="state, action")
-        check_finite(self.parameters)
+        matrices = (
+            to_finite(state, "state", ("dimensions", "dimensions")),
+            to_finite(action, "action", ("dimensions", "inputs")),
+        )
+        fits = matrices[0].shape == (len(matrices[0]),) * 2 and len(matrices[1]) == len(matrices[0])
+        shapes = " and ".join(str(matrix.shape) for matrix in matrices)
+        check(fits, f"expected a square matrix and one with as many rows, found {shapes}", field="state, action")
+        self.noise = checked_noise(noise, len(matrices[0]))
+        self.parameters = dict(zip(("state", "action"), map(jnp.asarray, matrices), strict=True))
 
     def example_action(self) -> Float[Array, " inputs"]:
         """Return an action with as many components as B has columns."""
@@ -267,6 +307,7 @@ class TableDynamics(Dynamics):
     model: TransitionModel
 
     def __init__(self, model: TransitionModel):
+        check_instance(model, TransitionModel, "model")
         self.model = model
 
     @property
@@ -325,8 +366,21 @@ class TableDynamics(Dynamics):
         successors = self.model.graph.successors[state, action].astype(next_state.dtype)
         return value(next_state) - self._probabilities(state, action) @ jax.vmap(value)(successors)
 
+    def score_control_variate(self, value: ValueFunction, state: State, action: Action, next_state: State) -> Real:
+        """Return a number with the derivative ∇ ln T(s, a, s′) v(s′) − ∇E[v(s′)] of the value function itself.
 
-def checked_noise(noise: Float[Array, " _"] | np.ndarray, dimensions: int) -> Vector:
+        Args:
+            value: A function of the state, in units of reward; gradients by θ do not pass through it.
+            state: The state s.
+            action: The action a.
+            next_state: The next state s′.
+        """
+        successors = self.model.graph.successors[state, action].astype(next_state.dtype)
+        log_prob = self.log_prob(state, action, next_state)
+        return log_prob * value(next_state) - self._probabilities(state, action) @ jax.vmap(value)(successors)
+
+
+def checked_noise(noise: Float[Array, " _"] | np.ndarray | Sequence[float], dimensions: int) -> Vector:
     """Return standard deviations as floating-point numbers; refuse any that are not finite and above 0.
 
     Args:
@@ -339,12 +393,7 @@ def checked_noise(noise: Float[Array, " _"] | np.ndarray, dimensions: int) -> Ve
     Raises:
         InputError: For another number of them, or any not finite and above 0.
     """
-    noise = jnp.asarray(noise, jnp.result_type(float))
-    if noise.shape != (dimensions,):
-        raise InputError(f"expected {dimensions} numbers, one a component of the state, found {noise}", field="noise")
-    if not isinstance(noise, Tracer) and not (np.isfinite(noise).all() and (np.asarray(noise) > 0).all()):
-        raise InputError(f"expected finite numbers above 0, found {noise}", field="noise")
-    return noise
+    return jnp.asarray(to_finite(noise, "noise", (dimensions,), above=0), jnp.result_type(float))
 
 
 def check_finite(arrays: ArrayTree, field: str = "parameters") -> None:
@@ -358,8 +407,8 @@ def check_finite(arrays: ArrayTree, field: str = "parameters") -> None:
         InputError: For numbers that are not finite.
     """
     for leaf in jax.tree.leaves(arrays):
-        if not isinstance(leaf, Tracer) and not np.isfinite(leaf).all():
-            raise InputError("expected finite numbers", field=field)
+        if getattr(getattr(leaf, "dtype", None), "kind", "f") not in "biu":  # whole numbers and booleans are finite
+            to_finite(leaf, field)
 
 
 def check_corners(low: Vector, high: Vector) -> None:
@@ -372,5 +421,20 @@ def check_corners(low: Vector, high: Vector) -> None:
     Raises:
         InputError: For corners that are not finite or not in order.
     """
-    if not (np.isfinite(low).all() and np.isfinite(high).all() and (np.asarray(low) < np.asarray(high)).all()):
+    lower = np.asarray(to_finite(low, "low", ("dimensions",)))
+    upper = np.asarray(to_finite(high, "high", lower.shape))
+    if not (lower < upper).all():
         raise InputError(f"expected corners in order, found {low} and {high}", field="low, high")
+
+
+def checked_counts(counts: Sequence[int], dimensions: int) -> tuple[int, ...]:
+    """Return the number of points along each side of a lattice.
+
+    Args:
+        counts: The numbers.
+        dimensions: How many there should be.
+
+    Raises:
+        InputError: For other than as many whole numbers of at least 2.
+    """
+    return tuple(to_integers(counts, "counts", (dimensions,), least=2, what="numbers of points").tolist())

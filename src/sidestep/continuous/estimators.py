@@ -5,12 +5,16 @@ estimator (Williams 1992),
 
     ∇_θ Q^π(s_0, a_0) = E [ Σ_i ∇_θ ln T_θ(s_i, a_i, s_{i+1}) γ^i (Q̂_i + z_i − E_i) ].
 
-It differs from eq. 11 as printed in three points.
+It differs from eq. 11 as printed in four points.
 
 1. Terms of mean 0 are left out: rewards that were paid before a transition do not depend on it.
 2. The *baseline* E_i is subtracted. It may be any function of s_i and a_i, because ∇_θ ln T_θ has mean 0 given these;
    here it is the critic's estimate of Q^π, V_w(s_i) − b_i.
 3. z_i is added back, because the credit of a transition is the effect of its own draw.
+4. The part of this effect that the critic knows has its mean in place of its draw: with the credit that the critic
+   expects of s_{i+1}, u = R_i + γ V_w(s_{i+1}) − E_i, the number ∇ ln T_θ u − ∇E[u], which has mean 0, is subtracted
+   (`score_control_variate`). With an exact critic no noise of this draw is left. Gu et al. (2017) have the same control
+   variate for draws of actions.
 
 The **pathwise** estimate (Kingma and Welling 2014) is the derivative of Q̂_0 along the path, with the random numbers
 held fixed. It requires reparameterized dynamics and smooth rewards; its variance is then far lower on stable systems.
@@ -27,14 +31,15 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from sidestep._typing import FloatTree
-from sidestep.continuous.dynamics import Dynamics, PerCandidate, PerSample
+from sidestep.continuous.dynamics import Dynamics, PerCandidate, PerSample, ValueFunction
 from sidestep.continuous.policies import Agent, Critic, Starts
 from sidestep.continuous.rollouts import Rollout, q_estimates, sample_rollouts
 from sidestep.continuous.tasks import ContinuousTask
-from sidestep.errors import InputError, check
+from sidestep.errors import InputError, check_choice, check_function, check_instance
 
 Estimator = Literal["score", "pathwise"]
 
@@ -53,19 +58,26 @@ def with_control_variates(agent: Agent[Any], rollouts: Rollout, critic: Critic) 
     Returns:
         The same rollouts with other `transition_control_variates`.
     """
-    one_move = 1 / rollouts.acting.shape[-1]
 
     def variate(task: ContinuousTask, state: Array, choice: Array, following: Array, left: Array) -> Array:
-        def value(state: Array) -> Array:
-            going_on = jnp.where(left > 0.5 * one_move, critic(task.features(state), left), 0.0)
-            return jnp.where(task.terminal(state), task.terminal_reward(state), going_on)
-
-        action = agent.policy.action(choice)
+        action, value = agent.policy.action(choice), _value_after(task, critic, left, one_move)
         return task.discount * agent.dynamics.transition_control_variate(value, state, action, following)
 
-    variates = rollouts.at_every_move(variate, rollouts.choices, rollouts.following, rollouts.fraction_left - one_move)
+    one_move = 1 / rollouts.acting.shape[-1]
+    variates = rollouts.at_every_move(variate, rollouts.choices, rollouts.following, rollouts.fraction_left)
     variates = jax.lax.stop_gradient(jnp.where(rollouts.acting, variates, 0.0)).astype(rollouts.rewards.dtype)
     return eqx.tree_at(lambda rollouts: rollouts.transition_control_variates, rollouts, variates)
+
+
+def _value_after(task: ContinuousTask, critic: Critic, left: Array, one_move: float) -> ValueFunction:
+    """Return the value of a next state by a critic, when the fraction `left` of the horizon is left before the move."""
+
+    def value(state: Array) -> Array:
+        after = left - one_move
+        going_on = jnp.where(after > 0.5 * one_move, critic(task.features(state), after), 0.0)
+        return jnp.where(task.terminal(state), task.terminal_reward(state), going_on)
+
+    return value
 
 
 def score_surrogate(agent: Agent[Any], rollouts: Rollout, critic: Critic | None = None) -> Float[Array, "*batch"]:
@@ -93,14 +105,45 @@ def score_surrogate(agent: Agent[Any], rollouts: Rollout, critic: Critic | None 
     References:
         Eq. 11 of the paper, with the differences that the module's docstring lists.
     """
-    beyond = q_estimates(rollouts) + rollouts.transition_control_variates - rollouts.action_baselines(critic)
-    credit = rollouts.discount_powers(rollouts.acting.shape[-1]) * jnp.where(rollouts.acting, beyond, 0.0)
+    check_instance(agent, Agent, "agent")
+    check_instance(rollouts, Rollout, "rollouts")
+    check_instance(critic, (Critic, type(None)), "critic")
+    term, arrays = _score_terms(agent, rollouts, critic)
+    terms = rollouts.at_every_move(lambda *move: term(agent.dynamics, *move), *arrays)
+    return jnp.sum(terms, axis=-1)
 
-    def log_prob(_: ContinuousTask, state: Array, choice: Array, following: Array) -> Array:
-        return agent.dynamics.log_prob(state, agent.policy.action(choice), following)
 
-    log_probs = rollouts.at_every_move(log_prob, rollouts.choices, rollouts.following)
-    return jnp.sum(log_probs * jax.lax.stop_gradient(credit), axis=-1)
+def _score_terms(agent: Agent[Any], rollouts: Rollout, critic: Critic | None) -> tuple[Callable, tuple[Array, ...]]:
+    """Return a function of the dynamics and of what a move has, and the arrays of what moves have.
+
+    The sum of the function over the moves of a rollout has the score estimate as its derivative by θ.
+    """
+    moves = rollouts.acting.shape[-1]
+    baselines, one_move = rollouts.action_baselines(critic), 1 / moves
+    powers = jnp.broadcast_to(rollouts.discount_powers(moves), baselines.shape)
+    credit = powers * (q_estimates(rollouts) + rollouts.transition_control_variates - baselines)
+    known = rollouts.rewards[..., :-1] - baselines
+
+    def term(
+        dynamics: Dynamics,
+        task: ContinuousTask,
+        state: Array,
+        choice: Array,
+        following: Array,
+        left: Array,
+        power: Array,
+        credit: Array,
+        known: Array,
+    ) -> Array:
+        move = state, agent.policy.action(choice), following
+        total = dynamics.log_prob(*move) * credit
+        if critic is None:
+            return total
+        value = _value_after(task, critic, left, one_move)
+        return total - power * dynamics.score_control_variate(lambda at: known + task.discount * value(at), *move)
+
+    fixed = jax.lax.stop_gradient((rollouts.fraction_left, powers, credit, known))
+    return term, (rollouts.choices, rollouts.following, *fixed)
 
 
 def pathwise_surrogate(agent: Agent[Any], rollouts: Rollout, critic: Critic | None = None) -> Float[Array, "*batch"]:
@@ -170,6 +213,10 @@ def value_gradient(
     References:
         Eq. 11 of the paper.
     """
+    check_instance(agent, Agent, "agent")
+    check_instance(starts, Starts, "starts")
+    check_function(weight_function, "weight_function")
+    check_instance(critic, (Critic, type(None)), "critic")
     check_estimator(estimator, agent.dynamics, starts.tasks)
 
     def total(parameters: FloatTree) -> tuple[Array, Rollout]:
@@ -217,6 +264,60 @@ def sample_surrogates(
     return surrogates, jax.lax.stop_gradient(rollouts)
 
 
+def half_gradients(
+    agent: Agent[Any],
+    starts: Starts,
+    key: PRNGKeyArray,
+    critic: Critic,
+    estimator: Estimator,
+    *,
+    horizon: int,
+    half: int,
+) -> tuple[Float[Array, "2 starts candidates parameters"], Rollout]:
+    """Return the estimates of ∇_θ Q^π of every candidate by each of two halves of the rollouts.
+
+    Args:
+        agent: T_θ, π and the backup.
+        starts: The tasks, the states, and the candidates of each.
+        key: Draws everything random.
+        critic: V_w of baseline and control variates.
+        estimator: "score" or "pathwise".
+        horizon: τ, the number of moves, 1 or more.
+        half: Rollouts of each candidate in each half, 1 or more.
+
+    Returns:
+        The gradients with the entries of `ravel_pytree` of the parameters, and all rollouts.
+    """
+    flat, to_parameters = ravel_pytree(agent.dynamics.parameters)
+    size, shape = {"horizon": horizon, "samples": 2 * half}, starts.choices.shape[:2]
+    if estimator == "pathwise":
+
+        def of_candidate(task: ContinuousTask, state: Array, choice: Array, key: PRNGKeyArray) -> tuple[Array, Rollout]:
+            start = Starts(jax.tree.map(lambda leaf: leaf[None], task), state[None], choice[None, None])
+
+            def means(flat: Array) -> tuple[Array, Rollout]:
+                sampled = sample_surrogates(agent, to_parameters(flat), start, key, critic, estimator, **size)
+                return sampled[0].reshape(2, half).mean(axis=1), jax.tree.map(lambda leaf: leaf[0, 0], sampled[1])
+
+            return jax.jacrev(means, has_aux=True)(flat)
+
+        # the candidates of one start share their random numbers
+        of_start = jax.vmap(of_candidate, (None, None, 0, None))
+        keys = jax.random.split(key, len(starts.states))
+        slopes, rollouts = jax.vmap(of_start)(starts.tasks, starts.states, starts.choices, keys)
+        return jnp.moveaxis(slopes, 2, 0), rollouts
+    rollouts = with_control_variates(agent, sample_rollouts(agent, starts, key, **size), critic)
+    term, arrays = _score_terms(agent, rollouts, critic)
+
+    def of_move(flat: Array, *move: Any) -> Array:
+        return term(agent.dynamics.with_parameters(to_parameters(flat)), *move)
+
+    each = jnp.arange(2 * shape[0] * shape[1]).reshape(*shape, 2, 1)
+    groups = jnp.broadcast_to(jnp.repeat(each, half, axis=2), rollouts.acting.shape)
+    sums = rollouts.gradient_sums(of_move, flat, groups, each.size, *arrays)
+    return jnp.moveaxis(sums.reshape(*shape, 2, -1), 2, 0) / half, rollouts
+
+
 def check_estimator(estimator: Estimator, dynamics: Dynamics, tasks: ContinuousTask) -> None:
     """Refuse an estimator that does not exist, or is biased for these dynamics or tasks.
 
@@ -228,10 +329,11 @@ def check_estimator(estimator: Estimator, dynamics: Dynamics, tasks: ContinuousT
     Raises:
         InputError: For another name, or an estimator that is biased here.
     """
-    check(estimator in ("score", "pathwise"), f"expected 'score' or 'pathwise', found {estimator!r}", field="estimator")
+    check_choice(estimator, ("score", "pathwise"), "estimator")
     if estimator == "pathwise" and not (dynamics.reparameterized and tasks.smooth):
         what = "these dynamics jump" if not dynamics.reparameterized else "the returns of these tasks jump"
-        raise InputError(f"{what}, and gradients along the path do not see that: expected 'score'", field="estimator")
+        message = f"{what}, and gradients along the path do not see that: expected 'score', found {estimator!r}"
+        raise InputError(message, field="estimator")
 
 
 def _cross_weights(q: PerSample, weight_function: WeightFunction) -> PerSample:

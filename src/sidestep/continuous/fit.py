@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -29,7 +29,7 @@ from sidestep.continuous.planner import Planner, PlannerState, plan_policy
 from sidestep.continuous.policies import Agent, SomePolicy
 from sidestep.continuous.tasks import task_at
 from sidestep.continuous.verification import Verification, verify
-from sidestep.errors import NotConverged, check
+from sidestep.errors import NotConverged, check, check_function, to_count
 from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
 from sidestep.inference.priors import Normal, Prior
 from sidestep.tabular.backups import Behavior
@@ -42,8 +42,8 @@ if TYPE_CHECKING:
 Family = TypeVar("Family", bound=Dynamics)
 _NEWTON_STEPS = 3
 """The most steps by which a fit is refined."""
-_NOISE_OF_STEPS = 1.5
-"""The noise of a step, as a multiple of that of the last verification: the steps' noise averages out."""
+_FOLLOWING_RATE = 0.5
+"""Where the policy's rate begins before each verification, as a fraction of the first iteration's."""
 
 
 @short_repr("dynamics", "planner_state", "problem", "message", "converged")
@@ -142,8 +142,13 @@ def fit_dynamics(
     References:
         Eqs. 6, 11 and 12 of the paper.
     """
-    agent, schedule = Agent(dynamics, policy, behavior), schedule or Schedule()
-    problem = FitProblem(agent, demonstrations, prior or Normal(), planner, schedule, terms, estimator)
+    agent, schedule = Agent(dynamics, policy, behavior), Schedule() if schedule is None else schedule
+    seed = to_count(seed, "seed", 0)
+    if report is not None:
+        check_function(report, "report")
+    problem = FitProblem(
+        agent, demonstrations, Normal() if prior is None else prior, planner, schedule, terms, estimator
+    )
     saver = Saver(checkpoint, problem_fingerprint((problem, seed)) if checkpoint is not None else "")
     warmup_key, key = jax.random.split(jax.random.key(seed))
     initial_key, warmup_key = jax.random.split(warmup_key)
@@ -214,38 +219,63 @@ def _last_quarter(schedule: Schedule) -> int:
     return max(1, schedule.iterations // 4)
 
 
+class _Verified(NamedTuple):
+    """A state that is verified: θ as one vector, policy and critic, and how far θ is from the maximum."""
+
+    flat: np.ndarray
+    planner_state: PlannerState[Any]
+    verification: Verification
+
+
+def _clearly_worse(after: Verification, before: Verification) -> bool:
+    """Return whether one state is farther from the maximum than another, by more than the noise of both."""
+    return bool(after.distance > before.distance + np.hypot(after.noise, before.noise))
+
+
 def _refined(problem: FitProblem, state: _State, history: list[FitProgress], key: PRNGKeyArray) -> ContinuousFit:
     """Return the result, after Newton steps from the mean of θ over the last quarter of the iterations.
 
     The k-th step goes one part of k + 1, so that the noise of all of them averages out (Robbins and Monro 1951); but
-    one that is much longer than its noise goes the whole way. Each has rollouts of its own, and so has the last
-    verification, which no step follows.
+    one that is much longer than its noise goes the whole way. One that leads clearly farther from the maximum is taken
+    back. Each has rollouts of its own, and so has the last verification, which no step follows.
     """
     schedule = problem.schedule
-    flat, to_parameters = ravel_pytree(state.parameters)
-    flat = np.asarray(state.total, np.float64) / _last_quarter(schedule)
-    planner_state, step = state.planner_state, 0
-    while True:
-        dynamics = problem.agent.dynamics.with_parameters(to_parameters(jnp.asarray(flat, state.total.dtype)))
-        policy_key, rollout_key = jax.random.split(jax.random.fold_in(key, step))
+    to_parameters = ravel_pytree(state.parameters)[1]
+
+    def family(flat: np.ndarray) -> Dynamics:
+        return problem.agent.dynamics.with_parameters(to_parameters(jnp.asarray(flat, state.total.dtype)))
+
+    def verified(flat: np.ndarray, planner_state: PlannerState[Any], step: int) -> _Verified:
+        dynamics, (policy_key, rollout_key) = family(flat), jax.random.split(jax.random.fold_in(key, step))
         if "actions" in problem.terms:
-            for iteration in range(_last_quarter(schedule) // 2):
-                inner = jax.random.fold_in(policy_key, iteration)
-                planner_state = _follow(problem, dynamics.parameters, planner_state, inner)
-        last = step == _NEWTON_STEPS
-        noise = schedule.noise_tolerance * (1.0 if last else _NOISE_OF_STEPS)
-        verified = verify(problem, dynamics, planner_state, rollout_key, noise=noise)
-        near = verified.distance <= schedule.distance_tolerance / 3 and verified.noise <= schedule.noise_tolerance
-        if near or last:
+            planner_state = _followed(problem, dynamics.parameters, planner_state, policy_key)
+        verification = verify(problem, dynamics, planner_state, rollout_key, noise=schedule.noise_tolerance)
+        return _Verified(flat, planner_state, verification)
+
+    best = verified(np.asarray(state.total, np.float64) / _last_quarter(schedule), state.planner_state, 0)
+    whole = True
+    for step in range(1, _NEWTON_STEPS + 1):
+        current = best.verification
+        if current.distance <= schedule.distance_tolerance / 3 and current.passes(schedule):
             break
-        step += 1
-        flat = flat + verified.step * (1.0 if verified.distance > 2 * verified.noise else 1 / (step + 1))
-    converged, message = verified.passes(schedule), verified.message(schedule)
-    return ContinuousFit(dynamics, planner_state, problem, tuple(history), verified, converged, message)
+        share = 1.0 if whole and current.distance > 2 * current.noise else 1 / (step + 1)
+        after = verified(best.flat + share * current.step, best.planner_state, step)
+        whole = not _clearly_worse(after.verification, current)
+        best = after if whole else best
+    last = best.verification
+    converged, message = last.passes(schedule), last.message(schedule)
+    return ContinuousFit(family(best.flat), best.planner_state, problem, tuple(history), last, converged, message)
+
+
+def _followed(problem: FitProblem, parameters: FloatTree, state: Tree, key: PRNGKeyArray) -> Tree:
+    """Return the policy and its critic after a quarter of the iterations at one θ, with rates that fall."""
+    steps = _last_quarter(problem.schedule)
+    for step, fraction in enumerate(np.geomspace(_FOLLOWING_RATE, _FOLLOWING_RATE / 10, steps).astype(np.float32)):
+        state = _follow(problem, parameters, state, jax.random.fold_in(key, step), jnp.asarray(fraction))
+    return state
 
 
 @eqx.filter_jit
-def _follow(problem: FitProblem, parameters: FloatTree, state: Tree, key: PRNGKeyArray) -> Tree:
-    """Make one step of the policy and its critic, at the rates of the last iteration."""
-    last = jnp.asarray(problem.schedule.iterations)
-    return problem.improve_policy(parameters, state, key, problem.schedule.fraction(last))
+def _follow(problem: FitProblem, parameters: FloatTree, state: Tree, key: PRNGKeyArray, fraction: Array) -> Tree:
+    """Make one step of the policy and its critic."""
+    return problem.improve_policy(parameters, state, key, fraction)

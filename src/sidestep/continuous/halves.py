@@ -12,16 +12,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sidestep._typing import FloatTree, Tree
 from sidestep.continuous.dynamics import Dynamics, Real
-from sidestep.continuous.estimators import jackknife, sample_surrogates
+from sidestep.continuous.estimators import half_gradients, jackknife
+from sidestep.continuous.gaps import policy_gaps
 from sidestep.continuous.likelihood import ActionLikelihood, FitProblem
-from sidestep.continuous.planner import PlannerState, policy_gaps
+from sidestep.continuous.planner import PlannerState
 from sidestep.continuous.policies import Agent, Critic, FinitePolicy, Starts
-from sidestep.continuous.rollouts import Rollout, q_estimates
+from sidestep.continuous.rollouts import Rollout, q_estimates, returns_to_go, sample_rollout
 from sidestep.continuous.tasks import ContinuousTask, task_at, task_features
 
 _ROLLOUTS = 2**13
@@ -86,41 +85,48 @@ def _batch_halves(
     samples: int,
 ) -> Halves:
     demos, planner, critic = problem.demonstrations, problem.planner, planner_state.critic
-    choice_key, rollout_key = jax.random.split(key)
     tasks, states, observed = task_at(demos.tasks, demos.task[moves]), demos.states[moves], demos.actions[moves]
-    drawn, probabilities = planner.candidate_actions(choice_key, agent.policy, tasks, states)
-    likelihood = ActionLikelihood(agent, Starts(tasks, states, drawn), observed)
+    finite = isinstance(agent.policy, FinitePolicy)
+    sets = []
+    for index in range(1 if finite else 2):
+        choice_key, rollout_key = jax.random.split(jax.random.fold_in(key, index))
+        drawn, probabilities = planner.candidate_actions(choice_key, agent.policy, tasks, states)
+        likelihood = ActionLikelihood(agent, Starts(tasks, states, drawn), observed)
+        sets.append(_of_candidates(problem, likelihood, critic, probabilities, rollout_key, samples // 2))
+    if finite:
+        return sets[0]
+    # each half of the scores has candidates of its own, so that their difference has the noise of drawing these
+    factors = jnp.concatenate([each.factors for each in sets], axis=2) / jnp.sqrt(2.0)
+    scores = jnp.stack([each.scores.mean(axis=0) for each in sets])
+    figures = (jnp.stack(parts).mean(axis=0) for parts in zip(*(each[2:] for each in sets), strict=True))
+    return Halves(factors, scores, *figures)
+
+
+def _of_candidates(
+    problem: FitProblem,
+    likelihood: ActionLikelihood,
+    critic: Critic,
+    probabilities: Array,
+    key: PRNGKeyArray,
+    half: int,
+) -> Halves:
+    """Return what the rollouts of some candidates say; `probabilities` are those of the drawn ones."""
+    agent, beta = likelihood.agent, likelihood.agent.behavior.beta
     starts, probabilities = likelihood.candidates(probabilities)
-    half = samples // 2
-
-    def of_candidate(task: Tree, state: Array, choice: Array, key: PRNGKeyArray) -> tuple[Array, tuple]:
-        """Return ∇Q of both halves of the rollouts; Q and what is left at the end of each rollout."""
-        start = Starts(jax.tree.map(lambda leaf: leaf[None], task), state[None], choice[None, None])
-        size = {"horizon": planner.horizon, "samples": 2 * half}
-
-        def means(parameters: FloatTree) -> tuple[Array, tuple]:
-            surrogates, rollouts = sample_surrogates(agent, parameters, start, key, critic, problem.estimator, **size)
-            of_each = q_estimates(rollouts)[..., 0], _ends(rollouts, critic)
-            of_each = jax.tree.map(lambda leaf: leaf.reshape(2, half), of_each)
-            return surrogates.reshape(2, half).mean(axis=1), of_each
-
-        slopes, of_each = jax.jacrev(means, has_aux=True)(agent.dynamics.parameters)
-        return jax.vmap(lambda slope: ravel_pytree(slope)[0])(slopes), of_each
-
-    # the candidates of one start share their random numbers
-    of_start = jax.vmap(of_candidate, (None, None, 0, None))
-    keys = jax.random.split(rollout_key, len(moves))
-    by_candidate = jax.vmap(of_start)(starts.tasks, starts.states, starts.choices, keys)
+    rollout_key, end_key = jax.random.split(key)
+    size = {"horizon": problem.planner.horizon, "half": half}
+    slopes, rollouts = half_gradients(agent, starts, rollout_key, critic, problem.estimator, **size)
+    of_each = q_estimates(rollouts)[..., 0], _ends(agent, rollouts, critic, end_key)
     # the halves first
-    slopes, (q, ends) = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 2, 0), by_candidate)
+    q, ends = jax.tree.map(lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:2], 2, half), 2, 0), of_each)
     pi = likelihood.probabilities(q.mean(axis=(0, -1)))
     # drawn choices have less spread than the policy, by the part that each has in their mean
     drawn_again = 0.0 if isinstance(agent.policy, FinitePolicy) else jnp.sum(pi**2, axis=1)[:, None, None]
     beyond = slopes - jnp.sum(pi[..., None] * slopes, axis=2, keepdims=True)
-    factors = agent.behavior.beta * jnp.sqrt(pi[..., None] / (1 - drawn_again)) * beyond
+    factors = beta * jnp.sqrt(pi[..., None] / (1 - drawn_again)) * beyond
     weights = jnp.stack([jackknife(likelihood.weights, each) for each in q[::-1]])  # each half has those of the other
     scores = jnp.sum(weights[..., None] * slopes, axis=2)
-    left = agent.behavior.beta * ends.value.mean(axis=-1)
+    left = beta * ends.value.mean(axis=-1)
     left = left - jnp.sum(pi * left, axis=-1, keepdims=True)
     unfinished = jnp.sum(pi * ends.unfinished.mean(axis=(0, -1)), axis=-1)
     gaps = policy_gaps(agent.behavior, _advantages(agent, starts), jnp.concatenate(q, axis=-1), probabilities)
@@ -134,18 +140,23 @@ def _advantages(agent: Agent[Any], starts: Starts) -> Float[Array, "starts candi
     return log_probs + jax.vmap(agent.policy.entropy)(features)[:, None]
 
 
-def _ends(rollouts: Rollout, critic: Critic) -> _Ends:
-    """Return what is left at the end of each rollout; the critic's value there is that of a whole horizon."""
-    moves = rollouts.acting.shape[-1]
+def _ends(agent: Agent[Any], rollouts: Rollout, critic: Critic, key: PRNGKeyArray) -> _Ends:
+    """Return what is left at the end of each rollout: the critic's value there, which is that of a whole horizon.
 
-    def end(task: ContinuousTask, state: Array, acting: Array) -> tuple[Real, Real]:
+    With a horizon of one move no critic is fitted; one more move takes its place.
+    """
+    moves = rollouts.acting.shape[-1]
+    keys = jax.random.split(key, rollouts.acting.shape[::2])  # the candidates of a start share their random numbers
+
+    def end(task: ContinuousTask, state: Array, acting: Array, key: PRNGKeyArray) -> tuple[Real, Real]:
         going_on = task.discount**moves * (acting & ~task.terminal(state))
         ending = type(task).terminal is not ContinuousTask.terminal
-        # the critic is fitted from the second move on
-        return going_on * critic(task.features(state), jnp.asarray(1 - 1 / moves)), going_on * ending
+        if moves == 1:
+            value = returns_to_go(sample_rollout(agent, task, key, state, 1))[0]
+        else:  # the critic is fitted from the second move on
+            value = critic(task.features(state), jnp.asarray(1 - 1 / moves))
+        return going_on * value, going_on * ending
 
-    function = end
-    for _ in rollouts.acting.shape[:-1]:
-        function = jax.vmap(function)
-    last = rollouts.states[(slice(None),) * (rollouts.acting.ndim - 1) + (-1,)]
-    return _Ends(*function(rollouts.task, last, rollouts.acting[..., -1]))
+    of_samples = jax.vmap(end)
+    of_candidates = jax.vmap(of_samples, (0, 0, 0, None))
+    return _Ends(*jax.vmap(of_candidates)(rollouts.task, rollouts.states[:, :, :, -1], rollouts.acting[..., -1], keys))

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sidestep.continuous.dynamics import GaussianDynamics, Vector, check_corners
+from sidestep._arguments import to_finite, to_mask
+from sidestep.continuous.dynamics import GaussianDynamics, Vector, check_corners, checked_counts
 from sidestep.continuous.tasks import ContinuousTask
-from sidestep.errors import InputError
+from sidestep.errors import check_instance
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.models import TabularModel
@@ -50,11 +51,13 @@ class Lattice(eqx.Module):
     periodic: tuple[bool, ...] = eqx.field(static=True)
 
     def __init__(self, low: Vector, high: Vector, counts: tuple[int, ...], periodic: tuple[bool, ...] | None = None):
-        self.low, self.high = jnp.asarray(low), jnp.asarray(high)
-        self.counts, self.periodic = counts, periodic or (False,) * len(counts)
         check_corners(low, high)
-        if not len(counts) == len(self.periodic) == len(low) or min(counts) < 2:
-            raise InputError(f"expected {len(low)} numbers of at least 2, found {counts}", field="counts")
+        self.low, self.high = jnp.asarray(low), jnp.asarray(high)
+        self.counts = checked_counts(counts, len(self.low))
+        rings = (
+            (False,) * len(self.low) if periodic is None else to_mask(periodic, "periodic", (len(self.low),)).tolist()
+        )
+        self.periodic = tuple(rings)
 
     @property
     def size(self) -> int:
@@ -115,6 +118,9 @@ class LatticePlanner(eqx.Module):
         behavior: Its backup and β.
         lattice: The points of its values.
 
+    Raises:
+        InputError: For arguments of other types, and actions that are not finite.
+
     References:
         Munos and Moore (2002), "Variable Resolution Discretization in Optimal Control".
     """
@@ -123,6 +129,12 @@ class LatticePlanner(eqx.Module):
     actions: Float[Array, "actions inputs"]
     behavior: Behavior
     lattice: Lattice
+
+    def __check_init__(self) -> None:
+        check_instance(self.dynamics, GaussianDynamics, "dynamics")
+        check_instance(self.behavior, Behavior, "behavior")
+        check_instance(self.lattice, Lattice, "lattice")
+        to_finite(self.actions, "actions", ("actions", "inputs"))
 
     def landing(self, mean: Vector) -> tuple[Int[Array, " landing"], Float[Array, " landing"]]:
         """Return the points where an outcome leads, and their probabilities: those of interpolation, without its noise.

@@ -26,11 +26,11 @@ from sidestep.continuous.planner import Planner, PlannerState, PlanProgress, che
 from sidestep.continuous.policies import Agent, FinitePolicy, GaussianPolicy, Policy, Starts
 from sidestep.continuous.rollouts import q_estimates
 from sidestep.continuous.tasks import check_tasks, task_at, task_features
-from sidestep.errors import InputError, check, check_count, check_positive, input_errors
+from sidestep.errors import InputError, check, check_count, check_instance, check_positive, input_errors
 from sidestep.inference.priors import Prior
 from sidestep.tabular.backups import LogSumExp
 from sidestep.tabular.demonstrations import Demonstrations
-from sidestep.tabular.likelihood import ALL_TERMS, Term
+from sidestep.tabular.likelihood import Term, check_terms
 
 _Moves = Int[Array, " batch"]
 
@@ -91,7 +91,7 @@ class Schedule(eqx.Module):
     policy_steps: int = eqx.field(default=1, static=True)
     distance_tolerance: float = eqx.field(default=0.75, static=True)
     policy_gap_tolerance: float = eqx.field(default=0.1, static=True)
-    verification_samples: int = eqx.field(default=256, static=True)
+    verification_samples: int = eqx.field(default=512, static=True)
 
     def __check_init__(self):
         least = {"iterations": 2, "policy_warmup": 0, "batch_size": 1, "policy_steps": 1, "verification_samples": 8}
@@ -135,12 +135,14 @@ class FitProblem(eqx.Module):
 
     def __check_init__(self) -> None:
         agent, demos = self.agent, self.demonstrations
+        check_instance(demos, Demonstrations, "demonstrations")
+        for name, kind in {"prior": Prior, "planner": Planner, "schedule": Schedule}.items():
+            check_instance(getattr(self, name), kind, name)
+        check_terms(self.terms)
+        check_tasks(demos.tasks)
         _check_choices(demos, agent.policy)
-        message = f"expected one or both of {ALL_TERMS}, found {self.terms}"
-        check(self.terms and set(self.terms) <= set(ALL_TERMS), message, field="terms")
         check(jax.tree.leaves(agent.dynamics.parameters), "expected parameters to learn, found none", field="dynamics")
         check_finite(agent.dynamics.parameters)
-        check_tasks(demos.tasks)
         check_starts(demos.states, demos.task, demos.tasks)
         check_estimator(self.estimator, agent.dynamics, demos.tasks)
         check(

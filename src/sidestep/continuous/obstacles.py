@@ -21,9 +21,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, Scalar
 
+from sidestep._arguments import to_key
 from sidestep._typing import FloatTree, Tree
-from sidestep.continuous.dynamics import GaussianDynamics, Outcomes, Vector, check_corners, check_finite, checked_noise
-from sidestep.errors import InputError
+from sidestep.continuous.dynamics import (
+    GaussianDynamics,
+    Outcomes,
+    Vector,
+    check_corners,
+    check_finite,
+    checked_counts,
+    checked_noise,
+)
+from sidestep.errors import check_instance, to_count, to_number
 
 
 class Field(eqx.Module):
@@ -87,8 +96,7 @@ def radial_field(low: Vector, high: Vector, counts: Sequence[int], logit: float 
         [[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]
     """
     check_corners(low, high)
-    if len(counts) != len(low) or min(counts) < 2:
-        raise InputError(f"expected {len(low)} numbers of at least 2, found {counts}", field="counts")
+    counts, logit = checked_counts(counts, len(low)), to_number(logit, "logit")
     axes = [np.linspace(*ends) for ends in zip(np.asarray(low), np.asarray(high), counts, strict=True)]
     centers = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(counts))
     spacing = max(float(axis[1] - axis[0]) for axis in axes)
@@ -139,13 +147,16 @@ def network_field(
         A field with the network's weights as parameters.
 
     Raises:
-        InputError: For corners out of order.
+        InputError: For corners out of order, and counts or a logit that are none.
 
     Example:
         >>> network_field(jax.random.key(0), jnp.zeros(2), jnp.ones(2)).scale.tolist()
         [0.25, 0.25]
     """
     check_corners(low, high)
+    key, logit = to_key(key), to_number(logit, "logit")
+    width, depth = to_count(width, "width"), to_count(depth, "depth", 0)
+    low, high = jnp.asarray(low), jnp.asarray(high)
     network = eqx.filter_jit(eqx.nn.MLP)(len(low), "scalar", width, depth, jnp.tanh, key=key)
     parameters, structure = eqx.partition(network, eqx.is_inexact_array)
     return NetworkField(parameters, (low + high) / 2, (high - low) / 4, logit, structure)
@@ -206,6 +217,7 @@ class ObstacleMotion(GaussianDynamics):
     stops: bool = eqx.field(static=True)
 
     def __init__(self, field: Field, low: Vector, high: Vector, noise: Vector, *, stops: bool = True):
+        check_instance(field, Field, "field")
         check_corners(low, high)
         check_finite(field.parameters)
         self.field, self.stops = field, stops

@@ -24,7 +24,7 @@ from sidestep.continuous.information import rollout_free_slope
 from sidestep.continuous.lattice import Lattice, LatticePlanner
 from sidestep.continuous.policies import FinitePolicy
 from sidestep.continuous.tasks import ContinuousTask, task_at
-from sidestep.errors import NotConverged, check
+from sidestep.errors import NotConverged, check, check_instance
 from sidestep.tabular.solve import check_proper, solve
 
 _DIMENSIONS = 3
@@ -100,11 +100,14 @@ def compare_with_lattice(fit: ContinuousFit[Any, Any], lattice: Lattice) -> Latt
     References:
         Goodwin, "The evaluation of integrals of the form ∫ f(x) e^(−x²) dx" (1949), for sums in place of integrals.
     """
+    check_instance(fit, ContinuousFit, "fit")
+    check_instance(lattice, Lattice, "lattice")
     problem, dynamics = fit.problem, fit.dynamics
     policy, demos = problem.agent.policy, problem.demonstrations
     known = isinstance(dynamics, GaussianDynamics) and isinstance(policy, FinitePolicy)
-    check(known, "expected Gaussian dynamics and a finite set of actions", field="fit")
-    check("actions" in problem.terms, "expected a fit with the actions' term", field="terms")
+    kinds = f"{type(dynamics).__name__} and {type(policy).__name__}"
+    check(known, f"expected Gaussian dynamics and a finite set of actions, found {kinds}", field="fit")
+    check("actions" in problem.terms, f"expected a fit with the actions' term, found {problem.terms}", field="terms")
     dimensions = len(lattice.counts)
     message = f"expected {demos.states.shape[-1]} dimensions, at most {_DIMENSIONS}, found {dimensions}"
     check(dimensions == demos.states.shape[-1] and dimensions <= _DIMENSIONS, message, field="lattice")

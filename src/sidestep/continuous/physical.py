@@ -17,8 +17,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Scalar
 
-from sidestep.continuous.dynamics import GaussianDynamics, Outcomes, check_finite, checked_noise
-from sidestep.errors import check, check_positive
+from sidestep._arguments import to_finite
+from sidestep.continuous.dynamics import GaussianDynamics, Outcomes, checked_noise
+from sidestep.errors import check_choice, check_positive, to_list
 
 PENDULUM_CONSTANTS = ("gravity", "mass", "length")
 """The constants of a pendulum that may be unknown."""
@@ -66,11 +67,11 @@ class Pendulum(GaussianDynamics):
         values: dict[str, float] = dict(zip(PENDULUM_CONSTANTS, (gravity, mass, length), strict=True))
         for name, value in (*values.items(), ("time_step", time_step)):
             check_positive(value, name)
-        message = f"expected some of {PENDULUM_CONSTANTS}, found {tuple(unknown)}"
-        check(set(unknown) <= set(values), message, field="unknown")
+        for name in to_list(unknown, str, "unknown", 0):
+            check_choice(name, PENDULUM_CONSTANTS, "unknown")
         self.parameters = {name: jnp.log(jnp.asarray(values[name], jnp.result_type(float))) for name in unknown}
         self.known = {name: value for name, value in values.items() if name not in unknown}
-        self.noise, self.time_step = checked_noise(jnp.asarray(noise), 2), time_step
+        self.noise, self.time_step = checked_noise(noise, 2), time_step
 
     def constant(self, name: str) -> Float[Scalar, ""] | float:
         """Return a constant in its own unit, whether known or learned.
@@ -135,10 +136,9 @@ class PointMass(GaussianDynamics):
     ):
         check_positive(friction, "friction")
         check_positive(time_step, "time_step")
-        real = jnp.result_type(float)
+        real, wind = jnp.result_type(float), to_finite(wind, "wind", (2,))
         self.parameters = {"friction": jnp.log(jnp.asarray(friction, real)), "wind": jnp.asarray(wind, real)}
-        check_finite(self.parameters)
-        self.noise, self.time_step = checked_noise(jnp.asarray(noise), 4), time_step
+        self.noise, self.time_step = checked_noise(noise, 4), time_step
 
     def example_action(self) -> Float[Array, " 2"]:
         """Return an acceleration."""

@@ -32,16 +32,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
+from jaxtyping import Array, Int, PRNGKeyArray, Shaped
 
+from sidestep._arguments import to_floats, to_integers
 from sidestep._typing import Tree
-from sidestep.continuous.dynamics import PerCandidate, PerSample, Real, check_finite
+from sidestep.continuous.dynamics import PerCandidate, Real, check_finite
 from sidestep.continuous.estimators import with_control_variates
+from sidestep.continuous.gaps import policy_gaps
 from sidestep.continuous.policies import Agent, Critic, FinitePolicy, Policy, SomePolicy, Starts, make_critic
 from sidestep.continuous.rollouts import Rollout, discounted_returns, q_estimates, returns_to_go, sample_rollouts
 from sidestep.continuous.tasks import ContinuousTask, States, check_tasks, has_ended, task_at, task_features
-from sidestep.errors import NotConverged, check, check_count, check_positive
-from sidestep.tabular.backups import Behavior, HardMax
+from sidestep.errors import (
+    NotConverged,
+    check,
+    check_count,
+    check_function,
+    check_instance,
+    check_positive,
+    to_count,
+)
+from sidestep.tabular.arrays import to_jax
+from sidestep.tabular.backups import Behavior
 
 
 class PlanProgress(NamedTuple):
@@ -131,11 +142,16 @@ class Planner(eqx.Module):
 
         Raises:
             InputError: For no start where a task goes on.
+        NotConverged: For rollouts with numbers that are not finite.
         """
-        critic_key, *moves = _first_moves(self, agent, tasks, states, key)
-        acting, *examples = map(np.asarray, moves)
-        check(acting.any(), "expected starts where a task has not ended", field="states")
-        critic = make_critic(critic_key, *(jax.device_put(leaf[acting]) for leaf in examples), width=self.critic_width)
+        critic_key, *first = _first_moves(self, agent, tasks, states, key)
+        acting, *examples = map(np.asarray, first)
+        check(acting.any(), f"expected starts where a task has not ended, found none of {len(states)}", field="states")
+        moves = [leaf[acting] for leaf in examples]
+        if not all(np.isfinite(leaf).all() for leaf in moves):
+            reason = "the first rollouts have features or returns that are not, by dynamics or rewards"
+            raise NotConverged(f"the policy's figures ceased to be finite at step 0: {reason}")
+        critic = make_critic(critic_key, *map(jax.device_put, moves), width=self.critic_width)
         return PlannerState(agent.policy, critic, *_fresh_moments(self, agent.policy, critic))
 
     def candidate_actions(
@@ -275,8 +291,14 @@ def plan_policy(
     References:
         Eq. 12 of the paper; see the module's docstring.
     """
+    check_instance(agent, Agent, "agent")
+    check_instance(planner, Planner, "planner")
+    check_instance(warm_start, (PlannerState, type(None)), "warm_start")
+    if report is not None:
+        check_function(report, "report")
+    seed = to_count(seed, "seed", 0)
     check_tasks(tasks)
-    check_starts(states, task, tasks)
+    states, task = check_starts(states, task, tasks)
     check_finite(agent.dynamics.parameters)
     check_count(steps, 1, "steps")
     initial_key, key = jax.random.split(jax.random.key(seed))
@@ -421,55 +443,35 @@ def minibatches(
     return jnp.swapaxes(flat[: size * count].reshape(size, count, *leaf.shape[4:]), 0, 1)
 
 
-def policy_gaps(
-    behavior: Behavior, advantages: PerCandidate, q: PerSample, probabilities: PerCandidate
-) -> Float[Array, " starts"]:
-    """Return the gap between a policy and its own Q estimates, for each start.
+def check_starts(
+    states: States, task: Int[Array, " starts"], tasks: ContinuousTask
+) -> tuple[States, Int[Array, " starts"]]:
+    """Return starts and their tasks as arrays.
 
-    For soft agents it is the divergence of π_λ from exp βQ̂ in nats, for optimal ones the gain of the best action in
-    units of reward. Two independent halves of the samples give the noise of Q̂, which is subtracted.
-
-    Args:
-        behavior: The agent's backup and β.
-        advantages: q_λ of every candidate, in nats.
-        q: Q̂_0 of every sample, in units of reward.
-        probabilities: Those of the candidates, which add up to 1 for each start.
-
-    Returns:
-        A number for each start, in nats or units of reward.
-    """
-    half = q.shape[-1] // 2
-    halves = q[..., :half].mean(axis=-1), q[..., -half:].mean(axis=-1)
-    if isinstance(behavior.backup, HardMax):
-        best = jnp.take_along_axis(halves[1], halves[0].argmax(axis=1)[:, None], axis=1)[:, 0]
-        return best - jnp.sum(probabilities * halves[1], axis=1)
-
-    # with d = q_λ − βQ̂ the divergence is E d + ln E exp(−d)
-    difference = advantages - behavior.beta * (halves[0] + halves[1]) / 2
-    divergence = jnp.sum(probabilities * difference, axis=1)
-    divergence = divergence + jax.nn.logsumexp(-difference, axis=1, b=probabilities)
-    # noise in Q̂ adds half its variance under π
-    noise = behavior.beta * (halves[0] - halves[1]) / 2
-    noise = noise - jnp.sum(probabilities * noise, axis=1, keepdims=True)
-    return divergence - 0.5 * jnp.sum(probabilities * noise**2, axis=1)
-
-
-def check_starts(states: States, task: Int[Array, " starts"], tasks: ContinuousTask) -> None:
-    """Refuse no starts, starts that are not finite, and tasks that do not exist or have ended there.
+    There is a start, all are finite, and their tasks exist and have not ended there.
 
     Args:
         states: The states.
         task: The index of the task of each start.
         tasks: The tasks as a batch.
 
+    Returns:
+        The states and the indices.
+
     Raises:
         InputError: For any of these.
     """
-    count = len(tasks.discount)
-    message = f"expected starts and a task for each, found {len(states)} and {len(task)}"
-    check(0 < len(states) == len(task), message, field="states")
-    finite = np.isfinite(states).reshape(len(states), -1).all(axis=1)
-    check(finite.all(), "expected finite numbers", source="states", row=int(finite.argmin()) + 1)
-    check(np.isin(task, np.arange(count)).all(), f"expected tasks in 0…{count - 1}", field="task")
-    ended, message = np.asarray(has_ended(tasks, task, states)), "expected starts where a task has not ended"
+    message = "expected a batch of tasks (batch_tasks), found a single one"
+    check(np.ndim(tasks.discount) == 1, message, field="tasks")
+    places = states if isinstance(states, jax.Array) else to_jax(to_floats(states, "states"))
+    message = f"expected one or more starts, found shape {places.shape}"
+    check(places.ndim and len(places), message, field="states")
+    last = len(tasks.discount) - 1
+    which = to_jax(to_integers(task, "task", (len(places),), least=0, most=last, what="tasks"))
+    finite = np.isfinite(places).reshape(len(places), -1).all(axis=1)
+    message = f"expected finite numbers, found {places[int(finite.argmin())]}"
+    check(finite.all(), message, source="states", row=int(finite.argmin()) + 1)
+    ended = np.asarray(has_ended(tasks, which, places))
+    message = f"expected starts where a task has not ended, found {places[int(ended.argmax())]}"
     check(not ended.any(), message, source="states", row=int(ended.argmax()) + 1)
+    return places, which

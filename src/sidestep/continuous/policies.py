@@ -19,10 +19,11 @@ import numpy as np
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float, PRNGKeyArray, Shaped
 
+from sidestep._arguments import to_finite, to_key
 from sidestep._repr import short_repr
 from sidestep.continuous.dynamics import Action, Dynamics, Real
 from sidestep.continuous.tasks import ContinuousTask, States
-from sidestep.errors import check, check_positive
+from sidestep.errors import check, check_instance, check_positive, to_count
 from sidestep.tabular.backups import Behavior, HardMax
 
 Features = Float[Array, " features"]
@@ -55,10 +56,12 @@ def scaled_network(key: PRNGKeyArray, examples: Examples, outputs: int, width: i
         depth: The number of hidden layers.
 
     Raises:
-        InputError: For no examples, or any that are not finite.
+        InputError: For no examples, any that are not finite, and counts that are none.
     """
-    valid = len(examples) > 0 and np.isfinite(examples).all()
-    check(valid, "expected one or more rows of finite numbers", field="examples")
+    rows = to_finite(examples, "examples", ("examples", "features"))
+    check(len(rows) > 0, "expected one or more rows, found none", field="examples")
+    key, examples = to_key(key), jnp.asarray(rows)
+    width, depth = to_count(width, "width"), to_count(depth, "depth", 0)
     network = eqx.filter_jit(eqx.nn.MLP)(examples.shape[-1], outputs, width, depth, jnp.tanh, key=key)
     last = jax.tree.map(lambda leaf: jax.device_put(0.01 * np.asarray(leaf)), network.layers[-1])
     return ScaledNetwork(eqx.tree_at(lambda net: net.layers[-1], network, last), *_center_and_scale(examples, 1e-6))
@@ -146,11 +149,18 @@ class Agent(eqx.Module, Generic[SomePolicy]):
         dynamics: T_θ, by which it moves.
         policy: π_λ, by which it chooses.
         behavior: Its backup and β, which set the bonuses.
+
+    Raises:
+        InputError: For anything else in their places.
     """
 
     dynamics: Dynamics
     policy: SomePolicy
     behavior: Behavior
+
+    def __check_init__(self) -> None:
+        for name, kind in {"dynamics": Dynamics, "policy": Policy, "behavior": Behavior}.items():
+            check_instance(getattr(self, name), kind, name)
 
     @property
     def temperature(self) -> Float[Array, ""]:
@@ -308,8 +318,8 @@ def finite_policy(
         >>> jnp.exp(policy.log_probs(jnp.zeros(3))).round(1).tolist()
         [0.5, 0.5]
     """
-    valid = len(actions) >= 2 and np.isfinite(actions).all()
-    check(valid, "expected two or more actions of finite numbers", field="actions")
+    actions = to_finite(actions, "actions")
+    check(actions.ndim and len(actions) >= 2, f"expected two or more, found shape {actions.shape}", field="actions")
     return FinitePolicy(scaled_network(key, examples, len(actions), width, depth), jnp.asarray(actions))
 
 
@@ -334,8 +344,9 @@ def gaussian_policy(
         [0.0, 0.0]
     """
     check_positive(spread, "spread")
+    inputs = to_count(inputs, "inputs")
     network = scaled_network(key, examples, inputs, width, depth)
-    return GaussianPolicy(network, jnp.full(inputs, math.log(spread), examples.dtype))
+    return GaussianPolicy(network, jnp.full(inputs, math.log(spread), network.center.dtype))
 
 
 def make_critic(
@@ -359,5 +370,8 @@ def make_critic(
         >>> float(critic.center), float(critic.spread)
         (2.0, 1.0)
     """
+    examples = to_finite(examples, "examples", ("examples", "features"))
+    count = (len(examples),)
+    left, returns = to_finite(left, "left", count, least=0, most=1), to_finite(returns, "returns", count)
     network = scaled_network(key, jax.device_put(np.column_stack([examples, left])), 1, width, depth)
     return Critic(network, *_center_and_scale(returns, 0.0))

@@ -28,10 +28,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, Shaped
 
+from sidestep._arguments import to_key
 from sidestep.continuous.dynamics import State
+from sidestep.continuous.moves import map_moves, sum_gradients
 from sidestep.continuous.policies import Agent, Choice, Critic, FinitePolicy, Policy, Starts
 from sidestep.continuous.tasks import ContinuousTask
-from sidestep.errors import check_count
+from sidestep.errors import check_count, check_instance
 
 
 class Rollout(eqx.Module):
@@ -72,16 +74,27 @@ class Rollout(eqx.Module):
         return jnp.broadcast_to(1 - jnp.arange(moves) / moves, self.acting.shape).astype(self.rewards.dtype)
 
     def at_every_move(self, function: Callable, *more: Array) -> Array:
-        """Return function(task, state, …) at every move.
+        """Return function(task, state, …) at every move with an action, and 0 at the others.
 
         Args:
             function: Of the task, of the state that the move leaves, and of an entry of each of `more`.
             more: Arrays with all axes of the moves.
         """
-        mapped = jax.vmap(function, (None, *(0,) * (1 + len(more))))
-        for _ in self.acting.shape[:-1]:
-            mapped = jax.vmap(mapped)
-        return mapped(self.task, self.leaving, *more)
+        return map_moves(function, self.task, self.acting, (self.leaving, *more))
+
+    def gradient_sums(
+        self, function: Callable, parameters: Float[Array, " parameters"], groups: Array, count: int, *more: Array
+    ) -> Float[Array, "groups parameters"]:
+        """Return the gradients by θ of function(θ, task, state, …) at every move, added up in groups of moves.
+
+        Args:
+            function: Of θ, of the task, of the state that the move leaves, and of an entry of each of `more`.
+            parameters: θ as one vector.
+            groups: The group of each move, from 0.
+            count: The number of groups.
+            more: Arrays with all axes of the moves.
+        """
+        return sum_gradients(function, parameters, self.task, self.acting, (self.leaving, *more), groups, count)
 
     def features(self) -> Float[Array, "*batch moves features"]:
         """Return the features of every state that a move leaves."""
@@ -155,27 +168,29 @@ def sample_rollout(
         (6, 1)
     """
     check_count(horizon, 1, "horizon")
+    check_instance(agent, Agent, "agent")
+    check_instance(task, ContinuousTask, "task")
+    key = to_key(key)
     policy, behavior = agent.policy, agent.behavior
     actions = len(policy.actions) if isinstance(policy, FinitePolicy) else None
 
-    def move(carry: tuple, key: PRNGKeyArray) -> tuple[tuple, tuple]:
-        state, choice, over = carry
+    def move(carry: tuple, step: tuple[Array, PRNGKeyArray]) -> tuple[tuple, tuple]:
+        (state, over), (index, key) = carry, step
         transition_key, choice_key = jax.random.split(key)
-        terminal = task.terminal(state)
+        terminal, features = task.terminal(state), task.features(state)
         acting = ~(over | terminal)
-        action = policy.action(choice)
+        # the policy is evaluated once for the draw, its probability and the entropy
+        chosen = policy.sample(choice_key, features)
+        chosen = chosen if choice is None else jnp.where(index == 0, choice, chosen)
+        action, entropy = policy.action(chosen), policy.entropy(features)
         reward = jnp.where(acting, task.reward(state, action), jnp.where(over, 0.0, task.terminal_reward(state)))
-        features = task.features(state)
-        entropy = policy.entropy(features)
-        expected = agent.temperature * (policy.log_prob(features, choice) + entropy)
+        expected = agent.temperature * (policy.log_prob(features, chosen) + entropy)
         bonus = jnp.where(acting, behavior.backup.bonus(entropy, actions, behavior.beta) - expected, 0.0)
         following = agent.dynamics.sample(transition_key, state, action)
-        next_choice = policy.sample(choice_key, task.features(following))
-        return (following, next_choice, over | terminal), (state, choice, reward, bonus, acting)
+        return (following, over | terminal), (state, chosen, reward, bonus, acting)
 
-    first_key, key = jax.random.split(key)
-    choice = policy.sample(first_key, task.features(state)) if choice is None else choice
-    (end, _, over), moves = jax.lax.scan(move, (state, choice, jnp.zeros((), bool)), jax.random.split(key, horizon))
+    steps = jnp.arange(horizon), jax.random.split(key, horizon)
+    (end, over), moves = jax.lax.scan(move, (state, jnp.zeros((), bool)), steps)
     states, choices, rewards, bonuses, acting = moves
     final = jnp.where(task.terminal(end) & ~over, task.terminal_reward(end), 0.0).astype(rewards.dtype)
     states, rewards = jnp.concatenate([states, end[None]]), jnp.append(rewards, final)
@@ -213,6 +228,8 @@ def sample_rollouts(agent: Agent[Any], starts: Starts, key: PRNGKeyArray, horizo
         (2, 3, 4, 6, 1)
     """
     check_count(samples, 1, "samples")
+    check_instance(starts, Starts, "starts")
+    key = to_key(key)
     keys = jax.random.split(key, (len(starts.states), samples))
 
     def sample(task: ContinuousTask, state: State, choice: Choice, key: PRNGKeyArray) -> Rollout:
@@ -231,6 +248,8 @@ def returns_to_go(rollouts: Rollout) -> Float[Array, "*batch payments"]:
     Returns:
         W_i in units of reward, one more than moves.
     """
+
+    check_instance(rollouts, Rollout, "rollouts")
 
     def add(after: Array, gain: Array) -> tuple[Array, Array]:
         total = gain + rollouts.task.discount * after
@@ -264,4 +283,5 @@ def discounted_returns(rollouts: Rollout) -> Float[Array, "*batch"]:
     Returns:
         A return for each rollout, in units of reward.
     """
+    check_instance(rollouts, Rollout, "rollouts")
     return jnp.sum(rollouts.discount_powers(rollouts.rewards.shape[-1]) * rollouts.rewards, axis=-1)

@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from sidestep._arguments import to_finite, to_key
 from sidestep.continuous.dynamics import Dynamics, GaussianDynamics
 from sidestep.continuous.lattice import LatticePlanner
 from sidestep.continuous.tasks import ContinuousTask, batch_tasks, check_tasks, has_ended
-from sidestep.errors import NotConverged, check, check_count
+from sidestep.errors import InputError, NotConverged, check, check_count, check_instance, describe, to_count, to_list
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory
 from sidestep.tabular.proper import check_proper
@@ -63,15 +64,17 @@ def simulate_trajectories(
         [1, 1]
     """
     check_count(moves, 1, "moves")
+    key, tasks, starts = to_key(key), to_list(tasks, ContinuousTask, "tasks"), to_list(starts, object, "starts")
+    check_instance(agent, LatticePlanner, "agent")
+    check_instance(real, GaussianDynamics, "real")
     message = f"expected as many as tasks, found {len(starts)} for {len(tasks)}"
-    check(0 < len(tasks) == len(starts), message, field="starts")
+    check(len(tasks) == len(starts), message, field="starts")
     actions, width = agent.actions, real.example_action().shape
     message = f"expected rows of finite numbers of shape {width}, found {actions.shape}"
     check(np.isfinite(actions).all() and actions.shape[1:] == width, message, field="actions")
     model, trajectories = agent.tabular_model(), []
-    for index, (task, own) in enumerate(zip(tasks, starts, strict=True)):
-        fits = np.isfinite(own).all() and np.shape(own)[1:] == real.noise.shape
-        check(fits, f"expected rows of {len(real.noise)} finite numbers", source=f"starts of task {index}")
+    first_states = [to_finite(own, f"starts[{i}]", ("agents", len(real.noise))) for i, own in enumerate(starts)]
+    for index, (task, own) in enumerate(zip(tasks, first_states, strict=True)):
         table = agent.tabular_task(task)
         check_proper(table, agent.behavior, model.graph)
         solution = solve(model, table, agent.behavior, options=options)
@@ -107,10 +110,9 @@ def gather_trajectories(trajectories: Sequence[Trajectory], tasks: Sequence[Cont
     """
     batched = batch_tasks(tasks)
     check_tasks(batched)
-    check(trajectories, "expected at least one trajectory", field="trajectories")
-    for row, trajectory in enumerate(trajectories, start=1):
-        _check_trajectory(trajectory, trajectories[0], len(tasks), row)
-    states, actions, task, _ = zip(*trajectories, strict=True)
+    trajectories = to_list(trajectories, Trajectory, "trajectories")
+    checked = [_checked(trajectory, trajectories[0], len(tasks), row) for row, trajectory in enumerate(trajectories, 1)]
+    states, actions, task = zip(*checked, strict=True)
     parts = [each[:-1] for each in states], actions, [each[1:] for each in states]
     moves = (to_jax(np.concatenate(part)) for part in parts)
     lengths = [len(each) for each in actions]
@@ -118,22 +120,37 @@ def gather_trajectories(trajectories: Sequence[Trajectory], tasks: Sequence[Cont
     demonstrations = Demonstrations(*moves, *map(to_jax, (which, trajectory)), tasks=batched)
     ended = np.asarray(has_ended(batched, demonstrations.task, demonstrations.states))
     row = int(trajectory[ended.argmax()]) + 1
-    check(not ended.any(), "goes on after a terminal state of its task", source="trajectory", row=row)
+    state = demonstrations.states[int(ended.argmax())]
+    message = f"expected no moves after a terminal state of its task, found one from {state}"
+    check(not ended.any(), message, source="trajectory", row=row)
     return demonstrations
 
 
-def _check_trajectory(trajectory: Trajectory, first: Trajectory, tasks: int, row: int) -> None:
-    """Refuse a trajectory that is inconsistent, or has other shapes than the first."""
-    states, actions, task, _ = trajectory
+def _checked(trajectory: Trajectory, first: Trajectory, tasks: int, row: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return the states, the actions and the task of a trajectory; refuse one with other shapes than the first."""
+    try:
+        states, actions = (_numbers(trajectory, name) for name in ("states", "actions"))
+        task = to_count(trajectory.task, "task", 0, tasks - 1)
+    except InputError as error:
+        raise InputError(error.message, source="trajectory", row=row, field=error.field) from error
     shape, action = np.shape(first.states)[1:], np.shape(first.actions)[1:]
     expect = partial(check, source="trajectory", row=row)
-    fits = len(states) == len(actions) + 1 > 1 and np.shape(states)[1:] == shape
-    expect(fits, f"expected moves and one state of shape {shape} more, found {len(actions)} and {np.shape(states)}")
-    message = f"expected actions of shape {action}, found {np.shape(actions)[1:]}"
-    expect(np.shape(actions)[1:] == action, message, field="actions")
-    for field, part in {"states": states, "actions": actions}.items():
-        expect(np.isfinite(part).all(), "expected finite numbers", field=field)
-    expect(0 <= task < tasks, f"expected a task in 0…{tasks - 1}, found {task}")
+    fits = len(states) == len(actions) + 1 > 1 and states.shape[1:] == shape
+    expect(fits, f"expected moves and one state of shape {shape} more, found {len(actions)} and {states.shape}")
+    expect(
+        actions.shape[1:] == action, f"expected actions of shape {action}, found {actions.shape[1:]}", field="actions"
+    )
+    return states, actions, task
+
+
+def _numbers(trajectory: Trajectory, name: str) -> np.ndarray:
+    """Return states or actions as finite numbers; whole ones stay whole."""
+    value = getattr(trajectory, name)
+    array = np.asarray(to_finite(value, name))
+    whole = np.asarray(value)
+    array = whole if whole.dtype.kind in "iu" else array
+    check(array.ndim > 0, f"expected an entry for each move, found {describe(value)}", field=name)
+    return array
 
 
 @eqx.filter_jit

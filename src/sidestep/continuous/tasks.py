@@ -14,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from sidestep._arguments import to_finite, to_integers
 from sidestep._repr import short_repr
 from sidestep.continuous.dynamics import Action, Real, State, check_finite
-from sidestep.errors import InputError, check, check_positive
+from sidestep.errors import InputError, check, check_instance, check_positive, to_list
 from sidestep.tabular.tasks import Task, check_discount
 
 States = Shaped[Array, "states *state"]
@@ -144,7 +145,7 @@ def reach_region(
     check_discount(discount)
     if step_cost is None and discount == 1:
         raise InputError("a goal that pays 1 needs a discount below 1 (or give a step cost)", field="discount")
-    check(np.isfinite(np.asarray(goal)).all(), f"expected finite numbers, found {tuple(goal)}", field="goal")
+    goal = to_finite(goal, "goal", ("dimensions",))
     check_positive(radius, "radius")
     if step_cost is not None:
         check_positive(step_cost, "step_cost")
@@ -293,8 +294,9 @@ def batch_tasks(tasks: Sequence[_Task]) -> _Task:
         >>> batch_tasks([reach_region((0.0,), 0.1), reach_region((1.0,), 0.1)]).goal.tolist()
         [[0.0], [1.0]]
     """
+    tasks = to_list(tasks, ContinuousTask, "tasks")
     kinds = {(jax.tree.structure(task), *map(np.shape, jax.tree.leaves(task))) for task in tasks}
-    check(len(kinds) == 1, "expected at least one task, all of a kind", field="tasks")
+    check(len(kinds) == 1, f"expected tasks of one kind and shape, found {len(kinds)}", field="tasks")
     return _stacked(tasks)
 
 
@@ -309,9 +311,16 @@ def task_at(tasks: _Task, index: Array | int) -> _Task:
     Args:
         tasks: The tasks as a batch.
         index: The index of a task, or an array of them.
+
+    Raises:
+        InputError: For a single task, and indices of tasks that do not exist.
     """
+    check_instance(tasks, ContinuousTask, "tasks")
+    message = f"expected a batch of tasks (batch_tasks), found a single {type(tasks).__name__}"
+    check(jnp.ndim(tasks.discount) > 0, message, field="tasks")
     # an array, because a function is compiled for each number
-    return _task_at(tasks, jnp.asarray(index))
+    count = tasks.discount.shape[0]
+    return _task_at(tasks, jnp.asarray(to_integers(index, "index", (), ("indices",), least=-count, most=count - 1)))
 
 
 @eqx.filter_jit
@@ -319,14 +328,25 @@ def _task_at(tasks: _Task, index: Array) -> _Task:
     return jax.tree.map(lambda leaf: leaf[index], tasks)
 
 
-@eqx.filter_jit
 def task_features(tasks: ContinuousTask, states: States) -> Float[Array, "states features"]:
     """Return the features of every state under its own task (`tasks` has an axis of states).
 
     Args:
         tasks: The task of each state.
         states: The states, one a task or an index.
+
+    Raises:
+        InputError: For another number of tasks than of states.
     """
+    check_instance(tasks, ContinuousTask, "tasks")
+    count, shape = np.shape(tasks.discount), np.shape(states)
+    message = f"expected a task for each state, found {count} and {shape} of them"
+    check(len(count) == 1 and count == shape[:1], message, field="tasks")
+    return _features(tasks, states)
+
+
+@eqx.filter_jit
+def _features(tasks: ContinuousTask, states: States) -> Float[Array, "states features"]:
     return jax.vmap(lambda task, state: task.features(state))(tasks, states)
 
 
@@ -351,6 +371,7 @@ def check_tasks(tasks: ContinuousTask) -> None:
     Raises:
         InputError: For any of these.
     """
+    check_instance(tasks, ContinuousTask, "tasks")
     check_finite(tasks, field="tasks")
     for discount in np.ravel(np.asarray(tasks.discount)):
         check_discount(float(discount))

@@ -41,7 +41,9 @@ class RoomConfig(ContinuousConfig):
     beta: float = 4.0
     planner: sc.Planner = field(default_factory=lambda: sc.Planner(horizon=24, learning_rate=0.02))
     schedule: sc.Schedule = field(
-        default_factory=lambda: sc.Schedule(300, policy_warmup=80, learning_rate=0.15, policy_gap_tolerance=0.2)
+        default_factory=lambda: sc.Schedule(
+            300, policy_warmup=80, policy_steps=2, learning_rate=0.15, policy_gap_tolerance=0.2
+        )
     )
     prior_mean: float = -2.5
     prior_variance: float = 10.0
