@@ -15,7 +15,6 @@ from typing import Any
 MOST_BYTES = 16 * 2**30
 """The address space of a process: a mutant may ask for arrays of any size."""
 _plan: dict[str, Any] = {}
-_slow: set[str] = set()
 
 
 def pytest_configure() -> None:
@@ -26,7 +25,6 @@ def pytest_configure() -> None:
 
 def pytest_collection_modifyitems(items: list[Any]) -> None:
     """Leave the tests of the plan, in its order."""
-    _slow.update(item.nodeid for item in items if item.get_closest_marker("slow"))
     if _plan["tests"] is not None:
         own = {item.nodeid: item for item in items}
         items[:] = [own[test] for test in _plan["tests"] if test in own]
@@ -41,7 +39,7 @@ def pytest_runtest_logstart(nodeid: str) -> None:
 
 def pytest_runtest_logreport(report: Any) -> None:
     """Note how a part of a test went."""
-    _log({"test": report.nodeid, "seconds": report.duration, "failed": report.failed, "slow": report.nodeid in _slow})
+    _log({"test": report.nodeid, "seconds": report.duration, "failed": report.failed})
 
 
 def pytest_runtest_logfinish(nodeid: str) -> None:

@@ -27,21 +27,19 @@ from sidestep._files import read_json, write_whole
 
 PLUGIN = Path(__file__).parent / "mutant_plugin.py"
 SOURCES = "src/sidestep"
-QUICK = ("-m", "not slow")
-"""The options that leave slow tests out."""
 RECORDING_LIMIT = 1800.0
 """Seconds that one test file may take under coverage."""
 
 
 class TestFile(NamedTuple):
-    """What was noted of a test file: seconds of its tests, which are slow, and by module and line who executed it.
+    """What was noted of the slow tests of a file, or of the others: seconds, and who executed each line of each module.
 
     Tests are numbered in the order of `seconds`; -1 stands for the file itself, while it is collected.
     """
 
     name: str
+    slow: bool
     seconds: dict[str, float]
-    slow: list[str]
     lines: dict[str, dict[str, list[int]]]
 
 
@@ -104,8 +102,8 @@ def test_files(checkout: Path, package: str) -> list[str]:
     return [str(path.relative_to(checkout)) for path in paths]
 
 
-def recorded(checkout: Path, names: Iterable[str], slow: bool, kept: Path, cache: Path) -> Iterator[TestFile]:
-    """Yield what is noted of test files, of slow tests only if they are asked for.
+def recorded(checkout: Path, names: Sequence[str], slow: bool, kept: Path, cache: Path) -> Iterator[TestFile]:
+    """Yield what is noted of test files, and if they are asked for of their slow tests by themselves.
 
     Args:
         checkout: The root of a copy of the repository.
@@ -114,12 +112,12 @@ def recorded(checkout: Path, names: Iterable[str], slow: bool, kept: Path, cache
         kept: The folder where what was noted is kept, and read while it holds.
         cache: The folder for compiled code.
     """
-    for name in names:
-        path = kept / f"{name.replace('/', '-')}{'-slow' if slow else ''}.json"
+    for name, marked in [(name, marked) for marked in ((False, True) if slow else (False,)) for name in names]:
+        path = kept / f"{name.replace('/', '-')}{'-slow' if marked else ''}.json"
         stored = read_json(path) if path.exists() else None
         if stored is None or stored["digests"] != {file: _digest(checkout / file) for file in stored["digests"]}:
-            note(f"recording {name}")
-            own = _record(checkout, name, slow, cache)
+            note(f"recording {name}{' (slow)' if marked else ''}")
+            own = _record(checkout, name, marked, cache)
             shared = [*checkout.glob("tests/conftest.py"), *checkout.glob("tests/helpers/**/*.py")]
             files = [name, *(f"{SOURCES}/{file}" for file in own.lines), *(_name(file, checkout) for file in shared)]
             stored = {"digests": {file: _digest(checkout / file) for file in files}, **own._asdict()}
@@ -139,7 +137,7 @@ def _record(checkout: Path, name: str, slow: bool, cache: Path) -> TestFile:
     for program in (cache / "programs").glob("*"):
         program.unlink()  # a program that is kept is not traced
     # the path of the package, for the name imports it
-    options = (f"--cov={SOURCES}", "--cov-context=test", "--cov-report=", *(() if slow else QUICK))
+    options = (f"--cov={SOURCES}", "--cov-context=test", "--cov-report=", "-m", "slow" if slow else "not slow")
     ran = run_tests(checkout, [name], None, cache, RECORDING_LIMIT, *options)
     seconds: dict[str, float] = defaultdict(float)
     failed = {line["test"] for line in ran.log if line.get("failed")}
@@ -159,8 +157,7 @@ def _record(checkout: Path, name: str, slow: bool, cache: Path) -> TestFile:
                 str(line): sorted({numbers.get(each.rpartition("|")[0], -1) for each in own})
                 for line, own in sorted(contexts.items())
             }
-    marked = sorted({line["test"] for line in ran.log if line.get("slow")})
-    return TestFile(name, dict(seconds), marked, lines)
+    return TestFile(name, slow, dict(seconds), lines)
 
 
 def _digest(path: Path) -> str:
@@ -185,18 +182,17 @@ def choose(checkout: Path, file: str, line: int, records: Sequence[TestFile], bu
     """
     executed = _executed(checkout, file, line, records)
     ranked: list[tuple[tuple, Chosen]] = []
-    for record in records:
-        own = executed.get(record.name)
-        if own is None:
+    for record, own in zip(records, executed, strict=True):
+        if not own:
             continue
         named = Path(file).stem in record.name
         total = sum(seconds for number, seconds in enumerate(record.seconds.values()) if number in own)
         cases: dict[str, int] = defaultdict(int)
         for number, (test, seconds) in enumerate(record.seconds.items()):
-            slow, function = test in record.slow, test.partition("[")[0]
-            key = slow, number not in own, cases[function] > 0, not named, total, record.name, seconds
+            function = test.partition("[")[0]
+            key = record.slow, number not in own, cases[function] > 0, not named, total, record.name, seconds
             cases[function] += number in own
-            ranked.append((key, Chosen(test, seconds, slow)))
+            ranked.append((key, Chosen(test, seconds, record.slow)))
     chosen, taken = [], 0.0
     for _, each in sorted(ranked, key=lambda pair: pair[0]):
         if taken <= budget:
@@ -205,21 +201,16 @@ def choose(checkout: Path, file: str, line: int, records: Sequence[TestFile], bu
     return chosen
 
 
-def _executed(checkout: Path, file: str, line: int, records: Sequence[TestFile]) -> dict[str, set[int]]:
-    """Return the tests that execute a line, by test file; of lines that are not seen, those of the module's others."""
+def _executed(checkout: Path, file: str, line: int, records: Sequence[TestFile]) -> list[set[int]]:
+    """Return the tests of each file that execute a line; of lines that are not seen, those of the module's others."""
     sources = checkout / SOURCES
     within = statement_lines((sources / file).read_text(), line)
-    found = {record.name: _who(record, file, within) for record in records} if within else {}
-    if any(found.values()):
-        return {name: tests for name, tests in found.items() if tests}
+    found = [_who(record, file, within or ()) for record in records]
     for modules in ((file,), importers(sources, file)):
-        found = defaultdict(set)
-        for record in records:
-            for module in modules:
-                found[record.name] |= _who(record, module, body_lines((sources / module).read_text()))
-        if any(found.values()):
-            break
-    return {name: tests for name, tests in found.items() if tests}
+        if not any(found):
+            bodies = {module: body_lines((sources / module).read_text()) for module in modules}
+            found = [set().union(*(_who(record, *body) for body in bodies.items())) for record in records]
+    return found
 
 
 def _who(record: TestFile, module: str, lines: Iterable[int]) -> set[int]:

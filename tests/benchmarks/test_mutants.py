@@ -117,13 +117,12 @@ def test_choose_takes_tests_that_execute_the_line_first(tmp_path):
     def chosen(line, budget=100.0):
         return [each.test for each in mutant_tests.choose(tmp_path, module, line, records, budget)]
 
-    first = mutant_tests.TestFile(
-        "tests/test_a.py", {"a::none": 1.0, "a::slow": 9.0, "a::hit[0]": 2.0, "a::hit[1]": 1.0}, ["a::slow"],
-        {module: {str(line): [1, 2, 3], "1": [-1]}},
-    )  # fmt: skip
-    second = mutant_tests.TestFile("tests/test_sums.py", {"b::hit": 3.0}, [], {module: {str(line): [0]}})
-    third = mutant_tests.TestFile("tests/test_c.py", {"c::user": 1.0}, [], {other: {"5": [0]}})
-    records = [first, second, third]
+    hit = {module: {str(line): [1, 2], "1": [-1]}}
+    first = mutant_tests.TestFile("tests/test_a.py", False, {"a::none": 1.0, "a::hit[0]": 2.0, "a::hit[1]": 1.0}, hit)
+    slow = mutant_tests.TestFile("tests/test_a.py", True, {"a::slow": 9.0}, {module: {str(line): [0]}})
+    second = mutant_tests.TestFile("tests/test_sums.py", False, {"b::hit": 3.0}, {module: {str(line): [0]}})
+    third = mutant_tests.TestFile("tests/test_c.py", False, {"c::user": 1.0}, {other: {"5": [0]}})
+    records = [slow, first, second, third]
     # the file with the module's name, one case of each test, other cases, those that do not execute the line, slow ones
     assert chosen(line) == ["b::hit", "a::hit[0]", "a::hit[1]", "a::none", "a::slow"]
     assert chosen(line, 4.0) == ["b::hit", "a::hit[0]"]
