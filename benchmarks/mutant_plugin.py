@@ -1,8 +1,9 @@
 """A plugin of pytest for the tests of a mutant: their order, their time limits, and a log of how they went.
 
-The environment variable `MUTANT_PLAN` names a file with `tests`, seconds by test in the order in which they run (null
-for all, without limits), and `log`, the file that gets a line for each test that starts or ends. A test that takes
-longer ends the process, whatever native code it is in.
+The environment variable `MUTANT_PLAN` names a file with `tests`, seconds by test in the order in which they run, and
+`log`, the file that gets a line for each test that starts or ends. A test that takes longer ends the process, whatever
+native code it is in. Where `tests` is null, there are no limits, and of the cases of a test those run that have a value
+of a parameter that none before had; the log then begins with the names of all cases.
 """
 
 import faulthandler
@@ -11,6 +12,8 @@ import os
 import resource
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 MOST_BYTES = 16 * 2**30
 """The address space of a process: a mutant may ask for arrays of any size."""
@@ -23,11 +26,24 @@ def pytest_configure() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES))
 
 
+@pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[Any]) -> None:
-    """Leave the tests of the plan, in its order."""
+    """Leave the tests of the plan, in its order, or cases with each value of each parameter."""
     if _plan["tests"] is not None:
         own = {item.nodeid: item for item in items}
         items[:] = [own[test] for test in _plan["tests"] if test in own]
+    else:
+        _log({"collected": [item.nodeid for item in items]})
+        seen: set[tuple[str, str]] = set()
+        items[:] = [item for item in items if _has_new_value(item.nodeid, seen)]
+
+
+def _has_new_value(test: str, seen: set[tuple[str, str]]) -> bool:
+    function, _, case = test.partition("[")
+    values = {(function, value) for value in case.split("-")}
+    new = bool(values - seen)
+    seen |= values
+    return new
 
 
 def pytest_runtest_logstart(nodeid: str) -> None:

@@ -1,11 +1,12 @@
 """Which tests run for a mutant, and in which order.
 
-Each test file runs once in a process of its own, under coverage.py, which notes the lines that each test executes. What
-a process compiled it does not trace again, so a line of one test may matter to others of its file: a mutant is tried on
-all tests of the files that execute its line, those first that did so themselves. Lines of native code, of functions
-that XLA calls and of constants are not seen; they get the files that execute anything else in the module, or in the
-modules that import it. What was noted is kept in the user's cache, and holds while the test file, what the tests share
-and the modules that they execute stay as they were.
+Each test file runs once in a process of its own, under coverage.py, which notes the lines that each test executes; of
+the cases of a test, as many as have each value of each parameter once. What a process compiled it does not trace again,
+so a line of one test may matter to others of its file: a mutant is tried on all tests of the files that execute its
+line, those first that did so themselves. Lines of native code, of functions that XLA calls and of constants are not
+seen; they get the files that execute anything else in the module, or in the modules that import it. What was noted is
+kept in the user's cache, and holds while the test file, what the tests share and the modules that they execute stay as
+they were.
 """
 
 import ast
@@ -17,7 +18,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -139,13 +140,15 @@ def _record(checkout: Path, name: str, slow: bool, cache: Path) -> TestFile:
     # the path of the package, for the name imports it
     options = (f"--cov={SOURCES}", "--cov-context=test", "--cov-report=", "-m", "slow" if slow else "not slow")
     ran = run_tests(checkout, [name], None, cache, RECORDING_LIMIT, *options)
-    seconds: dict[str, float] = defaultdict(float)
-    failed = {line["test"] for line in ran.log if line.get("failed")}
-    for line in ran.log:
+    reports = [line for line in ran.log if "seconds" in line]
+    failed = {line["test"] for line in reports if line["failed"]}
+    seconds = dict.fromkeys((test for line in ran.log for test in line.get("collected", ()) if test not in failed), 0.0)
+    for line in reports:
         if line["test"] not in failed:
-            seconds[line["test"]] += line.get("seconds", 0.0)
+            seconds[line["test"]] += line["seconds"]
     if ran.status not in (0, 5):
         note(f"warning: {name}: {len(failed)} tests fail without a mutation; they are left out (status {ran.status})")
+    _fill(seconds, {line["test"] for line in reports})
     numbers = {test: number for number, test in enumerate(seconds)}
     data, lines = CoverageData(str(cache / "coverage")), {}
     data.read()
@@ -157,7 +160,16 @@ def _record(checkout: Path, name: str, slow: bool, cache: Path) -> TestFile:
                 str(line): sorted({numbers.get(each.rpartition("|")[0], -1) for each in own})
                 for line, own in sorted(contexts.items())
             }
-    return TestFile(name, slow, dict(seconds), lines)
+    return TestFile(name, slow, seconds, lines)
+
+
+def _fill(seconds: dict[str, float], ran: Collection[str]) -> None:
+    """Give cases of tests that did not run the seconds of the longest that ran."""
+    longest: dict[str, float] = defaultdict(float)
+    for test, own in seconds.items():
+        longest[test.partition("[")[0]] = max(own, longest[test.partition("[")[0]])
+    for test in seconds.keys() - ran:
+        seconds[test] = longest[test.partition("[")[0]]
 
 
 def _digest(path: Path) -> str:
