@@ -123,9 +123,8 @@ def test_slippery_grid_has_the_slip_of_each_terrain_and_what_is_blocked():
     np.testing.assert_allclose(ObstacleGrid(Grid(np.array([[-1, 0, 1]])), logits).blocked, model.blocked)
     # to the right of the first cell lies a free one; at its sides are the edges of the map, where moves do not fail
     slips = sigmoid(-1.0)
-    np.testing.assert_allclose(
-        np.asarray(model.probabilities())[0, 3], [1 - slips, slips / 2, slips / 2, 0], atol=1e-12
-    )
+    expected = np.array([1 - slips, slips / 2, slips / 2, 0.0])
+    np.testing.assert_allclose(np.asarray(model.probabilities())[0, 3], expected, atol=1e-12)
     np.testing.assert_array_equal(np.asarray(model.graph.successors)[0, 3], [1, 0, 0, 0])
     np.testing.assert_allclose(np.asarray(model.probabilities())[2].sum(axis=-1), 1)
     assert np.asarray(model.probabilities())[2, 2, 0] == pytest.approx(1)  # no slips there
