@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from coverage import Coverage
 
 MOST_BYTES = 16 * 2**30
 """The address space of a process: a mutant may ask for arrays of any size."""
@@ -47,10 +48,12 @@ def _has_new_value(test: str, seen: set[tuple[str, str]]) -> bool:
 
 
 def pytest_runtest_logstart(nodeid: str) -> None:
-    """Note that a test starts, and start its clock."""
+    """Note that a test starts, and start its clock, or tell coverage.py which it is."""
     _log({"test": nodeid})
     if _plan["tests"] is not None:
         faulthandler.dump_traceback_later(_plan["tests"][nodeid], exit=True)
+    elif (coverage := Coverage.current()) is not None:
+        coverage.switch_context(nodeid)
 
 
 def pytest_runtest_logreport(report: Any) -> None:

@@ -138,7 +138,7 @@ def _record(checkout: Path, name: str, slow: bool, cache: Path) -> TestFile:
     for program in (cache / "programs").glob("*"):
         program.unlink()  # a program that is kept is not traced
     # the path of the package, for the name imports it
-    options = (f"--cov={SOURCES}", "--cov-context=test", "--cov-report=", "-m", "slow" if slow else "not slow")
+    options = (f"--cov={SOURCES}", "--cov-report=", "-m", "slow" if slow else "not slow")
     ran = run_tests(checkout, [name], None, cache, RECORDING_LIMIT, *options)
     reports = [line for line in ran.log if "seconds" in line]
     failed = {line["test"] for line in reports if line["failed"]}
@@ -157,8 +157,7 @@ def _record(checkout: Path, name: str, slow: bool, cache: Path) -> TestFile:
         if contexts:
             module = _name(Path(file), (checkout / SOURCES).resolve())
             lines[module] = {
-                str(line): sorted({numbers.get(each.rpartition("|")[0], -1) for each in own})
-                for line, own in sorted(contexts.items())
+                str(line): sorted({numbers.get(each, -1) for each in own}) for line, own in sorted(contexts.items())
             }
     return TestFile(name, slow, seconds, lines)
 
@@ -198,12 +197,13 @@ def choose(checkout: Path, file: str, line: int, records: Sequence[TestFile], bu
         if not own:
             continue
         named = Path(file).stem in record.name
-        total = sum(seconds for number, seconds in enumerate(record.seconds.values()) if number in own)
+        hits = [seconds for number, seconds in enumerate(record.seconds.values()) if number in own]
+        total = sum(hits or record.seconds.values())
         cases: dict[str, int] = defaultdict(int)
         for number, (test, seconds) in enumerate(record.seconds.items()):
             function = test.partition("[")[0]
             key = record.slow, number not in own, cases[function] > 0, not named, total, record.name, seconds
-            cases[function] += number in own
+            cases[function] += number in own or not hits
             ranked.append((key, Chosen(test, seconds, record.slow)))
     chosen, taken = [], 0.0
     for _, each in sorted(ranked, key=lambda pair: pair[0]):
