@@ -101,7 +101,9 @@ def test_progress_says_the_objective_and_the_gradient():
     assert progress.total is None
 
 
-@pytest.mark.parametrize(("large_map", "given", "loose"), [(3, None, True), (4, None, True), (5, None, False), (4, 1e-5, False)])
+@pytest.mark.parametrize(
+    ("large_map", "given", "loose"), [(3, None, True), (4, None, True), (5, None, False), (4, 1e-5, False)]
+)
 def test_solve_tolerances_are_loose_first_on_large_maps(large_map, given, loose):
     solver = Jacobi(tolerance=given)
     options = SolveOptions(solver=solver)
