@@ -121,7 +121,8 @@ def recorded(checkout: Path, names: Sequence[str], slow: bool, kept: Path, cache
             own = _record(checkout, name, marked, cache)
             shared = [*checkout.glob("tests/conftest.py"), *checkout.glob("tests/helpers/**/*.py")]
             files = [name, *(f"{SOURCES}/{file}" for file in own.lines), *(_name(file, checkout) for file in shared)]
-            stored = {"digests": {file: _digest(checkout / file) for file in files}, **own._asdict()}
+            digests = {file: _digest(checkout / file) for file in files} | {str(PLUGIN): _digest(PLUGIN)}
+            stored = {"digests": digests, **own._asdict()}
             text = json.dumps(stored).encode()
             path.parent.mkdir(parents=True, exist_ok=True)
             write_whole(path, lambda file, text=text: file.write(text))

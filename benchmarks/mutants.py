@@ -9,10 +9,11 @@ one under which a test takes more than ten times its time and a minute (`--patie
 mutant early: it then counts as a survivor.
 
 Left out is what cannot change a result: type annotations and types in calls, docstrings, texts (f-strings, arguments of
-errors that are raised, `__repr__`), assertions, `TYPE_CHECKING`, decorators that compile, cache or declare, and
-arguments such as `strict` of `zip` or `unroll` (`mutations.WITHOUT_EFFECT`); and what fails wherever it runs: bits
-instead of arithmetic, `is` instead of `==`, `not` instead of a sign. Constants that only decide how fast something is
-remain, and mutants that are equal to the code for other reasons: no suite kills all.
+errors that are raised, `__repr__`), assertions, `TYPE_CHECKING`, decorators that compile, cache or declare, arguments
+such as `strict` of `zip` or `unroll` (`mutations.WITHOUT_EFFECT`), and constants that decide how much is done at a time
+(`mutations.SPEED_CONSTANTS`); and what fails wherever it runs: bits instead of arithmetic, `is` instead of `==`, `not`
+instead of a sign. Mutants that are equal to the code for other reasons remain, such as `axis=1` instead of `axis=-1` in
+arrays of two axes: no suite kills all.
 
 Records: `package`, `file`, `line`, `operator`, `change` (lines that differ), `outcome` (`killed`, `timeout`, `crash`,
 `survived`), `test` (which noticed it; `collection` where the tests could not be imported), `slow` (whether that test is

@@ -32,6 +32,12 @@ SPEED = frozenset({
 """Decorators that change speed, types or texts only."""
 WITHOUT_EFFECT = frozenset(["strict", "stacklevel", "unroll", "nogil", "inline", "static_argnames", "donate"])
 """Arguments that change no result of a call that is right."""
+SPEED_CONSTANTS = frozenset({
+    *("MEMORY", "LARGE_MAP", "SMALL_PROBLEM", "_BATCH", "_BLOCK_FACTOR", "_CHUNK", "_FIXED_WORKSPACE", "_MIN_LENGTH"),
+    *("_MIN_BYTES_TO_TRIM", "_MIN_MOVES", "_MIN_STATES_PER_CORE", "_MIN_TASKS", "_MOST_FACTORIZED", "_NUMBERS"),
+    *("_OUT_OF_ORDER", "_PROBABILITIES", "_ROLLOUTS", "_SMALL", "_SMALLEST_BLOCK", "_TOGETHER", "_WORKSPACE_PER_TASK"),
+})  # fmt: skip
+"""Constants of modules that decide how much is done at a time, for speed or memory, and no result."""
 TEXTS = frozenset({"__repr__", "__str__", "_repr_html_"})
 """Functions that return texts for people."""
 _BINARY = frozenset({"arith_expr", "term", "power", "expr", "xor_expr", "and_expr", "shift_expr", "atom_expr"})
@@ -143,6 +149,16 @@ class _Essence(ast.NodeTransformer):
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
         node.annotation = ast.Constant(None)
+        return ast.Pass() if _names(node.target) <= SPEED_CONSTANTS else self.generic_visit(node)
+
+    def visit_Assign(self, node: ast.Assign) -> ast.AST:
+        names = set().union(*(_names(target) for target in node.targets))
+        return ast.Pass() if names <= SPEED_CONSTANTS else self.generic_visit(node)
+
+    def visit_Compare(self, node: ast.Compare) -> ast.AST:
+        # sizes are at least 1
+        if _is_size(node.left) and [ast.dump(each) for each in node.comparators] == [ast.dump(ast.Constant(1))]:
+            node.ops = [ast.Gt() if isinstance(op, ast.NotEq) else op for op in node.ops]
         return self.generic_visit(node)
 
     def visit_BinOp(self, node: ast.BinOp) -> ast.AST:
@@ -177,6 +193,11 @@ def _names(node: ast.AST) -> set[str]:
     """Return all names and attributes in an expression."""
     names = {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
     return names | {each.attr for each in ast.walk(node) if isinstance(each, ast.Attribute)}
+
+
+def _is_size(node: ast.expr) -> bool:
+    """Return whether an expression is the length of an axis: `array.shape[n]`."""
+    return isinstance(node, ast.Subscript) and isinstance(node.value, ast.Attribute) and node.value.attr == "shape"
 
 
 def _is_type(node: ast.expr) -> bool:

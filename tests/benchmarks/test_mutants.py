@@ -15,6 +15,7 @@ MODULE = '''
 from functools import lru_cache
 
 LIMIT = 3
+_CHUNK = 64
 
 
 @lru_cache(maxsize=5)
@@ -33,6 +34,10 @@ def half(number):
     return number / 2
 
 
+def several(numbers):
+    return numbers.shape[0] > 1
+
+
 class Sum:
     def __repr__(self):
         return "sum" + "!"
@@ -49,6 +54,9 @@ def line_of(text):
         ("return number / 2", "return number * 2", True),
         ("start > LIMIT", "start >= LIMIT", True),
         ("LIMIT = 3", "LIMIT = 4", True),
+        ("_CHUNK = 64", "_CHUNK = 65", False),
+        ("numbers.shape[0] > 1", "numbers.shape[0] != 1", False),
+        ("numbers.shape[0] > 1", "numbers.shape[0] < 1", True),
         ("start: int = 0", "start: int = 1", True),
         ("numbers or ()", "numbers and ()", True),
         ("list[int] | None", "list[int] & None", False),
