@@ -91,3 +91,20 @@ def test_solve_with_a_horizon_looks_as_many_actions_ahead(name, horizon):
     values, q = plain_values(name, problem.dense(problem.model.parameters), task, BETA, horizon)
     np.testing.assert_allclose(solution.values, values, rtol=1e-10)
     np.testing.assert_allclose(solution.action_values, q, rtol=1e-10)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_solve_gradient_by_nothing_is_0_and_by_infinity_is_no_number(solver):
+    problem, task, _ = inputs_of("tabular", 0.9)
+    agents, options = Behavior(BACKUPS["Boltzmann"], BETA), SolveOptions(solver=SOLVERS[solver])
+
+    @jax.jit
+    def gradient(weight):
+        def weighted(parameters):
+            return weight * solve(problem.model.with_parameters(parameters), task, agents, options=options).values.sum()
+
+        return jax.grad(weighted)(problem.model.parameters)
+
+    assert np.isfinite(gradient(1.0)).all()
+    np.testing.assert_array_equal(gradient(0.0), np.zeros_like(problem.model.parameters))
+    assert not np.isfinite(gradient(np.inf)).any()
