@@ -10,7 +10,7 @@ from sidestep.inference.prior_chains import is_free_of, native_terms, sample_pri
 
 FIELD = np.array([-0.6, 0.4, 1.1, -1.3, 0.2, -0.1])
 WEIGHTS = {"lines": 0.9, "pairs": 0.5, "blocks": -1.2, "isolated": -0.8}
-COUNT = 20_000
+COUNT = 6_000
 PRIORS = {
     "cells": (BinaryMRF(FIELD, (2, 3), **WEIGHTS), np.full(6, -1)),
     "a column": (BinaryMRF(FIELD, (6, 1), **WEIGHTS), np.full(6, -1)),
