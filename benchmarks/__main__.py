@@ -31,6 +31,7 @@ BENCHMARKS = {
     "risk": "whether plans with risk mean what they say: P(path is open) beside true offices",
     "shapes": "the shape of maps: weights of a binary Markov random field, fitted to true maps",
     "towns": "one-way streets from taxi trips in Shanghai, buildings from drives in MAGELLAN's towns",
+    "mutants": "how many small mutations of the source code the tests notice",
 }
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.barrier_worlds import all_maps
+from sidestep.errors import InputError
 from sidestep.inference.mean_field import MeanField
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.tabular.grid import Cell
@@ -65,3 +66,22 @@ def test_log_density_without_shapes_is_largest_at_the_field():
     np.testing.assert_allclose(jax.grad(mean_field.log_density)(jnp.asarray(FIELD)), 0, atol=1e-12)
     # log Z of independent barriers
     assert float(mean_field.log_density(jnp.asarray(FIELD))) == pytest.approx(np.log1p(np.exp(FIELD)).sum())
+
+
+def test_log_density_of_barriers_without_a_shape_takes_cells_in_rows():
+    prior, known = BinaryMRF(FIELD), KNOWN["some"]
+    result = float(MeanField(prior, known).log_density(jnp.asarray(LOGITS)))
+    assert result == pytest.approx(expected(prior, known, LOGITS))
+
+
+@pytest.mark.parametrize(("prior", "known"), [
+    (BinaryMRF(FIELD), np.full(5, -1)),
+    (BinaryMRF(FIELD), np.full((2, 2), -1)),
+    (BinaryMRF(FIELD, SHAPE), np.full(6, -1)),
+    (BinaryMRF(FIELD, SHAPE), np.full((3, 2), -1)),
+    (BinaryMRF(FIELD, SHAPE), np.full(SHAPE, 2)),
+    (BinaryMRF(FIELD, SHAPE), np.full(SHAPE, -2)),
+])  # fmt: skip
+def test_mean_field_of_other_barriers_raises(prior, known):
+    with pytest.raises(InputError, match="known"):
+        MeanField(prior, known)

@@ -1,0 +1,30 @@
+"""How much an optimizer expects to gain, on quadratic losses where that is known."""
+
+import numpy as np
+import pytest
+
+from sidestep.inference.optimizers import LBFGS, Adam, Rprop
+
+CURVATURE = np.array([[3.0, 1.0], [1.0, 2.0]])
+
+
+def loss(x, *, approximate=False):
+    del approximate
+    return float(x @ CURVATURE @ x) / 2, CURVATURE @ x
+
+
+def test_expected_gain_of_lbfgs_becomes_that_of_the_quadratic():
+    optimizer, x = LBFGS(), np.array([5.0, -4.0])
+    state = optimizer.init(x)
+    for _ in range(3):
+        after = optimizer.step(loss, x, *loss(x), state)
+        assert after is not None
+        x, state = after
+    value, gradient = loss(x)
+    assert optimizer.expected_gain(x, gradient, state) == pytest.approx(value, rel=0.3)
+
+
+@pytest.mark.parametrize("optimizer", [Adam(), Rprop()])
+def test_expected_gain_without_curvature_is_infinite(optimizer):
+    x = np.array([1.0, -2.0])
+    assert optimizer.expected_gain(x, loss(x)[1], optimizer.init(x)) == np.inf
