@@ -69,17 +69,40 @@ def test_solve_at_discounts_near_one_equals_newtons_method(backup, discount, wit
     np.testing.assert_allclose(np.asarray(slope), expected, rtol=within, atol=within * np.abs(expected).max())
 
 
+def test_solve_with_a_dear_way_beside_a_long_one_does_not_say_that_it_converged_at_the_wrong_one():
+    """State 0 ends at a cost of 1.2 · 2/p, or goes to state 1, which ends with probability p or returns."""
+    count, chance = 500, 1e-5
+    successors, probabilities = np.zeros((count, 2, 2), int), np.zeros((count, 2, 2))
+    rewards = -np.ones((count, 2))
+    probabilities[..., 0] = 1
+    successors[0], successors[1], successors[2] = [[2, 2], [1, 1]], [[2, 0], [2, 0]], 2
+    rewards[0, 0], probabilities[1] = -2.4 / chance, [chance, 1 - chance]
+    successors[3:] = np.maximum(np.arange(3, count) - 1, 0)[:, None, None]
+    successors[3] = 0
+    shorter = task(rewards, 1.0, np.arange(count) == 2)
+    for dtype, within in ((np.float32, 0.05), (np.float64, 1e-5)):
+        model = tabular_model(graph(successors), probabilities.astype(dtype))
+        solution = solve(model, shorter, Behavior(HardMax()))
+        off = abs(float(solution.values[0]) + 2 / chance) * chance / 2
+        assert off <= within or not bool(solution.converged)
+        assert off * 2 / chance <= float(solution.error) * (1 + 1e-9) + 1e-3
+
+
 @pytest.mark.parametrize(("dtype", "within"), [(np.float64, 1e-9), (np.float32, 2e-4)])
-def test_solve_of_a_random_walk_equals_its_expected_number_of_moves(dtype, within):
-    """From i, with the end at 0 and the far end at n reflecting, i (2n - i) moves are expected."""
-    states = np.arange(101)
+@pytest.mark.parametrize("count", [101, 451])
+def test_solve_of_a_random_walk_equals_its_expected_number_of_moves(count, dtype, within):
+    """From i, with the end at 0 and the far end at n reflecting, i (2n - i) moves are expected.
+
+    By default the smaller one is solved by Jacobi iteration, the larger one by Gauss–Seidel sweeps.
+    """
+    states = np.arange(count)
     last = len(states) - 1
     successors = np.stack([np.maximum(states - 1, 0), np.minimum(states + 1, last)], axis=-1)[:, None]
     probabilities = np.full((len(states), 1, 2), 0.5, dtype)
     successors[last], probabilities[last] = (last - 1, last), (1, 0)
     walk = task(np.full((len(states), 1), -1.0), 1.0, states == 0)
     solution = solve(tabular_model(graph(successors), probabilities), walk, Behavior(HardMax()))
-    assert bool(solution.converged)
+    assert bool(solution.converged) or dtype == np.float32
     expected = -states * (2.0 * last - states)
     off = np.abs(np.asarray(solution.values, np.float64) - expected).max()
     assert off <= within * last**2

@@ -9,6 +9,8 @@ The bound holds for backups that are convex with weights of at least 0: the hard
 log-sum-exp, where the entropy bonus log(actions)/β makes a move cheaper. Bertsekas (*Dynamic Programming and Optimal
 Control* II, 2012, section 2.2) has such bounds for the first. For the Boltzmann average it is an estimate: an action
 that is worse by more than 1/β lowers a state's value where it becomes better. Rounding adds ε max |V| to a change.
+Where a few states are nearly closed the bound may be far too large, because these take most of the moves, and others
+most of the changes; `direct` has a better estimate.
 """
 
 from typing import NamedTuple
@@ -67,21 +69,8 @@ def move_costs(process: DecisionProcess, backup: Backup, beta: Beta) -> MoveCost
     return MoveCosts(least, jnp.maximum(worth, 0) + jnp.maximum(gain, 0))
 
 
-class ErrorBounds(NamedTuple):
-    """Bounds of the values' error after a sweep; ∞ where none is known.
-
-    Attributes:
-        by_discount: With N = 1/(1 − γ).
-        smallest: With the smaller N. It may be far too large where a few states are nearly closed: these take most of
-            the moves, and others most of the changes.
-    """
-
-    by_discount: Float[Array, ""]
-    smallest: Float[Array, ""]
-
-
-def error_bounds(process: DecisionProcess, costs: MoveCosts, values: Values, change: Float[Array, ""]) -> ErrorBounds:
-    """Return bounds of the values' error after a sweep.
+def error_bound(process: DecisionProcess, costs: MoveCosts, values: Values, change: Float[Array, ""]) -> Array:
+    """Return the bound of the values' error after a sweep; ∞ where none is known.
 
     Args:
         process: The decision process.
@@ -91,8 +80,8 @@ def error_bounds(process: DecisionProcess, costs: MoveCosts, values: Values, cha
     """
     lowest, size = jnp.where(is_reachable(values), values, jnp.inf).min(), largest_value(values)
     by_cost = costs.least / jnp.maximum(costs.ending - lowest, jnp.finfo(values.dtype).tiny)
-    error, rate = change + jnp.finfo(values.dtype).eps * size, 1 - process.discount
-    return ErrorBounds(error / rate, error / jnp.maximum(jnp.maximum(by_cost, 0), rate))
+    error = change + jnp.finfo(values.dtype).eps * size
+    return error / jnp.maximum(jnp.maximum(by_cost, 0), 1 - process.discount)
 
 
 def largest_error(tolerance: Float[Array, ""] | float, values: Values) -> Array:

@@ -10,7 +10,9 @@ states and replaces one value after another by its backup. This one differs:
 3. Values of farther states are shifted along with those they depend on, and states with unchanged neighbors are
    skipped (`value_kernels`).
 4. Sweeps go block by block, each until it has converged (`sweep_loop`).
-5. The gradient is that of the fixed point, by the adjoint equation; this is solved in the reverse order (`adjoint`).
+5. Worlds of up to a thousand states in which some hundred sweeps do not suffice are left to `Jacobi`, which has direct
+   steps.
+6. The gradient is that of the fixed point, by the adjoint equation; this is solved in the reverse order (`adjoint`).
 
 This module is what JAX sees. The rest runs on the host, and is imported when it first runs.
 """
@@ -29,6 +31,8 @@ from sidestep.tabular.backups import Backup, BoltzmannAverage, Gradient, HardMax
 from sidestep.tabular.solvers import base, native
 from sidestep.tabular.solvers.base import BellmanEquation, Region, Values, WarmStart
 from sidestep.tabular.solvers.bounds import lower_bound, move_costs
+from sidestep.tabular.solvers.direct import MOST_STATES
+from sidestep.tabular.solvers.jacobi import Jacobi
 
 KERNELS: dict[type[Backup], int] = {
     HardMax: native.HARD_MAX,
@@ -37,6 +41,8 @@ KERNELS: dict[type[Backup], int] = {
     Mellowmax: native.MELLOWMAX,
 }
 """The backups that have native code, and their numbers."""
+_PATIENCE = 200
+"""The least number of sweeps after which a small world is left to `Jacobi`."""
 
 
 class GaussSeidel(base.Solver):
@@ -82,8 +88,15 @@ class GaussSeidel(base.Solver):
         process, backup, beta = equation
         limits = lower_bound(process), move_costs(process, backup, beta)
         arguments = (self._native_equation(equation), *limits, start._replace(order=order), region)
-        solve = partial(_solve_values, self.max_sweeps)
-        return native.call_host(solve, arguments, _result_shapes(start.values, order))
+        states, dtype = start.values.shape[0], start.values.dtype
+        is_small = states <= MOST_STATES
+        most = min(self.max_sweeps, max(_PATIENCE, states)) if is_small else self.max_sweeps
+        result = native.call_host(partial(_solve_values, most), arguments, _result_shapes(start.values, order))
+        if not is_small:
+            return result
+        # direct steps, where sweeps are slow
+        rest = Jacobi(self.tolerance_for(dtype), self.max_sweeps)
+        return rest.go_on(equation, WarmStart(result.values, start.adjoint, result.order), result)
 
     def vjp(
         self, equation: BellmanEquation, gradient: Gradient, cotangent: Values, start: WarmStart, region: Region

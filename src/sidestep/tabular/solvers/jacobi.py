@@ -30,7 +30,7 @@ from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Backup, Gradient
 from sidestep.tabular.solvers import base
 from sidestep.tabular.solvers.base import BellmanEquation, Region, Values, WarmStart
-from sidestep.tabular.solvers.bounds import ErrorBounds, error_bounds, lower_bound, move_costs
+from sidestep.tabular.solvers.bounds import error_bound, lower_bound, move_costs
 from sidestep.tabular.solvers.direct import (
     MOST_STATES,
     Exits,
@@ -79,6 +79,18 @@ class Jacobi(base.Solver):
     def values(self, equation: BellmanEquation, start: WarmStart, region: Region) -> base.SolveResult:
         """Return V of the fixed point, of all states whatever the region."""
         del region
+        return self.go_on(equation, start)
+
+    def go_on(
+        self, equation: BellmanEquation, start: WarmStart, earlier: base.SolveResult | None = None
+    ) -> base.SolveResult:
+        """Return V of the fixed point, from where another solver has ended.
+
+        Args:
+            equation: What is solved.
+            start: Where to start from.
+            earlier: The result that `start` is from; if it has converged, it is returned as it is.
+        """
         process, backup, beta = equation
         exits, finite = Exits.of(process), finite_states(process)
         is_safe = jnp.all(finite[exits.successors] | (exits.discounted_probs == 0), axis=1)
@@ -100,9 +112,9 @@ class Jacobi(base.Solver):
 
         known = jnp.where(base.is_reachable(start.values), start.values, lower_bound(process))
         begun = jnp.where(finite, process.with_terminal_rewards(known), -jnp.inf)
-        errors = partial(error_bounds, process, move_costs(process, backup, beta))
-        iteration = self._iteration(sweep, begun.dtype, partial(newton_step, equation), errors)
-        return iterate(iteration, begun, start.order)
+        error = partial(error_bound, process, move_costs(process, backup, beta))
+        iteration = self._iteration(sweep, begun.dtype, partial(newton_step, equation), error)
+        return iterate(iteration, begun, start.order, earlier)
 
     def vjp(
         self, equation: BellmanEquation, gradient: Gradient, cotangent: Values, start: WarmStart, region: Region
@@ -120,11 +132,12 @@ class Jacobi(base.Solver):
 
         begun = jnp.nan_to_num(start.adjoint, nan=0)
 
-        def errors(adjoint: Values, _: Array) -> ErrorBounds:
-            error = adjoint_error(linear, cotangent, adjoint, equation.process.discount)
-            return ErrorBounds(jnp.full_like(error, jnp.inf), error)
+        def error(adjoint: Values, _: Array) -> Array:
+            # sums over many states are too large to say much
+            own = adjoint_error(linear, cotangent, adjoint, equation.process.discount)
+            return own if len(adjoint) <= MOST_STATES else jnp.zeros_like(own)
 
-        rules = partial(adjoint_step, linear, cotangent), errors
+        rules = partial(adjoint_step, linear, cotangent), error
         result = iterate(self._iteration(sweep, begun.dtype, *rules), begun, start.order)
         adjoint = jnp.where(result.converged, result.values, jnp.nan)
         by = jax.vjp(lambda by: equation.at(by).backed_up(values, gradient), equation.inputs)[1](adjoint)[0]

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sidestep.tabular.solvers.base import SolveResult, Values
-from sidestep.tabular.solvers.bounds import ErrorBounds, largest_error
+from sidestep.tabular.solvers.bounds import largest_error
 from sidestep.tabular.solvers.direct import MOST_STATES, DirectStep
 
 _STALLED = 1_000
@@ -43,14 +43,14 @@ class Iteration(NamedTuple):
         tolerance: The relative change at which to stop.
         max_sweeps: When to stop without convergence.
         step_all: Takes a step on all equations; None for none.
-        errors: Returns bounds of the error from the values and the largest change; None for none.
+        error: Returns a bound of the error from the values and the largest change; None for none.
     """
 
     sweep: Callable[[Values], tuple[Values, Values]]
     tolerance: Float[Array, ""] | float
     max_sweeps: int
     step_all: Callable[[Values], DirectStep] | None = None
-    errors: Callable[[Values, Float[Array, ""]], ErrorBounds] | None = None
+    error: Callable[[Values, Float[Array, ""]], Float[Array, ""]] | None = None
 
     @property
     def is_direct(self) -> bool:
@@ -92,13 +92,16 @@ class _State(NamedTuple):
     is_near: Bool[Array, ""]
 
 
-def iterate(iteration: Iteration, start: Values, order: Int[Array, " ordered"]) -> SolveResult:
+def iterate(
+    iteration: Iteration, start: Values, order: Int[Array, " ordered"], earlier: SolveResult | None = None
+) -> SolveResult:
     """Return the values at which sweeps stop.
 
     Args:
         iteration: What is iterated.
         start: The values to start from; −∞ where they are unknown or infinite.
         order: Passed on.
+        earlier: The result of another solver that `start` is from; nothing is done if it has converged.
     """
     dtype, eps = start.dtype, jnp.finfo(start.dtype).eps
     if len(start) > MOST_STATES:
@@ -125,7 +128,11 @@ def iterate(iteration: Iteration, start: Values, order: Int[Array, " ordered"]) 
         state = jax.lax.while_loop(lambda state: is_sweeping(state) & (state.sweeps < end), step, state)
         return _judge(iteration, state)
 
-    last = jax.lax.while_loop(is_unfinished, go_on, begun)
+    first = begun
+    if earlier is not None:
+        first = begun._replace(sweeps=earlier.sweeps, error=earlier.error, is_near=earlier.converged)
+        first = first._replace(residual=jnp.where(earlier.converged, earlier.residual, jnp.inf))
+    last = jax.lax.while_loop(is_unfinished, go_on, first)
     return SolveResult(last.values, order, last.sweeps, last.residual, last.error, last.is_near)
 
 
@@ -179,12 +186,10 @@ def _step_directly(iteration: Iteration, begun: _State, state: _State) -> _State
 def _judge(iteration: Iteration, state: _State) -> _State:
     """Return the state with its error; with a smaller tolerance if that is too large although changes are small."""
     is_small = state.residual <= state.tolerance
-    if iteration.errors is None:
+    if iteration.error is None:
         return state._replace(error=jnp.zeros_like(state.residual), is_near=is_small)
-    bounds = iteration.errors(state.values, state.moved)
-    error = jnp.minimum(bounds.smallest, state.direct_error)
-    # without direct steps a bound that may be far too large decides nothing
-    decisive = error if iteration.is_direct else jnp.where(jnp.isfinite(bounds.by_discount), bounds.by_discount, 0)
-    is_near = is_small & (decisive <= largest_error(iteration.tolerance, state.values))
+    error = jnp.minimum(iteration.error(state.values, state.moved), state.direct_error)
+    is_known = jnp.isfinite(error) | iteration.is_direct
+    is_near = is_small & (~is_known | (error <= largest_error(iteration.tolerance, state.values)))
     tolerance = jnp.where(is_small & ~is_near, _FINER * state.tolerance, state.tolerance)
     return state._replace(error=error, is_near=is_near, tolerance=tolerance)

@@ -101,22 +101,18 @@ class SweepLoop:
             shift_from = 0 if self.backup.kind in _SHIFTED_BACKUPS else len(self.values)
             self.sweep(np.arange(len(self.values), dtype=np.int32), shift_from)
         residual = self._shifted_rounds() if self.backup.kind in _SHIFTED_BACKUPS else np.inf
-        largest_error, error, converged = (
-            float(np.sqrt(max(self.tolerance, np.finfo(self.values.dtype).eps))),
-            np.inf,
-            False,
-        )
+        eps = np.finfo(self.values.dtype).eps
+        largest_error, error, converged = np.sqrt(float(max(self.tolerance, eps))), np.inf, False
         while not (converged or self._limit_reached() or np.isnan(residual)):
             residual = self._round_by_blocks() if residual > self.tolerance else residual
             if residual <= self.tolerance and not self._limit_reached():
                 residual, change = self.jacobi_sweep()
-                by_discount, error, size = self._errors(change)
-                # the other bound may be far too large
-                is_near = not np.isfinite(by_discount) or by_discount <= largest_error * size
+                error, size = self._error(change)
+                is_near = not np.isfinite(error) or error <= largest_error * size
                 converged = bool(residual <= self.tolerance and is_near)
                 if not is_near:
                     self.tolerance = self.tolerance * self.values.dtype.type(_FINER)
-                    if self.tolerance < np.finfo(self.values.dtype).eps:
+                    if self.tolerance < eps:
                         break
         return native.SolveInfo(-(-self.solved // len(self.values)), float(residual), float(error), converged)
 
@@ -150,15 +146,16 @@ class SweepLoop:
         history.last_changed[changed] = history.last_solved[changed] = self.number
         return residual, change
 
-    def _errors(self, change: float) -> tuple[float, float, float]:
-        """Return the bounds of the error after such a change (`bounds.error_bounds`), and the largest value."""
-        known = self.values[self.values > -np.inf]
+    def _error(self, change: float) -> tuple[float, float]:
+        """Return the bound of the error after such a change (`bounds.error_bound`), and the largest value."""
+        known, limits = self.values[self.values > -np.inf], np.finfo(self.values.dtype)
         lowest, size = float(known.min(initial=np.inf)), float(np.abs(known).max(initial=0.0))
-        by_cost = float(self.costs.least) / max(float(self.costs.ending) - lowest, float(np.finfo(known.dtype).tiny))
-        rate, error = float(self.process.one_minus_discount), change + float(np.finfo(known.dtype).eps) * size
-        by_discount, smallest = (error / each if each > 0 else np.inf for each in (rate, max(by_cost, rate)))
-        # a number that the results' type does not hold is of no use
-        return by_discount, (smallest if smallest < float(np.finfo(known.dtype).max) else np.inf), size
+        by_cost = float(self.costs.least) / max(float(self.costs.ending) - lowest, float(limits.tiny))
+        rate = max(by_cost, float(self.process.one_minus_discount), 0.0)
+        if rate == 0:
+            return np.inf, size
+        # no more than the results' type holds
+        return min((change + float(limits.eps) * size) / rate, float(limits.max)), size
 
     def _shifted_rounds(self) -> float:
         """Step 1; return the largest change in the last round, infinite if the first values were restored."""
