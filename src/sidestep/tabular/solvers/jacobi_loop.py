@@ -148,7 +148,8 @@ def _sweep_once(iteration: Iteration, start: Values, state: _State) -> _State:
     values, size = iteration.sweep(old)
     # a state may have no value yet, or never have one
     moved = jnp.where(jnp.isneginf(values) & jnp.isneginf(old), 0, values - old)
-    change = moved / jnp.maximum(size, jnp.finfo(old.dtype).tiny / iteration.tolerance)
+    limits = jnp.finfo(old.dtype)
+    change = moved / jnp.maximum(size, limits.tiny / jnp.maximum(iteration.tolerance, limits.eps))
     residual = jnp.abs(change).max()
     alternates = jnp.any((change * state.change < 0) & (jnp.abs(state.change) > _LARGE * residual))
     smaller = residual < _PROGRESS * state.smallest
