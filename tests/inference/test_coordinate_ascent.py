@@ -2,13 +2,15 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.special import expit
 
-from helpers.barrier_worlds import COSTLY, DISCOUNTED, RIGHT, UP, BarrierWorld, all_maps, room, world
-from sidestep.errors import InputError
+from helpers.barrier_worlds import COSTLY, DISCOUNTED, RIGHT, UP, BarrierWorld, all_maps, corridor, room, world
+from sidestep.errors import ImproperTask, InputError
 from sidestep.inference.chains import PASSING
 from sidestep.inference.checkpoints import Checkpoint
 from sidestep.inference.coordinate_ascent import BarrierMeanField, mean_field_barriers, prior_mean_field
@@ -16,6 +18,7 @@ from sidestep.inference.enumeration import enumerate_barriers
 from sidestep.inference.maximize import Status
 from sidestep.inference.mrf import BinaryMRF, expected_shapes, shape_counts
 from sidestep.tabular.backups import Behavior, HardMax, LogSumExp
+from sidestep.tabular.behavior_model import behavior_model
 from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.likelihood import log_likelihood
@@ -219,3 +222,14 @@ def test_mean_field_barriers_of_a_known_map_is_the_map():
 def test_mean_field_barriers_with_settings_out_of_range_raises(settings, field):
     with pytest.raises(InputError, match=f"'{field}'"):
         ascended(world(), **settings)
+
+
+def test_mean_field_barriers_of_agents_with_a_discount_is_that_of_discounted_tasks():
+    """Without costs, the task at discount 1 has no values of its own."""
+    one = corridor()
+    undiscounted = eqx.tree_at(lambda demos: demos.tasks.discount, one.demonstrations, jnp.ones(1))
+    agents = behavior_model(one.behavior, ["discount"], discount=DISCOUNTED.discount)
+    with pytest.raises(ImproperTask):
+        mean_field_barriers(one.model, undiscounted, one.behavior, prior=one.prior)
+    result = mean_field_barriers(one.model, undiscounted, agents, prior=one.prior)
+    np.testing.assert_allclose(result.closed, ascended(one).closed, rtol=1e-6)

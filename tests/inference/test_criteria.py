@@ -181,3 +181,31 @@ def test_to_arviz_with_a_fit_has_what_waic_and_loo_need():
     np.testing.assert_allclose(loo["elpd_loo"], waic["elpd_waic"], atol=0.2)
     moves: Any = ss.laplace(fit).to_arviz(jax.random.key(0), 5, fit=fit, unit="move")
     assert moves.log_likelihood["moves"].shape == (1, 5, 8)
+
+
+def fit_of_known_dynamics(learn: tuple[str, ...]) -> ss.Fit:
+    """A fit with nothing to learn in the model."""
+    model = ss.tabular_model(ss.graph(SUCCESSORS), np.full(SUCCESSORS.shape, 0.5), known=True)
+    return ss.fit(model, demonstrations(), ss.behavior_model(ss.Behavior("boltzmann", 2.0), learn), terms=("actions",))
+
+
+@pytest.mark.parametrize("learn", [(), ("beta",)])
+def test_pointwise_log_likelihood_of_known_dynamics_is_the_dense_one(learn):
+    fit = fit_of_known_dynamics(learn)
+    beta = float(fit.behavior.behavior_of().beta)
+    transitions, expected = dense_tabular(np.zeros(SUCCESSORS.shape), SUCCESSORS), []
+    for path, taken, task in WALKS:
+        policy = plain_policy(plain_values("Boltzmann", transitions, TASKS[task], beta, 300)[1], beta)
+        expected += np.log(policy[np.array(path[:-1]), np.array(taken)]).tolist()
+    np.testing.assert_allclose(ss.pointwise_log_likelihood(fit).actions, expected, rtol=1e-8)
+
+
+def test_information_criteria_and_cross_validation_of_known_dynamics_have_a_parameter():
+    fit = fit_of_known_dynamics(("beta",))
+    assert ss.information_criteria(fit).parameters == 1
+    assert np.isfinite(ss.cross_validate(fit, folds=3).mean.estimate)
+
+
+def test_laplace_of_a_fit_with_nothing_to_learn_raises():
+    with pytest.raises(InputError, match="field 'fit': expected a fit of at least one parameter"):
+        ss.laplace(fit_of_known_dynamics(()))

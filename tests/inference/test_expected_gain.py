@@ -28,3 +28,18 @@ def test_expected_gain_of_lbfgs_becomes_that_of_the_quadratic():
 def test_expected_gain_without_curvature_is_infinite(optimizer):
     x = np.array([1.0, -2.0])
     assert optimizer.expected_gain(x, loss(x)[1], optimizer.init(x)) == np.inf
+
+
+def test_expected_gain_of_lbfgs_where_the_loss_is_concave_is_infinite():
+    """The loss −x³/3 is concave above 0, so that the memory of a step has a negative curvature."""
+
+    def concave(x, *, approximate=False):
+        del approximate
+        return -float(np.sum(x**3)) / 3 if abs(x[0]) < 3 else np.inf, -(x**2)
+
+    optimizer, x = LBFGS(), np.array([1.0])
+    after = optimizer.step(concave, x, *concave(x), optimizer.init(x))
+    assert after is not None
+    x, state = after
+    assert optimizer.expected_gain(x, concave(x)[1], state) == np.inf
+    assert optimizer.expected_gain(x, np.zeros(1), state) == 0

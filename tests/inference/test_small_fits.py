@@ -15,7 +15,7 @@ from sidestep.tabular.behavior_model import behavior_model
 from sidestep.tabular.demonstrations import Trajectory, gather
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import ALL_TERMS
-from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.models import ObstacleGrid, true_model
 from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import reach
@@ -111,3 +111,17 @@ def test_solve_tolerances_are_loose_first_on_large_maps(large_map, given, loose)
     tolerances = solve_tolerances(problem, LBFGS(), large_map)
     exact = float(solver.tolerance_for(np.dtype(np.float64)))
     assert tolerances == ([LBFGS().solve_tolerance, exact] if loose else [None])
+
+
+def test_fit_of_which_the_next_points_have_no_values_has_not_converged():
+    """Agents that would rather stay than arrive: at discount 1, a larger taste for staying has no values."""
+    grid = Grid(np.zeros((1, 4), int))
+    features = (np.arange(4) == 0).astype(float)[:, None, None]
+    walk = Trajectory(np.array([1] + [0] * 8 + [1, 2, 3]), np.array([2] + [2] * 7 + [3, 3, 3]), 0)
+    demos = gather([walk] * 20, [reach(grid, 3, discount=1.0, step_cost=1.0)])
+    agents = behavior_model(Behavior(BoltzmannAverage(), 3.0), features=features)
+    result = fit(true_model(grid), demos, agents, terms=("actions",))
+    assert result.final.gradient > 1
+    assert not result.converged
+    assert result.status is Status.NO_VALUES
+    assert "the maximum may lie where a task has no values" in result.message

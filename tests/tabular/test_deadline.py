@@ -80,3 +80,22 @@ def test_log_likelihood_of_a_walk_beyond_the_deadline_raises():
 def test_solve_options_with_a_deadline_without_horizon_raise():
     with pytest.raises(ss.InputError, match="expected a horizon with a deadline"):
         ss.SolveOptions(deadline=True)
+
+
+def test_pointwise_log_likelihood_with_a_deadline_is_that_of_the_time_of_each_move():
+    demos = shown()
+    states, actions = np.asarray(demos.states), np.asarray(demos.actions)
+    fit = ss.fit(MODEL, demos, BEHAVIOR, options=OPTIONS, optimizer=ss.LBFGS(max_iterations=0))
+    each = ss.pointwise_log_likelihood(fit).actions
+    expected = by_hand(MODEL.parameters, demos)
+    np.testing.assert_allclose(each, expected, rtol=1e-10)
+    # the same choice has several log-likelihoods
+    assert len(np.unique(np.round(expected[(states == 0) & (actions == 0)], 6))) > 1
+
+
+def test_information_criteria_with_a_deadline_need_the_number_of_parameters():
+    known = ss.tabular_model(ss.graph(SUCCESSORS), PROBABILITIES, known=True)
+    fit = ss.fit(known, shown(), ss.behavior_model(BEHAVIOR, ["beta"]), terms=("actions",), options=OPTIONS)
+    with pytest.raises(ss.errors.InputError, match="field 'options': expected options without a deadline"):
+        ss.information_criteria(fit)
+    assert ss.information_criteria(fit, parameters=1).log_likelihood == pytest.approx(fit.final.actions, rel=1e-10)

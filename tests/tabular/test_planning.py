@@ -7,6 +7,7 @@ import pytest
 
 from sidestep.errors import ImproperTask, InputError, NotConverged
 from sidestep.tabular.backups import Behavior, HardMax, LogSumExp
+from sidestep.tabular.behavior_model import behavior_model
 from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid, TabularModel, true_model
@@ -152,3 +153,11 @@ def test_roll_out_of_many_agents_has_the_probabilities_as_frequencies():
 def test_roll_out_with_equal_keys_is_equal():
     np.testing.assert_array_equal(stochastic(1).states, stochastic(1).states)
     assert (stochastic(1).states != stochastic(2).states).any()
+
+
+@pytest.mark.parametrize(("learn", "person"), [([], 0), ([], 7), (["lapse"], 7), (["beta"], 7)])
+def test_plan_of_a_person_that_does_not_exist_raises(learn, person):
+    agents = behavior_model(Behavior(HardMax(), 2.0), learn)
+    assert plan(true_model(OPEN), reach(OPEN, 8), agents).path_from(7).tolist() == [7, 8]
+    with pytest.raises(InputError, match="field 'person'"):
+        plan(true_model(OPEN), reach(OPEN, 8), agents, person=person)

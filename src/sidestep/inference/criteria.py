@@ -67,7 +67,7 @@ def information_criteria(fit: Fit[Any], *, unit: Unit = "walk", parameters: int 
 
     Raises:
         InputError: For a fit that did not converge or with tempering, and, where k is not given, for too many
-            parameters or the fixed-policy gradient.
+            parameters, the fixed-policy gradient or a deadline.
 
     Example:
         >>> import sidestep as ss
@@ -101,7 +101,7 @@ def identified_parameters(fit: Fit[Any]) -> int:
         fit: The fit, with the exact gradient and at most 500 parameters.
 
     Raises:
-        InputError: For more parameters, and for the fixed-policy gradient.
+        InputError: For more parameters, for the fixed-policy gradient, and for agents with a deadline.
     """
     learned = Parameters(fit.model.parameters, fit.behavior.parameters)
     count = ravel_pytree(learned)[0].size
@@ -109,6 +109,9 @@ def identified_parameters(fit: Fit[Any]) -> int:
     check(count <= _MOST, message, source="information_criteria", field="parameters")
     if count == 0:
         return 0
+    # the moves that are expected have no time, on which policies depend before a deadline
+    message = "expected options without a deadline, or the number of parameters by parameters=…; found a deadline"
+    check(not fit.problem.options.deadline, message, source="information_criteria", field="options")
     expected = _expected_moves(fit, learned)
     information = TabularInformation(replace(fit.problem, demonstrations=expected, tempering=1.0), learned)
     of_likelihood = information.dense() - _symmetric(information.of_prior(np.eye(count)))

@@ -43,9 +43,9 @@ def laplace(fit: HasInformation | Information, *, dense: int = 500, rank: int = 
         The normal distribution, with standard errors, intervals and samples.
 
     Raises:
-        InputError: For a fit that did not converge (its values, or its policy), that ended before the maximum or at a
-            bound; for too few rollouts; and where the posterior does not determine some direction, with the names of
-            parameters.
+        InputError: For a fit with nothing to learn, that did not converge (its values, or its policy), or that ended
+            before the maximum or at a bound; for too few rollouts; and where the posterior does not determine some
+            direction, with the names of parameters.
         NotConverged: If the iterations for many parameters do not converge.
 
     Example:
@@ -66,6 +66,8 @@ def laplace(fit: HasInformation | Information, *, dense: int = 500, rank: int = 
     if isinstance(fit, type) or not isinstance(fit, Information | HasInformation):
         raise InputError(f"expected a fit, or its information, found {describe(fit)}", field="fit")
     information = fit if isinstance(fit, Information) else fit.information()
+    message = "expected a fit of at least one parameter, found one with nothing to learn"
+    check(information.size > 0, message, source="laplace", field="fit")
     _check_bounds(information.parameters)
     finite = np.isfinite(information.gradient).all()
     check(finite, "expected a finite gradient at the learned parameters", source="laplace", field="fit")

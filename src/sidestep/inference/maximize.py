@@ -70,6 +70,7 @@ class Status(enum.Enum):
     MAX_ITERATIONS = "stopped at max_iterations"
     NO_ASCENT_STEP = "stopped, no step increases the objective"
     PRECISION_LIMIT = "stopped, no step increases the objective in 32-bit numbers"
+    NO_VALUES = "stopped, values do not exist or do not converge next to this point"
     MIXED = "mixed"
     NOT_MIXED = "chains have not mixed"
 
@@ -84,6 +85,9 @@ _ADVICE = {
     Status.MAX_ITERATIONS: "a larger max_iterations lets it continue",
     Status.NO_ASCENT_STEP: (
         "the objective has a kink here (as with HardMax), or the solver's tolerance does not resolve smaller changes"
+    ),
+    Status.NO_VALUES: (
+        "the maximum may lie where a task has no values; a discount below 1, a narrower prior or more sweeps may help"
     ),
     Status.PRECISION_LIMIT: (
         "32-bit numbers cannot resolve smaller changes of the objective; set jax.config.update('jax_enable_x64', True) "
@@ -172,6 +176,7 @@ def maximize(
         elif progress.iteration >= optimizer.max_iterations:
             status = Status.MAX_ITERATIONS
         else:
+            evaluator.nearest = _Nearest(x)
             update = optimizer.step(evaluator.loss, x, -progress.objective, point.gradient, state)
         if update is not None:
             x, state = update
@@ -185,6 +190,8 @@ def maximize(
                 optimizer.measure.format(optimizer.convergence(point.gradient, state)),
                 evaluator.resolution,
             )
+            if status is None and not evaluator.nearest.usable:
+                status = Status.NO_VALUES
             if status is None and optimizer.expected_gain(x, point.gradient, state) <= limit:
                 status = Status.CONVERGED
                 measure += f", and no more than {limit:.1g} nats are left to gain, the precision of the objective"
@@ -216,6 +223,18 @@ class _Point(NamedTuple):
     gradient: np.ndarray
 
 
+class _Nearest(NamedTuple):
+    """The trial point next to x of one step, and whether it has a finite loss; none at first."""
+
+    x: np.ndarray
+    distance: float = np.inf
+    usable: bool = True
+
+    def after(self, trial: np.ndarray, usable: bool) -> "_Nearest":
+        distance = float(np.abs(trial - self.x).max(initial=0.0))
+        return _Nearest(self.x, distance, usable) if 0 < distance < self.distance else self
+
+
 class _Evaluator:
     """Evaluates an objective at vectors, each time from the warm starts of the last time.
 
@@ -237,6 +256,7 @@ class _Evaluator:
         self.solves: list[SolveSummary] = []
         self.contributions: list[Contribution] = []
         self.scale = 0.0
+        self.nearest = _Nearest(self.start)
 
     @property
     def resolution(self) -> float:
@@ -271,6 +291,7 @@ class _Evaluator:
         """Return minus the objective and its gradient; infinity where a solve failed, so that no search ends there."""
         point = self.evaluate(x, approximate)
         usable = np.isfinite(point.terms[0]) and np.isfinite(point.gradient).all()
+        self.nearest = self.nearest.after(x, bool(usable))
         return -float(point.terms[0]) if usable else np.inf, point.gradient
 
     def tighten(self) -> bool:

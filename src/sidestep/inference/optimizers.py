@@ -115,7 +115,7 @@ class Optimizer(eqx.Module):
             state: The present state.
 
         Returns:
-            Nats; infinite where the optimizer knows no curvature.
+            Nats; infinite where the optimizer knows no curvature, or not that of a minimum.
         """
         del x, gradient, state
         return float("inf")
@@ -176,7 +176,9 @@ class LBFGS(Optimizer):
     def expected_gain(self, x: Vector, gradient: Vector, state: Tree) -> float:
         """Return the gain of a Newton step with the estimated curvature, half its first-order gain."""
         direction, _ = _lbfgs_direction(self.memory_size, gradient, state, x)
-        return float(np.asarray(direction, np.float64) @ np.asarray(gradient, np.float64)) / 2
+        gain = float(np.asarray(direction, np.float64) @ np.asarray(gradient, np.float64)) / 2
+        # negative where the loss is concave between the points of the memory
+        return gain if gain > 0 or not gradient.any() else float("inf")
 
 
 class Adam(Optimizer):

@@ -4,6 +4,7 @@ The objective of a fit is linear in the counts of its choices and arrivals (`sid
 derivative by a count is the log-likelihood of one move. That is how it is computed here: by the objective itself.
 """
 
+import math
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -20,7 +21,7 @@ from sidestep.inference.fit import Fit
 from sidestep.inference.objective import Objective, Parameters, Problem, actions_log_likelihood
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.demonstrations import Demonstrations
-from sidestep.tabular.likelihood import Arrivals, arrival_log_likelihood
+from sidestep.tabular.likelihood import Arrivals, arrival_log_likelihood, move_times
 from sidestep.tabular.solvers.base import WarmStart
 
 Unit = Literal["walk", "move"]
@@ -159,7 +160,8 @@ def _stack(parameters: Parameters, learned: Parameters) -> tuple[tuple[int, ...]
         len(axes) == 1 and shapes, "expected draws with the same leading axes, of the fit's shapes", field="parameters"
     )
     (draws,) = axes
-    flat = jax.tree.map(lambda draw, one: to_jax(np.asarray(draw).reshape(-1, *one.shape)), parameters, learned)
+    count = math.prod(draws)
+    flat = jax.tree.map(lambda draw, one: to_jax(np.asarray(draw).reshape(count, *one.shape)), parameters, learned)
     return draws, flat
 
 
@@ -194,15 +196,19 @@ def _of_choices(
     objective: Objective, demos: Demonstrations, choices: list[Float[np.ndarray, "draws tasks choices"]]
 ) -> Float[np.ndarray, "draws moves"]:
     """Return the log-likelihood of the action of each move, from that of each choice."""
-    graph, batches = objective.problem.model.graph, objective.batches
-    states, actions, counts = (
+    graph, batches, options = objective.problem.model.graph, objective.batches, objective.problem.options
+    # with a deadline, choices after different numbers of moves are distinct
+    timed, moments = (("times",), (options.horizon or 1,)) if options.deadline else ((), ())
+    counts, *parts = (
         np.concatenate([np.asarray(getattr(batch.choices, name)) for batch in batches])
-        for name in ("states", "actions", "counts")
+        for name in ("counts", "states", "actions", *timed)
     )
-    task = np.broadcast_to(np.arange(len(states))[:, None], states.shape)
-    shape, places = (len(states), graph.states, graph.actions), np.flatnonzero(counts.ravel() > 0)
-    of_choice = np.ravel_multi_index((task, states, actions), shape).ravel()[places]
-    of_move = np.ravel_multi_index(tuple(map(np.asarray, (demos.task, demos.states, demos.actions))), shape)
+    task = np.broadcast_to(np.arange(len(counts))[:, None], counts.shape)
+    shape, places = (len(counts), graph.states, graph.actions, *moments), np.flatnonzero(counts.ravel() > 0)
+    of_choice = np.ravel_multi_index((task, *parts), shape).ravel()[places]
+    times = [move_times(demos.trajectory)] if timed else []
+    own = map(np.asarray, (demos.task, demos.states, demos.actions, *times))
+    of_move = np.ravel_multi_index(tuple(own), shape)
     values = np.concatenate(choices, axis=1)
     return _values_at(of_choice, of_move, values.reshape(len(values), -1)[:, places])
 

@@ -114,7 +114,10 @@ class BehaviorModel(eqx.Module):
         """
         log_beta, logit_lapse = self.parameters.log_beta, self.parameters.logit_lapse
         beta, lapse = self.behavior.beta, self.behavior.lapse
-        if log_beta is not None:
+        if log_beta is None:
+            message = f"expected none without persons, found {person!r}"
+            check(person is None or isinstance(person, jax.Array), message, field="person")
+        else:
             exists = person is None or isinstance(person, jax.Array) or person in range(len(log_beta))
             check(exists, f"expected a person in 0…{len(log_beta) - 1}, found {person!r}", field="person")
             beta = jnp.exp(log_beta.mean() if person is None else log_beta[person])
@@ -203,9 +206,9 @@ def behavior_model(
         The behavior model, with the learned numbers at their start.
 
     Raises:
-        InputError: For a name that is not in `LEARNABLE`, a learned discount that is not between 0 and 1, persons
-            that are not numbered from 0, features or weights that are not finite, another number of weights than of
-            features, and aims that are not states.
+        InputError: For a name that is not in `LEARNABLE`, a learned discount that is not between 0 and 1, a discount
+            that is not learned, persons that are not numbered from 0, features or weights that are not finite,
+            another number of weights than of features, weights without features, and aims that are not states.
 
     Example:
         >>> from sidestep.tabular.backups import BoltzmannAverage
@@ -225,9 +228,14 @@ def behavior_model(
         log_beta = jnp.full(1 if person is None else int(np.max(person)) + 1, jnp.log(behavior.beta))
     if "lapse" in learn:
         logit_lapse = logit(jnp.asarray(_INITIAL_LAPSE if behavior.lapse is None else behavior.lapse))
-    if "discount" in learn:
+    learns_discount = "discount" in learn
+    message = f"expected none unless it is learned (a task has its own), found {discount!r}"
+    check(learns_discount or discount is None, message, field="discount")
+    if learns_discount:
         begin = to_number(discount, "discount", above=0, below=1)
         logit_discount = logit(jnp.asarray(begin, jnp.result_type(float)))
+    message = "expected none without features, found some"
+    check(features is not None or reward_weights is None, message, field="reward_weights")
     if features is not None:
         features = to_jax(to_finite(features, "features", ("states", "actions", "features")), jnp.result_type(float))
         count = features.shape[-1]
