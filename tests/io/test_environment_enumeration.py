@@ -298,8 +298,26 @@ def test_collect_in_an_enumerated_environment_follows_its_policy():
         (("carries", (0,)), ("cell", 3)),
         (("carries", (1,)), ("cell", 3)),
     ]
-    assert walk.actions.tolist() == [1, 1, 2, 0]  # it is truncated there
+    assert walk.actions.tolist() == [1, 1, 2, 0]
+    assert walk.truncated is True
     gather([walk], [world.task])
+
+
+@pytest.mark.parametrize(("limit", "truncated"), [(19, True), (20, False), (21, False)])
+def test_collect_is_truncated_where_the_time_limit_comes_before_the_end(limit, truncated):
+    """A ladder of 20 rungs ends with its 20th step; where that is the limit too, the task has ended."""
+    world = enumerate_env(Ladder(lambda _: 1.0), 0.9)
+    env = wrappers.TimeLimit(Ladder(lambda _: 1.0), limit)
+    (walk,) = collect(env, world, lambda *_: 0, 1)
+    assert len(walk.actions) == min(limit, 20)
+    assert walk.truncated is truncated
+
+
+@pytest.mark.parametrize("reward", [np.nan, np.inf])
+@pytest.mark.parametrize("samples", [None, 3])
+def test_enumerate_env_of_a_reward_that_is_not_finite_raises_with_state_and_action(reward, samples):
+    with pytest.raises(InputError, match=r"^state 19, action 0, field 'reward': expected a finite number, found"):
+        enumerate_env(Ladder(lambda _: reward), samples=samples)
 
 
 def test_collect_of_a_state_that_was_not_enumerated_raises():

@@ -5,6 +5,7 @@ import enum
 import json
 import zipfile
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -166,6 +167,13 @@ def test_load_of_a_function_needs_a_template(tmp_path):
 def test_save_of_other_arrays_raises_and_writes_nothing(value, tmp_path):
     with pytest.raises(InputError, match=r"save, field 'result\[0\]': expected an array of numbers"):
         ss.save(tmp_path / "result", [value])
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("value", [{1, 2}, frozenset((1,)), b"ab", 1 + 2j, Path("map"), object()], ids=type)
+def test_save_of_an_object_that_is_no_record_raises_and_writes_nothing(value, tmp_path):
+    with pytest.raises(InputError, match=rf"save, field 'result\['own'\]': .*, found {type(value).__name__}$"):
+        ss.save(tmp_path / "result", {"own": value})
     assert not list(tmp_path.iterdir())
 
 

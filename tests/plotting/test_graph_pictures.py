@@ -56,6 +56,24 @@ def test_draw_graph_names_states_and_the_chances_of_actions():
     assert texts == {"home", "road", "work", "walk: .75", "bus: .50", "walk: .75\nbus: .50", "walk: .25\nbus: .50"}
 
 
+def test_draw_graph_has_available_actions_only():
+    """From home the bus alone leads to the road, and walking, which cannot be chosen, to work."""
+    graph = ss.graph([[[2], [1]], [[2], [2]], [[2], [2]]], available=[[False, True], [True, True], [True, True]])
+    axes = Figure().subplots()
+    draw_graph(axes, ss.TabularModel(graph, jnp.zeros((3, 2, 1))), labels=LABELS, positions=POSITIONS)
+    np.testing.assert_allclose(arrows(axes), [4.0, 4.0])  # home to road and road to work, of probability 1
+    assert {text.get_text() for text in axes.texts} - {""} == {"home", "road", "work", "bus: 1", "walk: 1\nbus: 1"}
+
+
+def test_draw_graph_of_a_plan_names_available_actions_only():
+    """Both actions lead from home to the road, and walking cannot be chosen."""
+    graph = ss.graph([[[1], [1]], [[2], [2]], [[2], [2]]], available=[[False, True], [True, True], [True, True]])
+    model, axes = ss.TabularModel(graph, jnp.zeros((3, 2, 1))), Figure().subplots()
+    draw_graph(axes, model, ss.plan(model, ss.reach(graph, 2)), labels=LABELS, positions=POSITIONS)
+    texts = [text.get_text() for text in axes.texts]
+    assert "bus: 1" in texts
+
+
 def test_draw_graph_terminal_states_have_another_shape():
     nodes = [each for each in drawn(world()[1]).collections if isinstance(each, PathCollection)]
     places = [np.asarray(each.get_offsets()).tolist() for each in nodes]

@@ -222,7 +222,7 @@ def test_join_of_different_worlds_raises():
     other = ss.gather([ss.Trajectory(np.array([0, 1]), np.array([3]), 0)], [ss.reach(ss.Grid.unknown(1, 2), 1)])
     with pytest.raises(InputError, match=r"number of states in all parts, found \[4, 2\]"):
         ss.join([demonstrations(), other])
-    with pytest.raises(InputError, match="at least one"):
+    with pytest.raises(InputError, match="at least 1, found 0"):
         ss.join([])
 
 
@@ -234,3 +234,20 @@ def test_join_with_persons_in_some_parts_raises():
     both = ss.join([known, known])
     assert both.persons is not None
     assert both.persons.tolist() == [4, 4]
+
+
+def test_from_table_with_a_step_left_out_raises_unless_the_next_state_is_known():
+    task = ss.reach(ss.Grid.unknown(1, 4), 3)
+    table = {"walk": [0, 0, 0], "state": [2, 0, 3], "action": [3, 3, None], "time": [2, 0, 3], "after": [3, 2, None]}
+    with pytest.raises(InputError, match=r"row 2, field 'time': expected the next step .*, found a gap"):
+        ss.Demonstrations.from_table(table, task, step="time")
+    known = ss.Demonstrations.from_table(table, task, step="time", next_state="after")
+    assert known.next_states.tolist() == [2, 3]
+    in_seconds = table | {"time": [2.5, 0.0, 3.0]}
+    assert ss.Demonstrations.from_table(in_seconds, task, step="time").next_states.tolist() == [2, 3]
+
+
+def test_from_table_of_walks_with_steps_that_begin_anywhere_takes_them():
+    task = ss.reach(ss.Grid.unknown(1, 4), 3)
+    table = {"walk": [0, 1, 0, 1], "state": [2, 1, 3, 2], "action": [3, 3, None, None], "step": [7, 2, 8, 3]}
+    assert ss.Demonstrations.from_table(table, task, step="step").next_states.tolist() == [3, 2]

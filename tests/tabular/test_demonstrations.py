@@ -1,5 +1,8 @@
 """Demonstrations from trajectories, and from walks in metres."""
 
+import dataclasses
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -116,3 +119,10 @@ def test_pad_to_power_of_two_adds_moves_that_count_nothing_and_tasks_that_end_at
 @pytest.mark.parametrize(("count", "expected"), [(1, 1), (2, 2), (3, 4), (16, 16), (17, 32)])
 def test_next_power_of_two_rounds_up(count, expected):
     assert next_power_of_two(count) == expected
+
+
+def test_with_only_keeps_the_weights_of_chosen_trajectories():
+    walk = Trajectory(np.array([0, 1, 2]), np.array([3, 3]), 0)
+    demos = gather([walk, walk], [reach(Grid.unknown(1, 3), 2)])
+    demos = dataclasses.replace(demos, weights=jnp.array([3.0, 0.5, 2.0, 2.0]))
+    assert demos.with_only([True, False]).weights.tolist() == [3, 0.5, 0, 0]

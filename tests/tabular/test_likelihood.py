@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from sidestep.inference.calibration import score_statistics
-from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax
+from sidestep.tabular.backups import Behavior, BoltzmannAverage, HardMax, LogSumExp
 from sidestep.tabular.demonstrations import Trajectory, gather
-from sidestep.tabular.graph import graph
+from sidestep.tabular.graph import Graph, graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.likelihood import (
     arrival_log_likelihood,
@@ -22,7 +22,7 @@ from sidestep.tabular.likelihood import (
 )
 from sidestep.tabular.models import ObstacleGrid, TabularModel
 from sidestep.tabular.solve import SolveOptions, solve
-from sidestep.tabular.tasks import reach
+from sidestep.tabular.tasks import reach, task
 
 # In a corridor of three cells, each blocked with p = 1/4, at γ = 1/2, an agent at 0 chooses left, right, right;
 # the first two fail; then right again. With g = γ(1−p)/(1−γp) = 3/7: V = g², g, 1.
@@ -182,3 +182,16 @@ def test_likelihoods_of_persons_with_any_number_of_moves_compile_once():
     assert first
     assert not again
     np.testing.assert_array_equal(likelihood, expected)
+
+
+def test_log_policies_of_one_row_of_available_actions_are_those_of_every_state():
+    """The row holds for all states, as the shape says."""
+    world = graph([[[1], [0], [1]], [[0], [1], [1]]])
+    rows = [Graph(world.successors, world.lengths, jnp.asarray([[True, False, True]] * rows)) for rows in (1, 2)]
+    walk = Trajectory(np.array([0, 0, 1]), np.array([0, 2]), task=0, truncated=True)
+    shown = gather([walk], [task(np.array([[0.0, 5.0, 1.0], [0.5, 2.0, 0.0]]), 0.9, np.array([False, False]))])
+    one, every = (
+        log_policies(TabularModel(row, jnp.zeros((2, 3, 1))), shown, Behavior(LogSumExp(), 2.0, lapse=0.1))
+        for row in rows
+    )
+    np.testing.assert_allclose(one, every)

@@ -61,6 +61,7 @@ def moved(states, actions, next_states, trajectory):
 
 
 @pytest.mark.parametrize(("moves", "message"), [
+    (([0, 1, 2], [0, 0, 0], [1, 2, 2], [0, 0, 0]), r"trajectory 0.*not a terminal state of its task in move 2"),
     (([0, 3], [0, 0], [1, 2], [0, 0]), r"trajectory 0.*expected state 0…2 in move 1, found 3"),
     (([0, -1], [0, 0], [1, 2], [0, 1]), r"trajectory 1.*expected state 0…2 in move 0, found -1"),
     (([0, 0, 0], [0, 0, 2], [1, 1, 1], [0, 1, 1]), r"trajectory 1.*expected action 0…1 in move 1, found 2 in state 0"),
@@ -72,7 +73,7 @@ def moved(states, actions, next_states, trajectory):
 def test_check_demonstrations_names_the_first_wrong_move(moves, message):
     with pytest.raises(InputError, match=message):
         check_demonstrations(moved(*moves), LINE)
-    check_demonstrations(moved([0, 1, 2], [1, 0, 0], [0, 2, 2], [0, 0, 1]), LINE)
+    check_demonstrations(moved([0, 1, 1], [1, 0, 0], [0, 2, 2], [0, 0, 1]), LINE)
 
 
 def test_check_task_accepts_rewards_of_the_world_and_axes_of_one():

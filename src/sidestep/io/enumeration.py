@@ -16,6 +16,7 @@ import reprlib
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from functools import partial
+from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -67,7 +68,8 @@ def enumerate_env(
 
     Raises:
         InputError: For an environment of several agents or with other actions, more states than `limit`, an action
-            that draws random numbers (without `samples`), and a key that leaves out what decides what follows.
+            that draws random numbers (without `samples`), a reward that is not finite, and a key that leaves out what
+            decides what follows.
 
     Notes:
         Random numbers are looked for in NumPy's and Python's generators that the environment holds; those of the whole
@@ -189,10 +191,10 @@ def _attempts(
         env, generators = states.resume(state)
         before = pickle.dumps(generators)
         only = step(env, action)
-        if pickle.dumps(generators) == before:
-            return [only]
-        message = "the action draws random numbers: expected a number of tries to estimate probabilities from"
         source = f"state {reprlib.repr(label)}, action {action + first_action}"
+        if pickle.dumps(generators) == before:
+            return _with_finite_rewards([only], source)
+        message = "the action draws random numbers: expected a number of tries to estimate probabilities from"
         check(samples is not None, message, source=source, field="samples")
         steps = []
         for _ in range(samples or 0):
@@ -200,9 +202,16 @@ def _attempts(
             for generator in generators:
                 _seed(generator, int(seeds.integers(2**32)))
             steps.append(step(env, action))
-        return steps
+        return _with_finite_rewards(steps, source)
 
     return attempt
+
+
+def _with_finite_rewards(steps: list[_Step], source: str) -> list[_Step]:
+    """Return what followed an action; raise `InputError` for a reward that is not finite."""
+    for each in steps:
+        check(isfinite(each.reward), f"expected a finite number, found {each.reward}", source=source, field="reward")
+    return steps
 
 
 def _seed(generator: Any, seed: int) -> None:

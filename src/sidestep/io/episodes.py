@@ -25,7 +25,7 @@ def collect(
     task: int = 0,
     key: Key = observation_key,
 ) -> list[Trajectory]:
-    """Return episodes in a Gymnasium environment as trajectories; some may be truncated by a time limit.
+    """Return episodes in a Gymnasium environment as trajectories, `truncated` where a time limit stopped them.
 
     Args:
         env: The environment. Its observations are states, unless it was enumerated.
@@ -67,7 +67,8 @@ def collect(
             observation, _, terminated, truncated, _ = env.step(action + first_action)
             state = state_of(observation, place)
             states.append(world.ends.get(state, state) if terminated else state)
-        trajectories.append(Trajectory(np.asarray(states), np.asarray(actions), task))
+        stopped = bool(truncated) and not terminated
+        trajectories.append(Trajectory(np.asarray(states), np.asarray(actions), task, stopped))
     return trajectories
 
 

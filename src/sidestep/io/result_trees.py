@@ -51,7 +51,8 @@ def describe(value: Any) -> tuple[Any, list[np.ndarray]]:
         value: A record, a container, an array or a plain value.
 
     Raises:
-        InputError: With the place, for arrays of other things than numbers and texts.
+        InputError: With the place, for arrays of other things than numbers and texts, and for objects that are neither
+            records nor functions, such as sets, bytes, complex numbers and paths.
     """
     writer = _Writer()
     return writer.described(value, "result"), writer.arrays
@@ -98,7 +99,9 @@ class _Writer:
         if isinstance(value, list | tuple):
             kind = "list" if isinstance(value, list) else "tuple"
             return {kind: [self.described(each, _at(path, at)) for at, each in enumerate(value)]}
-        return {"other": _name(value if callable(value) else type(value))}
+        message = "expected a record, a container, an array, a number, a text or a function"
+        check(callable(value), f"{message}, found {type(value).__name__}", source="save", field=path)
+        return {"other": _name(value)}
 
     def _number(self, array: Any, path: str) -> int:
         """Return the number of an array."""

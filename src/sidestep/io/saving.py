@@ -37,7 +37,8 @@ def save(path: str | Path, result: Any) -> None:
             or dictionary of records.
 
     Raises:
-        InputError: For arrays of other things than numbers and texts, and if the file system refuses.
+        InputError: For arrays of other things than numbers and texts, with the field for sets, bytes, complex numbers,
+            paths and other objects that are no records, and if the file system refuses.
 
     Example:
         >>> import sidestep as ss

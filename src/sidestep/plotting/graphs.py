@@ -51,8 +51,8 @@ def figure_graph(
 
     Args:
         model: The transition model, of at most 100 states.
-        plan: A plan, for the policy by which actions are chosen, and terminal states; by default all actions are
-            equally probable.
+        plan: A plan, for the policy by which actions are chosen, and terminal states; by default all available actions
+            are equally probable.
         labels: Names of states and actions.
         positions: The place of each state; by default networkx chooses it.
 
@@ -97,7 +97,8 @@ def draw_graph(
 
     labels, probabilities = labels or Labels(), _transitions(model)
     states, actions = probabilities.shape[:2]
-    policy, terminal = np.full((states, actions), 1 / actions), np.zeros(states, bool)
+    available = np.broadcast_to(np.asarray(model.graph.available), (states, actions))
+    policy, terminal = available / available.sum(axis=1, keepdims=True), np.zeros(states, bool)
     if plan is not None:
         policy, terminal = np.asarray(plan.policy), np.asarray(plan.terminal)
         message = f"expected a plan of {states} states and {actions} actions, found one of {policy.shape}"
@@ -124,7 +125,8 @@ def draw_graph(
     )  # fmt: skip
     texts = {}
     if states <= _TEXTS:
-        texts = {edge: _text(probabilities[edge[0], :, edge[1]], of_actions) for edge in network.edges}
+        offered = np.where(available[:, :, None], probabilities, 0.0)
+        texts = {edge: _text(offered[edge[0], :, edge[1]], of_actions) for edge in network.edges}
         between = {edge: texts[edge] for edge in edges}
         networkx.draw_networkx_edge_labels(
             network, places, between, font_size=7, ax=axes, connectionstyle=_CURVE, node_size=size, rotate=False

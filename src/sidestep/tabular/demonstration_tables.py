@@ -81,6 +81,8 @@ def read_moves(table: Any, tasks: Task | Sequence[Task], columns: Columns, label
     weight = weight[order]
     after = np.full(len(state), _NONE) if after is None else after[order]
     last = np.append(walk[1:] != walk[:-1], True)
+    if columns.step:
+        _check_steps(rows, order, last | (after != _NONE))
     next_state = _next_states(rows, number, last, state, action, after)
     moves = action != _NONE
     _check_walks(rows, number, walk, task, "task")
@@ -240,6 +242,16 @@ def _walks(rows: _Rows) -> tuple[Int[np.ndarray, " rows"], Int[np.ndarray, " row
     repeated = (np.diff(walk[order], prepend=-1) == 0) & (np.diff(rank[order], prepend=-1) == 0)
     rows.check(~repeated, rows.number[order], "the walk has another row with the same step", "step")
     return walk, order
+
+
+def _check_steps(rows: _Rows, order: Int[np.ndarray, " rows"], known: Bool[np.ndarray, " rows"]) -> None:
+    """Raise `InputError` where steps are whole numbers, one is left out and the next state is not known without it."""
+    column = rows.column("step")
+    if pa.types.is_integer(column.type):
+        step = np.asarray(column)[order]
+        follows = np.append(step[1:] == step[:-1] + 1, True)
+        message = "expected the next step in the walk's next row, found a gap (give `next_state`)"
+        rows.check(known | follows, rows.number[order], message, "step")
 
 
 def _next_states(

@@ -99,19 +99,20 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         return int(np.asarray(self.trajectory)[-1]) + 1
 
     def with_only(self, trajectories: Bool[np.ndarray, " trajectories"] | Sequence[bool]) -> "Demonstrations[Tasks]":
-        """Return the same moves, with weight 1 for those of the chosen trajectories and 0 for the others.
+        """Return the same moves, with weight 0 for those of trajectories that are not chosen.
 
         Args:
             trajectories: Whether each trajectory counts.
 
         Returns:
-            Demonstrations of the same length, so that no function is compiled anew.
+            Demonstrations of the same length, so that no function is compiled anew; the weights of the chosen
+            trajectories are as before.
 
         Raises:
             InputError: For anything but a boolean for each trajectory.
         """
         mask = to_mask(trajectories, "trajectories", (self.trajectories,))
-        weights = np.asarray(mask, dtype=np.float64)[np.asarray(self.trajectory)]
+        weights = np.where(np.asarray(mask)[np.asarray(self.trajectory)], np.asarray(self.weights), 0.0)
         return eqx.tree_at(lambda demonstrations: demonstrations.weights, self, to_jax(weights))
 
     @classmethod
@@ -145,7 +146,8 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
             next_state: The column with the state after each move; an empty cell is the state of the next row.
             walk: The column that tells walks apart, by numbers or texts; None for a single walk. Walks are numbered as
                 they appear.
-            step: The column by which the rows of a walk are ordered; by default they are in order.
+            step: The column by which the rows of a walk are ordered; by default they are in order. Where the next state
+                is that of the next row, whole numbers must be followed by the next one.
             task: The column with the task of each walk.
             subject: The column with the person of each walk.
             weight: The column with how much each move counts.
@@ -157,7 +159,8 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         Raises:
             InputError: With row and column, for a column that is missing or of another kind, an empty cell, a state,
                 action or task that does not exist, a label that is not known, moves that do not follow each other, a
-                walk without a move or that goes on after a terminal state, and two tasks or persons in one walk.
+                step that is left out, a walk without a move or that goes on after a terminal state, and two tasks or
+                persons in one walk.
 
         Example:
             >>> from sidestep.tabular.grid import Grid

@@ -428,8 +428,9 @@ def _log_policy(
     states: Int[Array, " visits"],
     actions: Int[Array, " visits"],
 ) -> Float[Array, " visits"]:
-    available = model.graph.available
-    mask = available[states] if len(available) > 1 else None
+    world = model.graph
+    everywhere = world.available.shape == (1, 1)
+    mask = None if everywhere else jnp.broadcast_to(world.available, (world.states, world.actions))[states]
     return jnp.take_along_axis(behavior.log_policy(q, mask), actions[:, None], axis=-1)[:, 0]
 
 

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Int
 
-from sidestep.errors import check
+from sidestep.errors import check, to_list
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.demonstrations import Demonstrations, Tasks, flat_moves
 from sidestep.tabular.tasks import Task, stack_tasks, task_at
@@ -59,8 +59,8 @@ def join(parts: Sequence[Demonstrations[Task]]) -> Demonstrations[Task]:
         All moves, with all tasks.
 
     Raises:
-        InputError: For nothing, for worlds of different sizes, and where some parts tell persons apart and others do
-            not.
+        InputError: For nothing, for anything but demonstrations, for worlds of different sizes, and where some parts
+            tell persons apart and others do not.
 
     Example:
         >>> from sidestep.tabular.demonstrations import Trajectory, gather
@@ -72,7 +72,7 @@ def join(parts: Sequence[Demonstrations[Task]]) -> Demonstrations[Task]:
         >>> joined.trajectories, len(joined.tasks.terminal)
         (2, 1)
     """
-    check(len(parts), "expected at least one", field="parts")
+    parts = to_list(parts, Demonstrations, "parts")
     states = [part.tasks.terminal.shape[-1] for part in parts]
     check(len(set(states)) == 1, f"expected the same number of states in all parts, found {states}", field="parts")
     known = [part.person is not None for part in parts]

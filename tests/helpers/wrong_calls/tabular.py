@@ -3,6 +3,7 @@
 # ruff: noqa: E501
 # pyright: basic, reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -26,6 +27,11 @@ from helpers.wrong_calls.small import (
 
 GRAPH = ss.graph(np.array([[[0, 1]], [[1, 0]]]))
 POLICY = jnp.full((20, 4), 0.25)
+
+
+def changed(**fields):
+    """The demonstrations with other fields."""
+    return replace(DEMOS, **fields)
 
 
 def table(transitions):
@@ -104,6 +110,22 @@ CASES = [
         ("solve, a grid", lambda: ss.solve(GRID, TASK, BEHAVIOR), "model"),
         ("solve, a backup", lambda: ss.solve(MODEL, TASK, ss.HardMax()), "behavior"),
         ("solve, a state", lambda: ss.solve(MODEL, 3, BEHAVIOR), "task"),
+        ("solve, a discount of 1.5", lambda: ss.solve(MODEL, replace(TASK, discount=jnp.asarray(1.5)), BEHAVIOR), "discount"),
+        ("plan, a discount of 0", lambda: ss.plan(MODEL, replace(TASK, discount=jnp.asarray(0.0))), "discount"),
+        ("plan, a discount NaN", lambda: ss.plan(MODEL, replace(TASK, discount=jnp.asarray(NAN))), "discount"),
+        ("log_likelihood, one of two discounts", lambda: ss.log_likelihood(MODEL, changed(tasks=replace(ss.stack_tasks([TASK, TASK]), discount=jnp.array([0.9, 1.1]))), BEHAVIOR), "discount"),
+        ("log_likelihood, a single task", lambda: ss.log_likelihood(MODEL, changed(tasks=TASK), BEHAVIOR), "tasks"),
+        ("log_likelihood, a task that is not there", lambda: ss.log_likelihood(MODEL, changed(task=jnp.full(6, 5)), BEHAVIOR), "'task'"),
+        ("fit, a task -1", lambda: ss.fit(MODEL, changed(task=jnp.full(6, -1)), BEHAVIOR), "'task'"),
+        ("log_likelihood, a weight NaN", lambda: ss.log_likelihood(MODEL, changed(weights=jnp.full(6, NAN)), BEHAVIOR), "weights"),
+        ("log_likelihood, a weight of infinity", lambda: ss.log_likelihood(MODEL, changed(weights=jnp.full(6, INF)), BEHAVIOR), "weights"),
+        ("fit, a weight -1", lambda: ss.fit(MODEL, changed(weights=jnp.full(6, -1.0)), BEHAVIOR), "weights"),
+        ("log_likelihood, a move after a terminal state", lambda: ss.log_likelihood(MODEL, changed(states=jnp.array([0, 1, 3, 0, 1, 2])), BEHAVIOR), "move 2, found 3"),
+        ("log_likelihood, trajectories in turns", lambda: ss.log_likelihood(MODEL, changed(trajectory=jnp.array([0, 1, 0, 1, 0, 1])), BEHAVIOR), "trajectory"),
+        ("log_likelihood, a trajectory left out", lambda: ss.log_likelihood(MODEL, changed(trajectory=jnp.array([0, 0, 0, 2, 2, 2])), BEHAVIOR), "trajectory"),
+        ("log_likelihood, trajectories from 1", lambda: ss.log_likelihood(MODEL, changed(trajectory=DEMOS.trajectory + 1), BEHAVIOR), "trajectory"),
+        ("log_likelihood, persons of trajectories", lambda: ss.log_likelihood(MODEL, changed(person=jnp.array([0, 1])), BEHAVIOR), "person"),
+        ("solve, successors that are no states", lambda: ss.solve(ss.TabularModel(ss.Graph(GRAPH.successors + 1, GRAPH.lengths), jnp.zeros((2, 1, 2))), ss.task(np.zeros(2), 0.9, [False, True]), BEHAVIOR), "successors"),
         ("check_proper, actions", lambda: ss.check_proper(TASK, BEHAVIOR, 4), "world"),
         ("log_likelihood of another world", lambda: ss.log_likelihood(OTHER_MODEL, DEMOS, BEHAVIOR), "demonstrations"),
         ("log_likelihood of walks", lambda: ss.log_likelihood(MODEL, WALKS, BEHAVIOR), "demonstrations"),
