@@ -29,6 +29,7 @@ from sidestep._repr import short_repr
 from sidestep.errors import InputError, NotConverged, check, check_count, check_function, to_list, to_number
 from sidestep.inference.arguments import check_tasks
 from sidestep.inference.fit import Fit, Model
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.behavior_model import BehaviorModel
 from sidestep.tabular.checks import check_behavior
@@ -226,8 +227,11 @@ def _trajectory_log_likelihoods(
 ) -> Float[np.ndarray, " trajectories"]:
     """Return Σ_t log π(a_t | s_t) of each trajectory for a task; −∞ if it continues after a terminal state."""
     moves = flatten([trajectory._replace(task=0) for trajectory in trajectories], stack_tasks([task]))
+    terminal, states = np.asarray(task.terminal), np.asarray(moves.states)
+    # as many moves for every candidate, so that no function is compiled anew; those after the end count as −∞
+    ended = terminal[states]
+    moves = eqx.tree_at(lambda moves: moves.states, moves, to_jax(np.where(ended, np.argmin(terminal), states)))
     log_policy = np.asarray(log_policies(model, moves, behavior))
     if np.isnan(log_policy).any():
         raise NotConverged("the values of a candidate's task did not converge: a smaller β may help")
-    ended = np.asarray(task.terminal)[np.asarray(moves.states)]
     return np.bincount(np.asarray(moves.trajectory), np.where(ended, -np.inf, log_policy), minlength=len(trajectories))
