@@ -102,7 +102,7 @@ def test_solve_of_a_random_walk_equals_its_expected_number_of_moves(count, dtype
     successors[last], probabilities[last] = (last - 1, last), (1, 0)
     walk = task(np.full((len(states), 1), -1.0), 1.0, states == 0)
     solution = solve(tabular_model(graph(successors), probabilities), walk, Behavior(HardMax()))
-    assert bool(solution.converged) or dtype == np.float32
+    assert bool(solution.converged) or (dtype == np.float32 and count > 101)
     expected = -states * (2.0 * last - states)
     off = np.abs(np.asarray(solution.values, np.float64) - expected).max()
     assert off <= within * last**2

@@ -363,16 +363,12 @@ def _solved(equation: NativeEquation) -> Float[np.ndarray, " states"]:
     # as `bounds.lower_bound`
     bound = np.float64(worst / (1 - process.discount) if process.discount < 1 else -np.inf)
     no_cost: Any = np.float64(0)
-    arrays: Any = (
-        np.empty(states),
-        np.empty(states, np.int32),
-        *(np.empty((), kind) for kind in (int, float, float, bool)),
-    )
+    costs, everywhere = MoveCosts(no_cost, no_cost), np.ones(states, bool)
+    info = (np.empty((), kind) for kind in (int, float, float, bool))
+    arrays: Any = np.empty(states), np.empty(states, np.int32), *info
     start: Any = np.full(states, -np.inf), np.zeros(0), np.full(states, -1, np.int32)
     result = SolveResult(*arrays)
-    solve_values(
-        _MAX_SWEEPS, result, equation, bound, MoveCosts(no_cost, no_cost), WarmStart(*start), np.ones(states, bool)
-    )
+    solve_values(_MAX_SWEEPS, result, equation, bound, costs, WarmStart(*start), everywhere)
     if not result.converged:
         raise NotConverged(f"the values of a task did not converge in {_MAX_SWEEPS} sweeps")
     return np.where(np.isneginf(arrays[0]), NEG_INF, arrays[0])

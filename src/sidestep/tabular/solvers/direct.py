@@ -23,6 +23,17 @@ from sidestep.tabular.solvers.base import BellmanEquation, DecisionProcess, Valu
 
 MOST_STATES = 1_000
 """The number of states up to which a factorization is faster than sweeps: it takes the time of a sweep for each."""
+_LEAST_SWEEPS = 200
+"""The least number of sweeps before a direct step."""
+
+
+def sweeps_before(states: int) -> int:
+    """Return the number of sweeps after which a direct step pays; it costs about as much as a sweep for each state.
+
+    Args:
+        states: Their number.
+    """
+    return max(_LEAST_SWEEPS, states)
 
 
 class Exits(NamedTuple):

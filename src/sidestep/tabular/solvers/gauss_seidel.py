@@ -31,7 +31,7 @@ from sidestep.tabular.backups import Backup, BoltzmannAverage, Gradient, HardMax
 from sidestep.tabular.solvers import base, native
 from sidestep.tabular.solvers.base import BellmanEquation, Region, Values, WarmStart
 from sidestep.tabular.solvers.bounds import lower_bound, move_costs
-from sidestep.tabular.solvers.direct import MOST_STATES
+from sidestep.tabular.solvers.direct import MOST_STATES, sweeps_before
 from sidestep.tabular.solvers.jacobi import Jacobi
 
 KERNELS: dict[type[Backup], int] = {
@@ -41,8 +41,6 @@ KERNELS: dict[type[Backup], int] = {
     Mellowmax: native.MELLOWMAX,
 }
 """The backups that have native code, and their numbers."""
-_PATIENCE = 200
-"""The least number of sweeps after which a small world is left to `Jacobi`."""
 
 
 class GaussSeidel(base.Solver):
@@ -90,7 +88,7 @@ class GaussSeidel(base.Solver):
         arguments = (self._native_equation(equation), *limits, start._replace(order=order), region)
         states, dtype = start.values.shape[0], start.values.dtype
         is_small = states <= MOST_STATES
-        most = min(self.max_sweeps, max(_PATIENCE, states)) if is_small else self.max_sweeps
+        most = min(self.max_sweeps, sweeps_before(states)) if is_small else self.max_sweeps
         result = native.call_host(partial(_solve_values, most), arguments, _result_shapes(start.values, order))
         if not is_small:
             return result

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sidestep.tabular.solvers.base import SolveResult, Values
 from sidestep.tabular.solvers.bounds import largest_error
-from sidestep.tabular.solvers.direct import MOST_STATES, DirectStep
+from sidestep.tabular.solvers.direct import MOST_STATES, DirectStep, sweeps_before
 
 _STALLED = 1_000
 """The number of sweeps without progress after which an oscillating solve starts anew.
@@ -27,8 +27,6 @@ Or the number of states, if it is larger: news from one end of the world takes a
 """
 _PROGRESS = 0.999
 """The part of the smallest change so far that a change may be to count as smaller."""
-_PATIENCE = 200
-"""The least number of sweeps before a direct step, which costs about as much as a sweep for each state."""
 _OSCILLATIONS, _LARGE = 4, 0.1
 """The number of these sweeps in which a large change must alternate in sign; large as a part of the largest."""
 _FINER = 0.1
@@ -107,7 +105,7 @@ def iterate(
     if len(start) > MOST_STATES:
         iteration = iteration._replace(step_all=None)
     begun = _begin(start, jnp.asarray(iteration.tolerance, dtype))
-    most = max(_PATIENCE, len(start)) if iteration.is_direct else iteration.max_sweeps
+    most = sweeps_before(len(start)) if iteration.is_direct else iteration.max_sweeps
 
     def is_sweeping(state: _State) -> Bool[Array, ""]:
         return (state.residual > state.tolerance) & (state.sweeps < iteration.max_sweeps)
