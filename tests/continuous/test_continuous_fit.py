@@ -197,7 +197,7 @@ def test_fit_dynamics_large_policy_gap_is_not_converged():
 
 
 def test_fit_dynamics_few_iterations_are_not_converged():
-    """Three Newton steps of two standard deviations do not lead to a maximum that is a hundred away."""
+    """Newton steps of at most two standard deviations do not lead to a maximum that is a hundred away."""
     begin = Drift(vector(-4.0), vector(NOISE))
     schedule = sc.Schedule(2, batch_size=MOVES, learning_rate=0.01)
     result = sc.fit_dynamics(begin, DEMONSTRATIONS, *AGENTS, prior=PRIOR, terms=("transitions",), schedule=schedule)
@@ -216,7 +216,7 @@ class SechDrift(LaplaceDrift):
 
 
 def test_fit_dynamics_newton_step_too_far_is_taken_back():
-    """Two away from a single move, Newton's step ends far beyond the maximum; a third of it ends near."""
+    """Two away from a single move, Newton's step ends far beyond the maximum; half of it ends near."""
     demos = demonstrations_of(np.zeros(1), np.ones(1, int), np.zeros(1))
     schedule = sc.Schedule(2, batch_size=1, learning_rate=1e-6)
     prior = ss.Normal(0.0, 1e6)

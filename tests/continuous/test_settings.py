@@ -48,7 +48,7 @@ def test_schedule_falls_along_a_cosine_to_a_twentieth():
 
 
 def figures(**changes):
-    numbers = {"distance": 0.7, "noise": 0.4, "policy_gap": -0.09, "beyond_horizon": 0.05, "unfinished": 0.1}
+    numbers = {"distance": 0.7, "noise": 0.3, "policy_gap": -0.09, "beyond_horizon": 0.05, "unfinished": 0.1}
     arrays = np.zeros(1), np.ones(1), np.ones((1, 1)), np.zeros(1)
     return Verification(*arrays, **(numbers | changes), samples=64)
 
@@ -58,9 +58,9 @@ SCHEDULE = sc.Schedule(distance_tolerance=0.75, policy_gap_tolerance=0.1)
 
 @pytest.mark.parametrize(("changes", "passes"), [
     ({}, True),
-    ({"distance": 0.75, "noise": 0.5}, True),
+    ({"distance": 0.75, "noise": 0.375}, True),
     ({"distance": 0.76}, False),
-    ({"noise": 0.51}, False),
+    ({"noise": 0.38}, False),
     ({"policy_gap": -0.11}, False),
     ({"policy_gap": 0.11}, False),
     ({"beyond_horizon": 0.11}, False),
@@ -74,10 +74,10 @@ def test_verification_passes_where_all_figures_are_within_the_tolerances(changes
 def test_verification_message_has_the_figures_and_what_is_wrong():
     message = figures().message(SCHEDULE)
     assert message.startswith(
-        "the maximum is 0.7 posterior standard deviations away (tolerance 0.75), with noise of 0.4"
+        "the maximum is 0.7 posterior standard deviations away (tolerance 0.75), with noise of 0.3"
     )
     assert (
-        "(tolerance 0.5) by 64 independent rollouts of each action, and the policy gap is -0.09 (tolerance 0.1)"
+        "(tolerance 0.38) by 64 independent rollouts of each action, and the policy gap is -0.09 (tolerance 0.1)"
         in message
     )
     assert "too short" not in message

@@ -9,8 +9,9 @@ little behind the model; `policy_gap` measures by how much.
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -27,6 +28,7 @@ from sidestep.continuous.estimators import Estimator
 from sidestep.continuous.likelihood import FitProblem, FitProgress, Schedule
 from sidestep.continuous.planner import Planner, PlannerState, plan_policy
 from sidestep.continuous.policies import Agent, SomePolicy
+from sidestep.continuous.refinement import Visit, refine
 from sidestep.continuous.tasks import task_at
 from sidestep.continuous.verification import Verification, verify
 from sidestep.errors import NotConverged, check, check_function, to_count
@@ -40,8 +42,6 @@ if TYPE_CHECKING:
     from sidestep.continuous.information import RolloutInformation
 
 Family = TypeVar("Family", bound=Dynamics)
-_NEWTON_STEPS = 3
-"""The most steps by which a fit is refined."""
 _FOLLOWING_RATE = 0.5
 """Where the policy's rate begins before each verification, as a fraction of the first iteration's."""
 
@@ -219,57 +219,30 @@ def _last_quarter(schedule: Schedule) -> int:
     return max(1, schedule.iterations // 4)
 
 
-class _Verified(NamedTuple):
-    """A state that is verified: θ as one vector, policy and critic, and how far θ is from the maximum."""
-
-    flat: np.ndarray
-    planner_state: PlannerState[Any]
-    verification: Verification
-
-
-def _clearly_worse(after: Verification, before: Verification) -> bool:
-    """Return whether one state is farther from the maximum than another, by more than the noise of both."""
-    return bool(after.distance > before.distance + np.hypot(after.noise, before.noise))
-
-
 def _refined(problem: FitProblem, state: _State, history: list[FitProgress], key: PRNGKeyArray) -> ContinuousFit:
-    """Return the result, after Newton steps from the mean of θ over the last quarter of the iterations.
-
-    The k-th step goes one part of k + 1, so that the noise of all of them averages out (Robbins and Monro 1951); but
-    one that is much longer than its noise goes the whole way. One that leads clearly farther from the maximum is taken
-    back. Each has rollouts of its own, and so has the last verification, which no step follows.
-    """
-    schedule = problem.schedule
+    """Return the result, refined from the mean of θ over the last quarter of the iterations."""
+    schedule, keys = problem.schedule, (jax.random.fold_in(key, step) for step in count())
     to_parameters = ravel_pytree(state.parameters)[1]
 
     def family(flat: np.ndarray) -> Dynamics:
         return problem.agent.dynamics.with_parameters(to_parameters(jnp.asarray(flat, state.total.dtype)))
 
-    def verified(flat: np.ndarray, planner_state: PlannerState[Any], step: int) -> _Verified:
-        dynamics, (policy_key, rollout_key) = family(flat), jax.random.split(jax.random.fold_in(key, step))
+    def visit(flat: np.ndarray, planner_state: PlannerState[Any], noise: float) -> Visit:
+        dynamics, (policy_key, rollout_key) = family(flat), jax.random.split(next(keys))
         if "actions" in problem.terms:
             planner_state = _followed(problem, dynamics.parameters, planner_state, policy_key)
-        verification = verify(problem, dynamics, planner_state, rollout_key, noise=schedule.noise_tolerance)
-        return _Verified(flat, planner_state, verification)
+        return Visit(flat, planner_state, verify(problem, dynamics, planner_state, rollout_key, noise=noise))
 
-    best = verified(np.asarray(state.total, np.float64) / _last_quarter(schedule), state.planner_state, 0)
-    whole = True
-    for step in range(1, _NEWTON_STEPS + 1):
-        current = best.verification
-        if current.distance <= schedule.distance_tolerance / 3 and current.passes(schedule):
-            break
-        share = 1.0 if whole and current.distance > 2 * current.noise else 1 / (step + 1)
-        after = verified(best.flat + share * current.step, best.planner_state, step)
-        whole = not _clearly_worse(after.verification, current)
-        best = after if whole else best
-    last = best.verification
-    converged, message = last.passes(schedule), last.message(schedule)
-    return ContinuousFit(family(best.flat), best.planner_state, problem, tuple(history), last, converged, message)
+    mean = np.asarray(state.total, np.float64) / _last_quarter(schedule)
+    last = refine(visit(mean, state.planner_state, schedule.step_noise), visit, schedule)
+    converged, message = last.verification.passes(schedule), last.verification.message(schedule)
+    result = problem, tuple(history), last.verification, converged, message
+    return ContinuousFit(family(last.flat), last.planner_state, *result)
 
 
 def _followed(problem: FitProblem, parameters: FloatTree, state: Tree, key: PRNGKeyArray) -> Tree:
-    """Return the policy and its critic after a quarter of the iterations at one θ, with rates that fall."""
-    steps = _last_quarter(problem.schedule)
+    """Return the policy and its critic after a twelfth of the iterations at one θ, with rates that fall."""
+    steps = max(1, problem.schedule.iterations // 12)
     for step, fraction in enumerate(np.geomspace(_FOLLOWING_RATE, _FOLLOWING_RATE / 10, steps).astype(np.float32)):
         state = _follow(problem, parameters, state, jax.random.fold_in(key, step), jnp.asarray(fraction))
     return state

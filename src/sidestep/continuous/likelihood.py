@@ -9,6 +9,7 @@ and of its critic (eq. 12). Over vectors of actions the sum over a′ is a mean 
 importance weights exp(βQ)/π_λ: it is then that of the agent under the current model, even if the policy lags behind.
 """
 
+import math
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -71,7 +72,7 @@ class Schedule(eqx.Module):
         learning_rate: That of Adam, in units of θ; it falls to a twentieth along a cosine.
         policy_steps: Steps of the policy for each of the model's, one of them with the model's own rollouts.
         distance_tolerance: The largest distance of a converged fit from the maximum, in posterior standard deviations,
-            as `Verification` has it; the noise of this distance may be two thirds of it.
+            as `Verification` has it; the noise of this distance may be half of it.
         policy_gap_tolerance: The largest policy gap of a converged fit, on either side of 0.
         verification_samples: The most rollouts of each candidate of each move that verify the end of a fit, 8 or more;
             as few are taken as make the noise small enough.
@@ -89,9 +90,9 @@ class Schedule(eqx.Module):
     batch_size: int = eqx.field(default=32, static=True)
     learning_rate: float = eqx.field(default=0.05, static=True)
     policy_steps: int = eqx.field(default=1, static=True)
-    distance_tolerance: float = eqx.field(default=0.75, static=True)
+    distance_tolerance: float = eqx.field(default=0.5, static=True)
     policy_gap_tolerance: float = eqx.field(default=0.1, static=True)
-    verification_samples: int = eqx.field(default=512, static=True)
+    verification_samples: int = eqx.field(default=1024, static=True)
 
     def __check_init__(self):
         least = {"iterations": 2, "policy_warmup": 0, "batch_size": 1, "policy_steps": 1, "verification_samples": 8}
@@ -103,7 +104,12 @@ class Schedule(eqx.Module):
     @property
     def noise_tolerance(self) -> float:
         """The largest noise of the distance of a converged fit."""
-        return self.distance_tolerance * 2 / 3
+        return self.distance_tolerance / 2
+
+    @property
+    def step_noise(self) -> float:
+        """The largest noise of each of the Newton steps before; the mean of eight has that of a converged fit."""
+        return math.sqrt(8) * self.noise_tolerance
 
     def rate(self) -> optax.Schedule:
         """Return the learning rate as a function of the iteration."""

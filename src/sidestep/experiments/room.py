@@ -42,7 +42,12 @@ class RoomConfig(ContinuousConfig):
     planner: sc.Planner = field(default_factory=lambda: sc.Planner(horizon=24, learning_rate=0.02))
     schedule: sc.Schedule = field(
         default_factory=lambda: sc.Schedule(
-            300, policy_warmup=80, policy_steps=2, learning_rate=0.15, policy_gap_tolerance=0.2
+            300,
+            policy_warmup=80,
+            policy_steps=2,
+            learning_rate=0.15,
+            distance_tolerance=0.75,
+            policy_gap_tolerance=0.2,
         )
     )
     prior_mean: float = -2.5

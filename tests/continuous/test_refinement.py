@@ -1,0 +1,129 @@
+"""Newton steps by noisy gradients of objectives in closed form: where they end, and when they stop."""
+
+import numpy as np
+import pytest
+
+import sidestep.continuous as sc
+from sidestep.continuous.refinement import Visit, refine
+from sidestep.continuous.verification import Verification
+
+TIGHT = sc.Schedule(distance_tolerance=0.5)
+
+
+class Objective:
+    """Gradients of an objective with noise; it counts them, and has the noise that was asked for.
+
+    `information` is the expected one: the steps' noise is normal with its inverse as covariance, times noise².
+    """
+
+    def __init__(self, slope, information, *, least_noise=0.0, seed=0, **figures):
+        self.slope, self.information = slope, np.atleast_2d(information)
+        self.random, self.least_noise, self.figures, self.noises = np.random.default_rng(seed), least_noise, figures, []
+
+    def __call__(self, flat, state, noise):
+        noise, size = max(noise, self.least_noise) if self.least_noise is not None else 0.0, len(flat)
+        root, covariance = np.linalg.cholesky(self.information), np.linalg.inv(self.information)
+        errors = noise * root @ self.random.normal(size=size)
+        gradient = self.slope(flat) + errors
+        step = covariance @ gradient
+        squared = gradient @ step / size
+        step = step * min(1.0, 2 / np.sqrt(squared)) if squared else step
+        distance = np.sqrt(max(squared - noise**2, 0.0))
+        figures = {"policy_gap": 0.0, "beyond_horizon": 0.0, "unfinished": 0.0} | self.figures
+        self.noises.append(noise)
+        numbers = gradient, np.abs(errors), covariance, step, float(distance), float(noise)
+        return Visit(flat, state, Verification(*numbers, **figures, samples=8))
+
+
+def refined(objective, start, schedule=TIGHT):
+    first = objective(np.asarray(start, float), None, schedule.step_noise)
+    return refine(first, objective, schedule)
+
+
+QUADRATIC = np.array([[3.0, 1.0], [1.0, 2.0]])
+MAXIMUM = np.array([1.0, -2.0])
+
+
+def quadratic(flat):
+    return QUADRATIC @ (MAXIMUM - flat)
+
+
+def test_refine_without_noise_ends_at_the_maximum():
+    last = refined(Objective(quadratic, QUADRATIC, least_noise=None), [0.3, -1.0])
+    np.testing.assert_allclose(last.flat, MAXIMUM, atol=1e-12)
+    assert last.verification.passes(TIGHT)
+
+
+def test_refine_without_noise_and_with_twice_the_information_goes_half_the_way_again_and_again():
+    """Four steps and the mean's own: (1/2)⁵ of the way is left."""
+    last = refined(Objective(quadratic, 2 * QUADRATIC, least_noise=None), [1.2, -2.2])
+    np.testing.assert_allclose(last.flat - MAXIMUM, [0.2 / 32, -0.2 / 32], atol=1e-12)
+
+
+def test_refine_mean_of_steps_has_less_noise_than_each():
+    """Eight steps with noise √8 / 4 have a mean with noise 1/4, in standard deviations."""
+    ends = [refined(Objective(quadratic, QUADRATIC, seed=seed), [0.0, 0.0]) for seed in range(200)]
+    away = np.array([last.flat - MAXIMUM for last in ends])
+    squares = np.einsum("ni,ij,nj->n", away, QUADRATIC, away) / 2
+    assert np.sqrt(squares.mean()) == pytest.approx(0.25, rel=0.15)
+    assert np.mean([last.verification.passes(TIGHT) for last in ends]) > 0.95
+
+
+def test_refine_verifies_with_the_noise_of_the_tolerance():
+    objective = Objective(quadratic, QUADRATIC)
+    refined(objective, [0.0, 0.0])
+    assert objective.noises[-1] == TIGHT.noise_tolerance
+    assert set(objective.noises[:-1]) == {TIGHT.step_noise}
+    assert len(objective.noises) >= 4 + 8 + 1
+
+
+def shoulder(flat):
+    """A small slope for a long way, where the expected information says that a maximum is near."""
+    return np.clip(-flat, -0.7, None)
+
+
+def test_refine_leaves_a_shoulder_that_single_gradients_do_not_see():
+    ends = [refined(Objective(shoulder, [[1.0]], seed=seed), [4.0]) for seed in range(100)]
+    passed = [last for last in ends if last.verification.passes(TIGHT)]
+    assert len(passed) > 80
+    assert np.mean([abs(last.flat[0]) > 1 for last in passed]) < 0.03
+
+
+def test_refine_step_that_leads_away_is_taken_back_and_halved():
+    """The expected information is a third of the curvature: whole steps double the distance, half ones halve it."""
+    objective = Objective(lambda flat: -3 * flat, [[1.0]], least_noise=None)
+    last = refined(objective, [0.5])
+    assert abs(last.flat[0]) < 0.1
+    assert last.verification.passes(TIGHT)
+
+
+def test_refine_noise_that_hides_every_step_ends_at_once():
+    objective = Objective(quadratic, QUADRATIC, least_noise=1.1)
+    last = refined(objective, MAXIMUM)
+    np.testing.assert_array_equal(last.flat, MAXIMUM)
+    assert objective.noises == [1.1]
+    assert not last.verification.passes(TIGHT)
+
+
+def test_refine_large_distance_is_followed_through_noise():
+    objective = Objective(quadratic, QUADRATIC, least_noise=1.1)
+    last = refined(objective, MAXIMUM + 20)
+    assert len(objective.noises) > 5
+    assert np.abs(last.flat - MAXIMUM).max() < 10
+    assert not last.verification.passes(TIGHT)
+
+
+def test_refine_two_verifications_at_most_where_another_figure_fails():
+    objective = Objective(quadratic, QUADRATIC, policy_gap=9.0)
+    last = refined(objective, [0.0, 0.0])
+    assert objective.noises.count(TIGHT.noise_tolerance) == 2
+    assert not last.verification.passes(TIGHT)
+
+
+def test_refine_ends_after_sixteen_steps_and_is_verified_there():
+    """A slope without an end."""
+    objective = Objective(lambda flat: np.full_like(flat, 5.0), [[1.0]], least_noise=None)
+    last = refined(objective, [0.0])
+    assert len(objective.noises) == 1 + 16 + 1
+    np.testing.assert_allclose(last.flat, [2.0 * 17])
+    assert not last.verification.passes(TIGHT)
