@@ -19,6 +19,7 @@ from sidestep._repr import short_repr
 from sidestep.errors import check_count, check_function, to_number
 from sidestep.inference.natural_scale import NaturalScale, natural_scale
 from sidestep.inference.objective import Parameters
+from sidestep.tabular.arrays import to_jax
 
 if TYPE_CHECKING:
     from arviz import InferenceData
@@ -86,9 +87,10 @@ class Laplace:
         """
         check_function(function, "function")
         flat, unravel = ravel_pytree(self.parameters)
-        jacobian = np.asarray(jax.jacrev(lambda x: function(unravel(x)))(flat), np.float64) * self.scale
+        # compiled as a whole: the many small steps of a derivative take longer one by one
+        jacobian = np.asarray(jax.jit(jax.jacrev(lambda x: function(unravel(x))))(flat), np.float64) * self.scale
         inner = np.sum(jacobian**2, axis=-1) + (jacobian @ self.vectors) ** 2 @ (1 / self.eigenvalues - 1)
-        return jnp.sqrt(jnp.asarray(inner))
+        return to_jax(np.sqrt(inner), jnp.result_type(float))
 
     def interval(self, level: float = 0.95) -> tuple[NaturalScale, NaturalScale]:
         """Return the ends of an interval for each number, mapped from the unconstrained scale.
