@@ -7,6 +7,7 @@ from .errors import (
     InputError as InputError,
     NotConverged as NotConverged,
     SidestepError as SidestepError,
+    SidestepWarning as SidestepWarning,
 )
 from ._version import __version__ as __version__
 

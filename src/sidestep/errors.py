@@ -1,4 +1,4 @@
-"""Errors of `sidestep`: each names the place, the expectation and the actual value."""
+"""Errors of `sidestep`: each names the place, the expectation and the actual value; and its kind of warnings."""
 
 import reprlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -230,3 +230,7 @@ class ImproperTask(SidestepError):
 
 class NotConverged(SidestepError):
     """A solution with values that have not converged; its numbers must not be used."""
+
+
+class SidestepWarning(UserWarning):
+    """A result that is right for what was asked, but hardly what was meant."""

@@ -1,6 +1,7 @@
 """The Python and the commands in README.md and docs run, with small files.
 
-The Python blocks of a page run in order as one program. Of shell blocks, commands that begin with `sidestep` run.
+The Python blocks of a page run in order as one program; a block of text right after one is what it prints. Of shell
+blocks, commands that begin with `sidestep` run.
 A block after `<!-- not run: REASON -->` is left out.
 """
 
@@ -19,7 +20,9 @@ from sidestep.cli.app import main
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 SLOW = re.compile("sidestep (demo|reproduce|experiment|compare)|--(person-column|goal-candidates|sensor-map)")
-BLOCK = re.compile(r"(<!-- not run: [^>]+ -->\n+)?^```(python|sh)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(
+    r"(<!-- not run: [^>]+ -->\n+)?^```(python|sh)\n(.*?)^```\n(?:\n```text\n(.*?)^```)?", re.MULTILINE | re.DOTALL
+)
 
 
 class Snippet(NamedTuple):
@@ -27,6 +30,7 @@ class Snippet(NamedTuple):
     language: str
     line: int
     text: str
+    printed: str | None
 
 
 def snippets(language):
@@ -34,7 +38,7 @@ def snippets(language):
         text = page.read_text()
         for match in BLOCK.finditer(text):
             if match[2] == language and match[1] is None:
-                yield Snippet(page, language, text[: match.start(3)].count("\n"), match[3])
+                yield Snippet(page, language, text[: match.start(3)].count("\n"), match[3], match[4])
 
 
 def commands():
@@ -85,7 +89,9 @@ def test_command_in_page_succeeds(command):
 
 @pytest.mark.usefixtures("inputs")
 @pytest.mark.parametrize(("page", "blocks"), list(programs()))
-def test_python_in_page_runs(page, blocks):
+def test_python_in_page_runs(page, blocks, capsys):
     namespace = {"__name__": page.stem}
     for block in blocks:
         exec(compile("\n" * block.line + block.text, str(page), "exec"), namespace)
+        printed = capsys.readouterr().out
+        assert block.printed is None or printed == block.printed

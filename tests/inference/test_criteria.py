@@ -13,6 +13,7 @@ import sidestep as ss
 from helpers.problems import dense_tabular, plain_policy, plain_values
 from sidestep.errors import InputError, NotConverged
 from sidestep.inference.criteria import identified_parameters
+from sidestep.tabular.behavior_model import BehaviorParameters
 
 STATES, ACTIONS = 4, 3
 RANDOM = np.random.default_rng(5)
@@ -181,6 +182,44 @@ def test_to_arviz_with_a_fit_has_what_waic_and_loo_need():
     np.testing.assert_allclose(loo["elpd_loo"], waic["elpd_waic"], atol=0.2)
     moves: Any = ss.laplace(fit).to_arviz(jax.random.key(0), 5, fit=fit, unit="move")
     assert moves.log_likelihood["moves"].shape == (1, 5, 8)
+
+
+def draws_of_behavior(persons: int, states: int = 2) -> ss.Draws:
+    """Draws of two chains, of one logit, a β of each person, and costs."""
+    beta, costs = RANDOM.normal(size=(2, 5, persons)), RANDOM.normal(size=(2, 5, states))
+    behavior = BehaviorParameters(log_beta=jnp.asarray(beta), cost_parameters=jnp.asarray(costs))
+    numbers = ss.Parameters(jnp.zeros((2, 5, 1)), behavior)
+    return ss.Draws(numbers, numbers, numbers, np.zeros((2, 5), bool), np.ones((2, 5)))
+
+
+def test_to_arviz_with_labels_has_persons_and_states_by_name():
+    labels = ss.Labels(states=("home", "work"), persons=("ann", "ben", "cem"))
+    draws = draws_of_behavior(3)
+    data: Any = draws.to_arviz(labels=labels)
+    beta, costs = data.posterior["beta"], data.posterior["costs"]
+    assert beta.dims == ("chain", "draw", "person")
+    assert beta.person.values.tolist() == ["ann", "ben", "cem"]
+    assert costs.state.values.tolist() == ["home", "work"]
+    log_beta: Any = draws.parameters.behavior
+    np.testing.assert_allclose(beta.sel(person="ben"), np.exp(log_beta.log_beta[..., 1]), rtol=1e-12)
+    numbered: Any = draws.to_arviz()
+    assert numbered.posterior["beta"].person.values.tolist() == [0, 1, 2]
+
+
+def test_to_arviz_of_one_beta_has_no_names_of_several_persons():
+    data: Any = draws_of_behavior(1).to_arviz(labels=ss.Labels(persons=("ann", "ben")))
+    assert data.posterior["beta"].person.values.tolist() == [0]
+    data = draws_of_behavior(1).to_arviz(labels=ss.Labels(persons=("ann",)))
+    assert data.posterior["beta"].person.values.tolist() == ["ann"]
+
+
+@pytest.mark.parametrize(("labels", "message"), [
+    (ss.Labels(persons=("ann", "ben")), "labels, field 'persons': expected 3 labels, found 2"),
+    (ss.Labels(states=("home",)), "labels, field 'states': expected 2 labels, found 1"),
+])  # fmt: skip
+def test_to_arviz_with_another_number_of_labels_raises(labels, message):
+    with pytest.raises(InputError, match=message):
+        draws_of_behavior(3).to_arviz(labels=labels)
 
 
 def fit_of_known_dynamics(learn: tuple[str, ...]) -> ss.Fit:

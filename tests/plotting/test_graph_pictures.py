@@ -5,6 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
@@ -88,6 +89,81 @@ def test_draw_graph_of_states_apart_has_a_place_for_each():
     draw_graph(axes, model)
     places = [np.asarray(each.get_offsets()) for each in axes.collections if isinstance(each, PathCollection)]
     assert pdist(np.concatenate(places)).min() > 0.5  # of a layout in [−1, 1]
+
+
+def chain(states: int) -> tuple[ss.TabularModel, ss.Plan]:
+    """A step to either side, which may fail."""
+    after = [[[max(state - 1, 0), state], [min(state + 1, states - 1), state]] for state in range(states)]
+    model = ss.TabularModel(ss.graph(after), jnp.zeros((states, 2, 2)))
+    return model, ss.plan(model, ss.reach(model.graph, states - 1), ss.Behavior("boltzmann", 5.0))
+
+
+def tree(states: int) -> tuple[ss.TabularModel, ss.Plan]:
+    """From each state to three below, one action each, or back."""
+    below = [[3 * state + k for k in (1, 2, 3)] for state in range(states)]
+    after = [[[each if each < states else state] for each in below[state]] for state in range(states)]
+    world = ss.graph([[*row, [max(state - 1, 0) // 3]] for state, row in enumerate(after)])
+    model = ss.TabularModel(world, jnp.zeros((states, 4, 1)))
+    return model, ss.plan(model, ss.reach(model.graph, states - 1), ss.Behavior("boltzmann", 5.0))
+
+
+WORLDS = {
+    "15 rooms": (tree(15), [f"living_room_{number}" for number in range(15)]),
+    "6 places": (tree(6), ["home", "road", "work", "shop", "park", "gym"]),
+    "40 numbers": (tree(40), ()),
+    "a chain": (chain(10), ()),
+    "long words": (chain(4), ["Schrodingerstrasse", "main station north", "a", "work"]),
+}
+
+
+@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize("placed", [False, True])
+def test_figure_graph_names_are_in_their_nodes_and_nodes_apart_and_all_is_in_the_picture(name, placed):
+    (model, plan), names = WORLDS[name]
+    positions = (
+        {state: (float(state % 4), float(state // 4)) for state in range(model.graph.states)} if placed else None
+    )
+    figure = ss.figure_graph(model, plan, labels=ss.Labels(states=names), positions=positions)
+    FigureCanvasAgg(figure).draw()
+    axes: Any = figure.axes[0]
+    unit = figure.dpi / 72
+    nodes = [each for each in axes.collections if isinstance(each, PathCollection)]
+    centers = np.concatenate([each.get_offset_transform().transform(each.get_offsets()) for each in nodes]) / unit
+    diameter = float(np.sqrt(nodes[0].get_sizes()[0]))
+    assert pdist(centers).min() > diameter * 1.25  # a diamond is 1.4 diameters high and wide
+    size = figure.get_size_inches() * 72
+    assert (centers > 0.75 * diameter).all()
+    assert (centers + 0.75 * diameter < size).all()
+    drawn = [text for text in axes.texts if text.get_zorder() == 6]
+    expected = [str(each) for each in (names or range(model.graph.states))]
+    assert [text.get_text().replace("\n", "").replace(" ", "") for text in drawn] == [
+        each.replace(" ", "") for each in expected
+    ]
+    places = np.concatenate([each.get_offsets() for each in nodes])
+    assert all(any(np.allclose(text.get_position(), place) for place in places) for text in drawn)
+    for text in drawn:
+        assert np.hypot(*text.get_window_extent().size) / unit < diameter
+    others = [each for each in axes.get_children() if each not in drawn]
+    assert max(each.get_zorder() for each in others) < 6
+    low, high = figure.get_tightbbox().get_points() * 72
+    assert (low >= -0.01).all()
+    assert (high <= size + 0.01).all()
+
+
+def test_figure_graph_of_a_chain_is_a_line_in_order():
+    model, plan = chain(10)
+    axes: Any = ss.figure_graph(model, plan).axes[0]
+    places = np.array([text.get_position() for text in axes.texts if text.get_zorder() == 6])
+    assert (np.diff(places[:, 0]) > 0).all()
+    assert np.ptp(places[:, 1]) < 0.05 * np.ptp(places[:, 0])
+
+
+def test_draw_graph_places_of_other_units_fill_the_picture():
+    """Time in minutes to the right, a probability upwards."""
+    axes = Figure().subplots()
+    draw_graph(axes, world()[0], positions={0: (0.0, 0.1), 1: (600.0, 0.5), 2: (900.0, 0.2)})
+    places = np.concatenate([np.asarray(each.get_offsets()) for each in axes.collections])
+    np.testing.assert_allclose(np.ptp(places, axis=0), 1.0)
 
 
 def test_figure_graph_has_a_key_and_is_written(tmp_path):

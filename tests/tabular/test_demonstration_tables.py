@@ -251,3 +251,55 @@ def test_from_table_of_walks_with_steps_that_begin_anywhere_takes_them():
     task = ss.reach(ss.Grid.unknown(1, 4), 3)
     table = {"walk": [0, 1, 0, 1], "state": [2, 1, 3, 2], "action": [3, 3, None, None], "step": [7, 2, 8, 3]}
     assert ss.Demonstrations.from_table(table, task, step="step").next_states.tolist() == [3, 2]
+
+
+def trials_of_two_persons() -> dict[str, list]:
+    """Two trials of each person, numbered 1 and 2 anew, and the persons' rows mixed."""
+    return {
+        "trial": [1, 1, 1, 1, 2, 2, 2, 2, 1, 1],
+        "who": ["b", "a", "b", "a", "b", "b", "a", "a", "b", "a"],
+        "state": [0, 1, 1, 2, 2, 3, 2, 3, 2, 3],
+        "action": [3, 3, 3, 3, 3, None, 3, None, None, None],
+    }
+
+
+def test_from_table_with_walks_of_several_columns_tells_them_apart():
+    labels = ss.Labels(persons=("a", "b"))
+    options = {"subject": "who", "labels": labels}
+    read = ss.Demonstrations.from_table(trials_of_two_persons(), TASKS[0], walk=["who", "trial"], **options)
+    assert [path.tolist() for path in read.paths()] == [[0, 1, 2], [1, 2, 3], [2, 3], [2, 3]]
+    assert read.persons is not None
+    assert read.persons.tolist() == [1, 0, 1, 0]
+    turned = ss.Demonstrations.from_table(trials_of_two_persons(), TASKS[0], walk=("trial", "who"), **options)
+    assert_same(read, turned)
+
+
+@pytest.mark.parametrize("step", [None, "time"])
+def test_from_table_with_a_walk_of_several_persons_names_the_columns(step):
+    """Before anything else that is wrong with such walks."""
+    table = trials_of_two_persons()
+    table["time"] = [0, 0, 1, 1, 0, 1, 0, 1, 2, 2]
+    labels = ss.Labels(persons=("a", "b"))
+    message = r"row 2, field 'who': the walk has rows of several persons: expected walk=\['who', 'trial'\]"
+    with pytest.raises(InputError, match=message):
+        ss.Demonstrations.from_table(table, TASKS[0], walk="trial", step=step, subject="who", labels=labels)
+    with pytest.raises(InputError, match=r"give `walk` several columns"):
+        ss.Demonstrations.from_table(table, TASKS[0], walk="trial", step=step)
+    with pytest.raises(InputError, match=r"expected walk=\['who'\]"):
+        ss.Demonstrations.from_table(table, TASKS[0], walk=None, subject="who", labels=labels)
+
+
+@pytest.mark.parametrize(("walk", "message"), [
+    (["who", "trail"], "field 'trail': the table has 0 such columns"),
+    ([], "field 'walk': expected at least 1, found 0"),
+])  # fmt: skip
+def test_from_table_with_wrong_columns_of_walks_raises(walk, message):
+    with pytest.raises(InputError, match=message):
+        ss.Demonstrations.from_table(trials_of_two_persons(), TASKS[0], walk=walk)
+
+
+def test_from_table_with_an_empty_cell_in_a_column_of_walks_raises():
+    table = trials_of_two_persons()
+    table["who"][3] = None
+    with pytest.raises(InputError, match="row 4, field 'trial, who': expected a value, found an empty cell"):
+        ss.Demonstrations.from_table(table, TASKS[0], walk=["trial", "who"])

@@ -1,7 +1,7 @@
 """Samples as ArviZ's `InferenceData`: one variable for each learned number, with chains and draws."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from arviz import InferenceData
 
     from sidestep.inference.pointwise import PointwiseLogLikelihood, Unit
+    from sidestep.tabular.demonstration_tables import Labels
 
 
 def require(package: str, what: str) -> None:
@@ -33,14 +34,19 @@ def inference_data(
     statistics: Mapping[str, np.ndarray] | None = None,
     pointwise: "PointwiseLogLikelihood | None" = None,
     unit: "Unit" = "walk",
+    labels: "Labels | None" = None,
 ) -> "InferenceData":
-    """Return draws as `InferenceData`.
+    """Return draws as `InferenceData`, in which β has the dimension `person`, costs `state`, reward weights `feature`.
 
     Args:
         draws: Each leaf with leading axes of chains and draws.
         statistics: Of the sampler, with the same axes, by ArviZ's names.
         pointwise: The log-likelihood of each move, with the same axes.
         unit: What the group `log_likelihood` has an entry for.
+        labels: The names of persons and states; numbers by default.
+
+    Raises:
+        InputError: Where ArviZ is not installed, and for another number of labels.
     """
     require("arviz", "to_arviz")
     with warnings.catch_warnings():
@@ -50,10 +56,34 @@ def inference_data(
     names: dict[str, np.ndarray] = {}
     for path, leaf in jax.tree_util.tree_flatten_with_path(draws)[0]:
         names[jax.tree_util.keystr(path).removeprefix(".")] = np.asarray(leaf)
-    others: dict[str, Any] = {}
+    dims, coords = _dimensions(draws, labels)
+    others: dict[str, Any] = {"dims": dims, "coords": coords}
     if statistics is not None:
         others["sample_stats"] = dict(statistics)
     if pointwise is not None:
         others["log_likelihood"] = {f"{unit}s": pointwise.of(unit)}
-        others["dims"], others["coords"] = {f"{unit}s": [unit]}, {unit: pointwise.numbers_of(unit)}
+        dims[f"{unit}s"], coords[unit] = [unit], pointwise.numbers_of(unit)
     return arviz.from_dict(posterior=names, **others)
+
+
+def _dimensions(draws: NaturalScale, labels: "Labels | None") -> tuple[dict[str, list[str]], dict[str, Any]]:
+    """Return the names of the dimensions after chains and draws, and their coordinates."""
+    persons, states = (labels.persons, labels.states) if labels is not None else ((), ())
+    if draws.beta is not None and np.shape(draws.beta)[-1] == 1 != len(persons):
+        persons = ()  # one β for all persons
+    dims: dict[str, list[str]] = {}
+    coords: dict[str, Any] = {}
+    each = ("beta", "person", persons), ("reward_weights", "feature", ()), ("costs", "state", states)
+    for field, dimension, names in each:
+        numbers = getattr(draws, field)
+        if numbers is not None:
+            dims[field] = [dimension]
+            coords[dimension] = _coordinates(names, np.shape(numbers)[-1], dimension)
+    return dims, coords
+
+
+def _coordinates(names: Sequence[Hashable], count: int, field: str) -> list[Hashable]:
+    """Return names, or numbers where there are none."""
+    message = f"expected {count} labels, found {len(names)}"
+    check(len(names) in (0, count), message, source="labels", field=f"{field}s")
+    return list(names) if len(names) else list(range(count))

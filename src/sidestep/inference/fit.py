@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
@@ -26,13 +27,16 @@ from sidestep.inference.maximize import Progress, Status, maximize, solve_tolera
 from sidestep.inference.objective import Objective, Parameters, Problem, SolveSummary, joined
 from sidestep.inference.optimizers import LBFGS, Adam, Optimizer
 from sidestep.inference.priors import Normal, Prior
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
 from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import ALL_TERMS, Terms, check_deadline
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.proper import check_proper
-from sidestep.tabular.solve import SolveOptions
+from sidestep.tabular.solve import SolveOptions, solve
+from sidestep.tabular.tasks import Task
+from sidestep.tabular.wandering import suspects, warn_of_wandering
 
 if TYPE_CHECKING:
     from sidestep.inference.information import Information
@@ -198,7 +202,8 @@ def fit(
 
     Returns:
         The learned model, and how the optimization ended. `laplace` gives what was learned standard errors, by second
-        derivatives of the posterior.
+        derivatives of the posterior. Where agents that behave as was learned avoid their goals, because entropy is
+        worth more to them, a `SidestepWarning` says so as `solve` does, once.
 
     Raises:
         InputError: For arguments of other types or out of range, or that exclude each other, demonstrations in another
@@ -235,6 +240,9 @@ def fit(
     best = maximize(objective, optimizer, tolerances=tolerances, saver=saver, report=report, resume=resume)
     learned = model.with_parameters(best.parameters.model), behavior.with_parameters(best.parameters.behavior)
     sweeps, residual, task_converged = _of_all_tasks(best.solves, count)
+    if "actions" in problem.terms and options.horizon is None:
+        solved = _solve_suspects(*learned, demonstrations.tasks, options)
+        warn_of_wandering(learned[0], demonstrations.tasks, learned[1], *solved)
     converged = best.status is Status.CONVERGED and bool(np.asarray(task_converged).all())
     status = best.status, converged, best.message
     return Fit(*learned, problem, best.history, sweeps, residual, task_converged, *status)
@@ -244,6 +252,28 @@ def _of_all_tasks(batches: list[SolveSummary], tasks: int) -> list[Array]:
     """Return the sweeps, residuals and convergence of all tasks; tasks without a solve count as converged."""
     unsolved = np.zeros(tasks, int), np.zeros(tasks), np.ones(tasks, dtype=bool)
     return [jax.device_put(leaf[:tasks]) for leaf in (joined(batches)[:3] if batches else unsolved)]
+
+
+def _solve_suspects(
+    model: TransitionModel, behavior: BehaviorModel, tasks: Task, options: SolveOptions
+) -> tuple[Float[np.ndarray, "tasks states"], Bool[np.ndarray, " tasks"]]:
+    """Return the values of tasks in which agents may wander, and whether they converged; none of other tasks."""
+    values, converged = np.full(tasks.terminal.shape, np.nan), np.zeros(len(tasks.terminal), bool)
+    some = np.array(suspects(model, tasks, behavior), int)
+    if len(some):
+        own, person = jax.tree.map(lambda leaf: to_jax(np.asarray(leaf)[some]), tasks), behavior.person
+        if person is not None:
+            behavior = eqx.tree_at(lambda each: each.person, behavior, to_jax(np.asarray(person)[some]))
+        values[some], converged[some] = (np.asarray(part) for part in _values(model, own, behavior, options))
+    return values, converged
+
+
+@eqx.filter_jit
+def _values(
+    model: TransitionModel, tasks: Task, behavior: BehaviorModel, options: SolveOptions
+) -> tuple[Float[Array, "tasks states"], Bool[Array, " tasks"]]:
+    solution = solve(model, tasks, behavior, options=options, visited=jnp.zeros((len(tasks.terminal), 1), jnp.int32))
+    return solution.values, solution.converged
 
 
 def _check_settings(

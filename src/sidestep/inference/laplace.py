@@ -88,7 +88,7 @@ def behavior_estimates(fit: Fit[Any]) -> dict[str, Estimate]:
         states and tasks, and where the posterior has no normal approximation.
     """
     parameters = Parameters(fit.model.parameters, fit.behavior.parameters)
-    numbers, count = _typical(parameters), sum(leaf.size for leaf in jax.tree.leaves(parameters))
+    numbers, count = jax.jit(_typical)(parameters), sum(leaf.size for leaf in jax.tree.leaves(parameters))
     errors: list[float | None] = [None] * len(numbers)
     if numbers and count * fit.problem.demonstrations.tasks.terminal.size <= _SMALL:
         with suppress(SidestepError):

@@ -19,12 +19,14 @@ from sidestep._repr import short_repr
 from sidestep.errors import check_count, check_function, to_number
 from sidestep.inference.natural_scale import NaturalScale, natural_scale
 from sidestep.inference.objective import Parameters
+from sidestep.tabular.arrays import to_jax
 
 if TYPE_CHECKING:
     from arviz import InferenceData
 
     from sidestep.inference.fit import Fit
     from sidestep.inference.pointwise import Unit
+    from sidestep.tabular.demonstration_tables import Labels
 
 
 @short_repr("parameters", "standard_errors", "neglected", "distance", "simulated")
@@ -85,9 +87,10 @@ class Laplace:
         """
         check_function(function, "function")
         flat, unravel = ravel_pytree(self.parameters)
-        jacobian = np.asarray(jax.jacrev(lambda x: function(unravel(x)))(flat), np.float64) * self.scale
+        # compiled as a whole: the many small steps of a derivative take longer one by one
+        jacobian = np.asarray(jax.jit(jax.jacrev(lambda x: function(unravel(x))))(flat), np.float64) * self.scale
         inner = np.sum(jacobian**2, axis=-1) + (jacobian @ self.vectors) ** 2 @ (1 / self.eigenvalues - 1)
-        return jnp.sqrt(jnp.asarray(inner))
+        return to_jax(np.sqrt(inner), jnp.result_type(float))
 
     def interval(self, level: float = 0.95) -> tuple[NaturalScale, NaturalScale]:
         """Return the ends of an interval for each number, mapped from the unconstrained scale.
@@ -132,9 +135,17 @@ class Laplace:
         return jax.vmap(unravel)(flat + jnp.asarray(inner * self.scale, flat.dtype))
 
     def to_arviz(
-        self, key: PRNGKeyArray, n: int = 1_000, *, fit: "Fit[Any] | None" = None, unit: "Unit" = "walk"
+        self,
+        key: PRNGKeyArray,
+        n: int = 1_000,
+        *,
+        fit: "Fit[Any] | None" = None,
+        unit: "Unit" = "walk",
+        labels: "Labels | None" = None,
     ) -> "InferenceData":
         """Return samples as ArviZ's `InferenceData`, on their natural scales; needs `sidestep[samplers]`.
+
+        β has the dimension `person`, costs of states have `state`, and reward weights `feature`.
 
         Args:
             key: Of the random numbers.
@@ -142,9 +153,10 @@ class Laplace:
             fit: The fit of a transition model that the approximation belongs to, for a group `log_likelihood`, which
                 `arviz.loo` and `arviz.waic` need.
             unit: What that group has an entry for, and `loo` leaves out: "walk" or "move".
+            labels: The names of persons and states, as coordinates; numbers by default.
 
         Raises:
-            InputError: Where ArviZ is not installed, for n below 1, and for another fit.
+            InputError: Where ArviZ is not installed, for n below 1, for another fit, and for another number of labels.
             NotConverged: If the values of a sample do not converge.
         """
         from sidestep.inference.arviz_data import inference_data
@@ -152,7 +164,7 @@ class Laplace:
 
         samples = jax.tree.map(lambda leaf: leaf[None], self.sample(key, n))
         pointwise = None if fit is None else pointwise_log_likelihood(fit, samples)
-        return inference_data(natural_scale(samples), None, pointwise, unit)
+        return inference_data(natural_scale(samples), None, pointwise, unit, labels)
 
     def _tree(self, vector: Float[np.ndarray, " parameters"]) -> Parameters:
         flat, unravel = ravel_pytree(self.parameters)

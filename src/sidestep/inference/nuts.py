@@ -38,6 +38,8 @@ from sidestep.tabular.solvers.base import WarmStart
 if TYPE_CHECKING:
     from arviz import InferenceData
 
+    from sidestep.tabular.demonstration_tables import Labels
+
 _Data = tuple[list[Batch], list[WarmStart], Arrivals | None]
 
 
@@ -60,20 +62,25 @@ class Draws:
     divergent: Bool[np.ndarray, "chains draws"]
     acceptance: Float[np.ndarray, "chains draws"]
 
-    def to_arviz(self, fit: Fit[Any] | None = None, *, unit: Unit = "walk") -> "InferenceData":
+    def to_arviz(
+        self, fit: Fit[Any] | None = None, *, unit: Unit = "walk", labels: "Labels | None" = None
+    ) -> "InferenceData":
         """Return the samples as ArviZ's `InferenceData`, on their natural scales.
+
+        β has the dimension `person`, costs of states have `state`, and reward weights `feature`.
 
         Args:
             fit: The fit that was sampled, for a group `log_likelihood`, which `arviz.loo` and `arviz.waic` need.
             unit: What that group has an entry for, and `loo` leaves out: "walk" or "move".
+            labels: The names of persons and states, as coordinates; numbers by default.
 
         Raises:
-            InputError: Where ArviZ is not installed, and for another fit.
+            InputError: Where ArviZ is not installed, for another fit, and for another number of labels.
             NotConverged: If the values of a draw do not converge.
         """
         statistics = {"diverging": self.divergent, "acceptance_rate": self.acceptance}
         pointwise = None if fit is None else pointwise_log_likelihood(fit, self.parameters)
-        return inference_data(natural_scale(self.parameters), statistics, pointwise, unit)
+        return inference_data(natural_scale(self.parameters), statistics, pointwise, unit, labels)
 
 
 def sample(fit: Fit[Any], key: PRNGKeyArray, n: int = 1_000, *, chains: int = 4, warmup: int = 500) -> Draws:

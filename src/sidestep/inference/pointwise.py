@@ -19,9 +19,11 @@ from sidestep.errors import NotConverged, check
 from sidestep.inference.batching import Batch
 from sidestep.inference.fit import Fit
 from sidestep.inference.objective import Objective, Parameters, Problem, actions_log_likelihood
+from sidestep.inference.tabular_information import with_known_values
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import Arrivals, arrival_log_likelihood, move_times
+from sidestep.tabular.solve import SMALL_PROBLEM
 from sidestep.tabular.solvers.base import WarmStart
 
 Unit = Literal["walk", "move"]
@@ -126,9 +128,13 @@ def moves_log_likelihood(problem: Problem, parameters: Parameters) -> PointwiseL
     """
     draws, stacked = _stack(parameters, problem.parameters)
     objective = _unweighted(problem)
-    data = objective.batches, objective.cold_starts(), objective.arrivals
+    constants, starts = objective.constants, objective.cold_starts()
+    if not draws and problem.model.graph.states <= SMALL_PROBLEM and constants.options.horizon is None:
+        # after a fit, the program that evaluates the objective is compiled, and one without sweeps is quickly
+        constants, starts = with_known_values(constants), _solved(objective, parameters)
+    data = objective.batches, starts, objective.arrivals
     size = problem.model.graph.successors.size * objective.plan.size
-    choices, arrivals = _terms(objective.constants, data, stacked, max(1, min(_TOGETHER, _NUMBERS // size)))
+    choices, arrivals = _terms(constants, data, stacked, max(1, min(_TOGETHER, _NUMBERS // size)))
     demos = problem.demonstrations
     shape = (*draws, len(demos))
     by_action = by_transition = np.zeros(shape)
@@ -140,6 +146,16 @@ def moves_log_likelihood(problem: Problem, parameters: Parameters) -> PointwiseL
     if failed.any():
         raise NotConverged(f"values did not converge for {failed.sum()} of {failed.size} draws: more sweeps may help")
     return PointwiseLogLikelihood(by_action, by_transition, np.asarray(demos.trajectory), np.asarray(demos.weights))
+
+
+def _solved(objective: Objective, parameters: Parameters) -> list[WarmStart]:
+    """Return the values of all tasks as starts; NaN where they have not converged."""
+    evaluation, starts = objective.evaluate(parameters, objective.cold_starts())
+    values = [
+        np.where(np.asarray(solves.converged)[:, None], np.asarray(start.values), np.nan)
+        for solves, start in zip(evaluation.solves, starts, strict=True)
+    ]
+    return [start._replace(values=to_jax(own)) for start, own in zip(starts, values, strict=True)]
 
 
 def _unweighted(problem: Problem) -> Objective:

@@ -3,16 +3,17 @@
     H = −∇² [log L(θ) + log p(θ)]
 
 A product H v is the directional derivative of the exact gradient, by automatic differentiation: one linear solve
-forward and one for the adjoint, for each task and vector, beside the solves of the gradient
-(`sidestep.tabular.implicit`). So no step size has to be chosen, and the error is that of the solves.
+forward and one for the adjoint, for each task and vector (`sidestep.tabular.implicit`). So no step size has to be
+chosen, and the error is that of the solves. The gradient itself is evaluated once, and leaves the values and adjoints
+at which all products are taken.
 """
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from sidestep._programs import keep_program
@@ -27,10 +28,12 @@ from sidestep.inference.objective import (
     transitions_and_prior,
 )
 from sidestep.inference.priors import Prior
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.behavior_model import BehaviorModel
 from sidestep.tabular.likelihood import Arrivals
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solvers.base import WarmStart
+from sidestep.tabular.solvers.known import Known
 
 _TOGETHER = 32
 """The most vectors that are multiplied at a time."""
@@ -50,10 +53,13 @@ class TabularInformation(Information):
     def __init__(self, problem: Problem, parameters: Parameters, message: str = ""):
         self.objective: Objective = Objective(problem)
         evaluation, self.starts = self.objective.evaluate(parameters, self.objective.cold_starts())
+        constants = self.objective.constants
+        solved = self.objective.plan.keeps_warm_starts and constants.options.horizon is None
+        self._at_solution: Problem = with_known_values(constants) if solved else constants
         self.parameters: Parameters = parameters
         self.message: str = message
-        _, self._unravel = ravel_pytree(parameters)
-        self.gradient: Float[np.ndarray, " parameters"] = -np.asarray(ravel_pytree(evaluation.gradient)[0])
+        gradient = [-np.asarray(leaf).ravel() for leaf in jax.tree.leaves(evaluation.gradient)]
+        self.gradient: Float[np.ndarray, " parameters"] = np.concatenate([np.zeros(0), *gradient])
 
     def products(self, vectors: Vectors) -> Vectors:
         """Return H v of each vector.
@@ -79,10 +85,10 @@ class TabularInformation(Information):
         return np.concatenate(parts)[: len(vectors)]
 
     def _whole(self, directions: Parameters) -> Tree:
-        problem, parameters = self.objective.constants, self.parameters
+        problem, parameters = self._at_solution, self.parameters
         total = self._without_actions(directions, self.objective.arrivals)
         for batch, starts in zip(self.objective.batches, self.starts, strict=True):
-            total = jax.tree.map(jnp.add, total, _actions_products(problem, parameters, batch, starts, directions))
+            total = jax.tree.map(np.add, total, _actions_products(problem, parameters, batch, starts, directions))
         return total
 
     def _without_actions(self, directions: Parameters, arrivals: Arrivals | None) -> Tree:
@@ -90,11 +96,27 @@ class TabularInformation(Information):
         return _other_products(constants.prior, constants.model, constants.behavior, arrivals, parameters, directions)
 
     def _trees(self, vectors: Vectors) -> Parameters:
-        return jax.vmap(self._unravel)(jnp.asarray(vectors, ravel_pytree(self.parameters)[0].dtype))
+        leaves, structure = jax.tree.flatten(self.parameters)
+        parts = np.split(vectors, np.cumsum([leaf.size for leaf in leaves])[:-1], axis=1)
+        shaped = zip(parts, leaves, strict=True)
+        return structure.unflatten(
+            [to_jax(part.reshape(len(vectors), *leaf.shape), leaf.dtype) for part, leaf in shaped]
+        )
 
     def _flat(self, trees: Tree) -> Vectors:
         leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(trees)]
         return np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
+
+
+def with_known_values(problem: Problem) -> Problem:
+    """Return a problem of which the solves take values and adjoints from their starts, without a sweep.
+
+    Args:
+        problem: The problem, at an infinite horizon.
+    """
+    solver = problem.options.solver
+    known = Known(None if solver is None else solver.tolerance)
+    return eqx.tree_at(lambda each: each.options.solver, problem, known, is_leaf=lambda leaf: leaf is None)
 
 
 @keep_program

@@ -1,7 +1,7 @@
 """Gymnasium environments with a transition table, as models and tasks.
 
 `env.unwrapped.P[s][a]` lists (probability, next state, reward, whether the episode ends), as in `FrozenLake-v1`,
-`CliffWalking-v1` and `Taxi`. States and actions are the keys of the table; an action that a state lacks is not
+`CliffWalking-v1` and `Taxi-v4`. States and actions are the keys of the table; an action that a state lacks is not
 available there. Spaces that start at another number than 0 are shifted to it. `sidestep.io.environments` says which
 states are terminal. The reward of an outcome is R(s, a, s′), whatever the other outcomes pay.
 """

@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from sidestep.errors import check
 from sidestep.plotting import palette
-from sidestep.plotting.graphs import names_of
+from sidestep.plotting.graph_layout import POINTS, names_of, text_size
 from sidestep.plotting.layout import DOTS_PER_INCH
 from sidestep.tabular.demonstration_tables import Labels
 from sidestep.tabular.planning import Plan
@@ -22,6 +22,8 @@ _NAMED = 40
 """The most states with a name each."""
 _DARK = 0.45
 """The fraction of the scale from which numbers are white."""
+_NAMES = 8.0
+"""The size of the names of states and actions in points."""
 
 
 def figure_plan(plan: Plan, *, labels: Labels | None = None) -> Figure:
@@ -51,8 +53,11 @@ def figure_plan(plan: Plan, *, labels: Labels | None = None) -> Figure:
     (states, actions), labels = policy.shape, labels or Labels()
     names = names_of(labels.states, states, "states"), names_of(labels.actions, actions, "actions")
     cell = 0.24 if states <= _NAMED else 6.0 / states
-    height = 1.6 + cell * states
-    figure = Figure(figsize=(2.6 + 1.0 * actions, max(height, 2.6)), dpi=DOTS_PER_INCH, layout="constrained")
+    # room for the names beside and below the cells
+    beside = text_size(max(names[0], key=len), _NAMES)[0] / POINTS if states <= _NAMED else 0.4
+    below = 0.0 if _short(names[1]) else 0.7 * text_size(max(names[1], key=len), _NAMES)[0] / POINTS
+    size = 2.2 + beside + 1.0 * actions, max(1.6 + below + cell * states, 2.6 + below)
+    figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
     ended = np.broadcast_to(np.asarray(plan.terminal)[:, None], q.shape)
     endless = ended | ~np.isfinite(q)
@@ -98,7 +103,7 @@ def draw_table(
     axes.set_xticks(range(len(actions)), actions, rotation=0 if _short(actions) else 45)
     if len(states) <= _NAMED:
         axes.set_yticks(range(len(states)), states)
-    axes.tick_params(labelsize=8, length=2)
+    axes.tick_params(labelsize=_NAMES, length=2)
     axes.set_xlabel("action", fontsize=9)
     if len(states) <= _NUMBERED[0] and len(actions) <= _NUMBERED[1]:
         for row, column in np.argwhere(~hidden).tolist():

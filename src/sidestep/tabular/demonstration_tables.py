@@ -20,6 +20,8 @@ from sidestep.tabular.tasks import Task, stack_tasks
 
 _NONE = -1
 """The number of an empty cell."""
+_ANEW = "give `walk` several columns where the walks of each person are numbered anew"
+"""What may be wrong where rows of several walks seem to be of one."""
 
 
 class Labels(NamedTuple):
@@ -43,13 +45,14 @@ class Columns(NamedTuple):
     """The names of a table's columns; None for those that it does not have.
 
     Attributes:
-        state, action, next_state, walk, step, task, subject, weight: As the arguments of `Demonstrations.from_table`.
+        state, action, next_state, step, task, subject, weight: As the arguments of `Demonstrations.from_table`.
+        walk: The columns that tell walks apart; empty for a single walk.
     """
 
     state: str = "state"
     action: str = "action"
     next_state: str | None = None
-    walk: str | None = None
+    walk: tuple[str, ...] = ()
     step: str | None = None
     task: str | None = None
     subject: str | None = None
@@ -68,12 +71,15 @@ def read_moves(table: Any, tasks: Task | Sequence[Task], columns: Columns, label
     rows = _Rows(_as_arrow(table), columns)
     stacked = _stacked(tasks)
     states = stacked.terminal.shape[-1]
-    walk, order = _walks(rows)
+    walk = _walks(rows)
+    person = rows.numbers("subject", labels.persons) if columns.subject else None
+    if person is not None:
+        _check_persons(rows, walk, person)
+    order = _order(rows, walk)
     state = rows.numbers("state", labels.states, states)
     action = rows.numbers("action", labels.actions, empty=True)
     task = rows.numbers("task", labels.tasks, len(stacked.terminal)) if columns.task else np.zeros(len(rows), np.int64)
     check(columns.task or len(stacked.terminal) == 1, "several tasks: expected a column with the task", field="task")
-    person = rows.numbers("subject", labels.persons) if columns.subject else None
     weight = rows.weights() if columns.weight else np.ones(len(rows))
     after = rows.numbers("next_state", labels.states, states, empty=True) if columns.next_state else None
     number = rows.number[order]
@@ -88,14 +94,11 @@ def read_moves(table: Any, tasks: Task | Sequence[Task], columns: Columns, label
     _check_walks(rows, number, walk, task, "task")
     ended = moves & np.asarray(stacked.terminal)[task, state]
     rows.check(~ended, number, "the walk goes on after a terminal state of its task", "state")
-    if person is not None:
-        person = person[order]
-        _check_walks(rows, number, walk, person, "subject")
     return Demonstrations(
         *(flat_moves([each[moves]]) for each in (state, action, next_state, task, walk)),
         tasks=stacked,
         weights=to_jax(weight[moves]),
-        person=None if person is None else flat_moves([person[moves]]),
+        person=None if person is None else flat_moves([person[order][moves]]),
     )
 
 
@@ -126,7 +129,8 @@ class _Rows:
     def __init__(self, table: pa.Table, columns: Columns):
         self.table, self.columns = table, columns
         self.number = np.arange(1, len(table) + 1)
-        for name in filter(None, columns):
+        names = [*columns.walk, *(name for name in columns if isinstance(name, str))]
+        for name in names:
             expected = f"expected one of {', '.join(table.column_names)}"
             count = table.column_names.count(name)
             check(count == 1, f"the table has {count} such columns: {expected}", source="table", field=name)
@@ -143,11 +147,15 @@ class _Rows:
             raise InputError(message, source="table", row=int(number[~valid].min()), field=self.name(kind))
 
     def name(self, kind: str) -> str:
-        return getattr(self.columns, kind) or kind
+        return ", ".join(self.columns.walk) if kind == "walk" else getattr(self.columns, kind) or kind
 
     def column(self, kind: str) -> pa.Array:
+        """Return the column of a kind, as `read` does."""
+        return self.read(self.name(kind))
+
+    def read(self, name: str) -> pa.Array:
         """Return a column in one piece, with NaN as an empty cell, and categories as what they stand for."""
-        column = self.table[self.name(kind)].combine_chunks()
+        column = self.table[name].combine_chunks()
         if pa.types.is_dictionary(column.type) or pa.types.is_string_view(column.type):
             column = pa.array(column.to_pylist())  # Arrow has few functions for texts of polars
         if pa.types.is_floating(column.type):
@@ -223,15 +231,30 @@ def _stacked(tasks: Task | Sequence[Task]) -> Task:
     return stack_tasks(tasks)
 
 
-def _walks(rows: _Rows) -> tuple[Int[np.ndarray, " rows"], Int[np.ndarray, " rows"]]:
-    """Return the walk of each row, numbered as they appear, and the rows walk by walk in the order of steps."""
+def _walks(rows: _Rows) -> Int[np.ndarray, " rows"]:
+    """Return the walk of each row, numbered as they appear."""
     walk = np.zeros(len(rows), np.int64)
-    if rows.columns.walk:
-        column = rows.column("walk")
+    for name in rows.columns.walk:
+        column = rows.read(name)
         rows.check(~np.asarray(column.is_null()), rows.number, "expected a value, found an empty cell", "walk")
-        walk = np.asarray(column.dictionary_encode().indices).astype(np.int64)
+        own = np.asarray(column.dictionary_encode().indices).astype(np.int64)
+        _, first, both = np.unique(np.stack([walk, own]), axis=1, return_index=True, return_inverse=True)
+        walk = np.argsort(np.argsort(first))[both.ravel()]
+    return walk
+
+
+def _check_persons(rows: _Rows, walk: Int[np.ndarray, " rows"], person: Int[np.ndarray, " rows"]) -> None:
+    """Raise `InputError` unless each walk has one person, with the columns by which walks of several are told apart."""
+    first = np.unique(walk, return_index=True)[1]
+    columns = [rows.name("subject"), *rows.columns.walk]
+    message = f"the walk has rows of several persons: expected walk={columns} where each person's walks begin anew"
+    rows.check(person == person[first][walk], rows.number, message, "subject")
+
+
+def _order(rows: _Rows, walk: Int[np.ndarray, " rows"]) -> Int[np.ndarray, " rows"]:
+    """Return the rows walk by walk, in the order of steps."""
     if not rows.columns.step:
-        return walk, np.argsort(walk, kind="stable")
+        return np.argsort(walk, kind="stable")
     column = rows.column("step")
     kinds = ("integer", "floating", "temporal", "decimal")
     ordered = any(getattr(pa.types, f"is_{kind}")(column.type) for kind in kinds)
@@ -240,8 +263,8 @@ def _walks(rows: _Rows) -> tuple[Int[np.ndarray, " rows"], Int[np.ndarray, " row
     rank = np.unique(column.to_numpy(zero_copy_only=False), return_inverse=True)[1]
     order = np.lexsort((rank, walk))
     repeated = (np.diff(walk[order], prepend=-1) == 0) & (np.diff(rank[order], prepend=-1) == 0)
-    rows.check(~repeated, rows.number[order], "the walk has another row with the same step", "step")
-    return walk, order
+    rows.check(~repeated, rows.number[order], f"the walk has another row with the same step ({_ANEW})", "step")
+    return order
 
 
 def _check_steps(rows: _Rows, order: Int[np.ndarray, " rows"], known: Bool[np.ndarray, " rows"]) -> None:
@@ -265,7 +288,8 @@ def _next_states(
     """Return the state after each move; −1 in rows with a final state."""
     final = action == _NONE
     below = np.append(state[1:], _NONE)
-    rows.check(last | ~final, number, "expected an action: only the last row of a walk may be without one", "action")
+    message = f"expected an action: only the last row of a walk may be without one ({_ANEW})"
+    rows.check(last | ~final, number, message, "action")
     first = np.append(True, last[:-1])
     rows.check(~(first & final), number, "expected at least one move in a walk, found a final state only", "action")
     rows.check(~(final & (after != _NONE)), number, "a row with a next state needs an action", "action")

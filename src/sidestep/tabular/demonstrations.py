@@ -124,7 +124,7 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         state: str = "state",
         action: str = "action",
         next_state: str | None = None,
-        walk: str | None = "walk",
+        walk: str | Sequence[str] | None = "walk",
         step: str | None = None,
         task: str | None = None,
         subject: str | None = None,
@@ -144,8 +144,9 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
                 0, or labels.
             action: The column with the action.
             next_state: The column with the state after each move; an empty cell is the state of the next row.
-            walk: The column that tells walks apart, by numbers or texts; None for a single walk. Walks are numbered as
-                they appear.
+            walk: The column that tells walks apart, by numbers or texts; a list of columns where one is not enough, as
+                where each person's walks begin anew (`["subject", "walk"]`); None for a single walk. Walks are numbered
+                as they appear.
             step: The column by which the rows of a walk are ordered; by default they are in order. Where the next state
                 is that of the next row, whole numbers must be followed by the next one.
             task: The column with the task of each walk.
@@ -172,7 +173,8 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         """
         from sidestep.tabular.demonstration_tables import Columns, Labels, read_moves
 
-        columns = Columns(state, action, next_state, walk, step, task, subject, weight)
+        of_walk = [] if walk is None else [walk] if isinstance(walk, str) else to_list(walk, str, "walk")
+        columns = Columns(state, action, next_state, tuple(of_walk), step, task, subject, weight)
         return read_moves(table, tasks, columns, labels or Labels())
 
     def to_table(self: "Demonstrations[Task]", labels: "Labels | None" = None) -> "pyarrow.Table":

@@ -32,6 +32,7 @@ from sidestep.tabular.solvers import base
 from sidestep.tabular.solvers.gauss_seidel import KERNELS, GaussSeidel
 from sidestep.tabular.solvers.jacobi import Jacobi
 from sidestep.tabular.tasks import Task
+from sidestep.tabular.wandering import warn_of_wandering
 
 SMALL_PROBLEM = 400
 """The number of states below which `Jacobi` is at least as fast as `GaussSeidel` on a CPU (`benchmarks/scaling.py`)."""
@@ -148,6 +149,11 @@ def solve(
 
     Usable under `jit`, `vmap` and `grad`. The numbers have the dtype of the model's probabilities.
 
+    With the log-sum-exp backup and a discount below 1, agents may avoid their goal because the entropy of going on for
+    ever is worth more. Where they arrive less often than by chance, beside every goal, a `SidestepWarning` says so.
+    With n actions, no costs and a goal that pays G, that is where G < log(n)/(β (1 − γ)). `sidestep.tabular.wandering`
+    has the condition in general. Under `jit` there is no warning.
+
     Args:
         model: The transition model.
         task: One task, or several by `stack_tasks`.
@@ -196,7 +202,10 @@ def solve(
         check_persons(behavior, len(task.terminal))
     if not is_traced(model, task, behavior):
         check_proper(agents.tasks_of(task), agents.behavior_of(), model.graph, options.horizon)
-    return _solve(model, task, agents, options, start, visited, times, region)
+    solution = _solve(model, task, agents, options, start, visited, times, region)
+    if options.horizon is None and region is None and not is_traced(model, task, behavior, solution.values):
+        warn_of_wandering(model, task, agents, solution.values, solution.converged)
+    return solution
 
 
 # Compiled as a whole: otherwise every call would compile the loops of a solver again.

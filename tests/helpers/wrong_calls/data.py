@@ -96,6 +96,10 @@ CASES = [
         ("one task without a list", lambda: ss.gather([WALK], TASK), "tasks"),
         ("a number as a task", lambda: ss.gather([WALK], [3]), "Task"),
     ]),
+    *labeled("from_table", [
+        ("walks by a number", lambda: ss.Demonstrations.from_table({"walk": [0]}, TASK, walk=3), "walk"),
+        ("walks by numbers", lambda: ss.Demonstrations.from_table({"walk": [0]}, TASK, walk=["walk", 3]), "walk[1]"),
+    ]),
     *labeled("Demonstrations", [
         ("lists", lambda: ss.Demonstrations([0], [0], [1], [0], [0], TASK), "states"),
         ("weights of another length", lambda: ss.Demonstrations(DEMOS.states, DEMOS.actions, DEMOS.next_states, DEMOS.task, DEMOS.trajectory, TASK, np.ones(2)), "weights"),
