@@ -201,7 +201,7 @@ def _trajectory(
     path = _within(observations, moves + 1, seen, episode.source)
     if episode.terminated:
         path[-1] = ends.get(int(path[-1]), int(path[-1]))
-    return Trajectory(path, _within(episode.actions, moves, acted, episode.source), task)
+    return Trajectory(path, _within(episode.actions, moves, acted, episode.source), task, not episode.terminated)
 
 
 def _at(observations: Any, step: int) -> Any:
