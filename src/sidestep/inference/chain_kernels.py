@@ -30,7 +30,9 @@ class World(NamedTuple):
     """The barriers of a model, and what depends on which, as native code reads them.
 
     Attributes:
-        successors, attempts, needed: As in `Barriers`.
+        successors: As in `Barriers`, but the state itself for attempts that cannot succeed, so that no value of −∞ is
+            multiplied by 0.
+        attempts, needed: As in `Barriers`.
         passing: o(i) of a barrier that is open, and of one that is closed.
         gated: The states with an action that needs barrier i are `gated[gated_begin[i] : gated_begin[i + 1]]`.
         before: The states with an action that may lead to s are `before[before_begin[s] : before_begin[s + 1]]`.
@@ -199,8 +201,9 @@ def chain_kernels(actions: int, width: int) -> ChainKernels:
             exit_value = evidence.reward[task, row, a if evidence.reward.shape[2] > 1 else 0]
             weight = 1 - discount
             for k in range(width):
-                j, move = world.successors[s, a, k], discount * chain.probs[s, a, k]
-                if j != s and move > 0:
+                j = world.successors[s, a, k]
+                if j != s:
+                    move = discount * chain.probs[s, a, k]
                     exit_value += move * chain.values[task, j]
                     weight += move
             scratch.exit_values[a] = exit_value

@@ -161,7 +161,7 @@ class BarrierProblem:
         Raises:
             NotConverged: Where values do not converge.
         """
-        successors, probabilities = _outcomes(self.barriers, self.world, chain.passing)
+        successors, probabilities = _outcomes(self.barriers, chain.passing)
         kind, tie = self.backup
         for task, values in enumerate(chain.values):
             reward, discount = self.evidence.reward[task], np.float64(self.evidence.discount[task])
@@ -318,8 +318,9 @@ def _world_of(barriers: Barriers) -> World:
     gated_begin, gated = _grouped(needed[needed != NO_BARRIER], state, len(barriers.known))
     leads = (barriers.attempts > 0) & (barriers.successors != states[:, None, None])
     before_begin, before = _grouped(barriers.successors[leads], np.nonzero(leads)[0], len(states))
+    successors = np.where(_possible(barriers), barriers.successors, states[:, None, None])
     return World(
-        barriers.successors.astype(np.int32), barriers.attempts, needed.astype(np.int32), passing,
+        successors.astype(np.int32), barriers.attempts, needed.astype(np.int32), passing,
         gated_begin, gated, before_begin, before,
     )  # fmt: skip
 
@@ -381,11 +382,11 @@ def check_prior(barriers: Barriers, prior: BinaryMRF | HierarchicalMRF) -> None:
     check(prior.shape is None or prior.shape == barriers.shape, message, field="prior")
 
 
-def _outcomes(barriers: Barriers, world: World, passing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _outcomes(barriers: Barriers, passing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return successors and probabilities with staying as the last outcome."""
     success = barriers.attempts * np.append(passing, 1.0)[barriers.needed].prod(axis=-1)
     stay = np.broadcast_to(np.arange(len(success))[:, None, None], (*success.shape[:2], 1))
-    successors = np.concatenate([world.successors, stay], axis=-1).astype(np.int32)
+    successors = np.concatenate([barriers.successors, stay], axis=-1).astype(np.int32)
     return successors, np.concatenate([success, 1 - success.sum(axis=-1, keepdims=True)], axis=-1)
 
 
