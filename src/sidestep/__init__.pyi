@@ -145,7 +145,8 @@ from .maps.sensors import SensorMap as SensorMap, read_sensor as read_sensor
 
 # planning
 from .robots.robot import risk_averse_robot as risk_averse_robot
-from .tabular.planning import Plan as Plan, RollOuts as RollOuts, plan as plan, roll_out as roll_out
+from .tabular.planning import Plan as Plan, plan as plan
+from .tabular.roll_outs import RollOuts as RollOuts, roll_out as roll_out
 
 # evaluation
 from .evaluation.evaluate import evaluate as evaluate, plan_paths as plan_paths

@@ -18,7 +18,8 @@ class Objective:
 
     def __init__(self, slope, information, *, least_noise=0.0, seed=0, **figures):
         self.slope, self.information = slope, np.atleast_2d(information)
-        self.random, self.least_noise, self.figures, self.noises = np.random.default_rng(seed), least_noise, figures, []
+        self.random, self.least_noise, self.figures = np.random.default_rng(seed), least_noise, figures
+        self.noises, self.places = [], []
 
     def __call__(self, flat, state, noise):
         noise, size = max(noise, self.least_noise) if self.least_noise is not None else 0.0, len(flat)
@@ -31,6 +32,7 @@ class Objective:
         distance = np.sqrt(max(squared - noise**2, 0.0))
         figures = {"policy_gap": 0.0, "beyond_horizon": 0.0, "unfinished": 0.0} | self.figures
         self.noises.append(noise)
+        self.places.append(flat)
         numbers = gradient, np.abs(errors), covariance, step, float(distance), float(noise)
         return Visit(flat, state, Verification(*numbers, **figures, samples=8))
 
@@ -75,6 +77,19 @@ def test_refine_verifies_with_the_noise_of_the_tolerance():
     assert objective.noises[-1] == TIGHT.noise_tolerance
     assert set(objective.noises[:-1]) == {TIGHT.step_noise}
     assert len(objective.noises) >= 4 + 8 + 1
+
+
+def test_refine_noise_in_many_directions_moves_a_maximum_little():
+    """Whole steps would have a root mean square of the noise, √8 / 4."""
+    objective = Objective(lambda flat: -flat, np.eye(100))
+    refined(objective, np.zeros(100))
+    assert np.sqrt(np.mean(objective.places[1] ** 2)) < 0.25 * TIGHT.step_noise
+
+
+def test_refine_signal_in_many_directions_is_followed():
+    objective = Objective(lambda flat: -flat, np.eye(100))
+    refined(objective, np.full(100, 1.9))
+    assert np.sqrt(np.mean(objective.places[1] ** 2)) < 0.6 * 1.9
 
 
 def shoulder(flat):

@@ -27,11 +27,12 @@ from sidestep.tabular.behavior_model import BehaviorModel, behavior_model
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather, split_by_person
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.likelihood import log_likelihood
-from sidestep.tabular.models import ObstacleGrid
+from sidestep.tabular.models import ObstacleGrid, road_network
 from sidestep.tabular.models.barriers import barriers_of
 from sidestep.tabular.solve import solve
 from sidestep.tabular.tasks import Task, reach, task
 
+LEFT = 2
 TOLERANCE = 0.01
 """Of β V, and of log-likelihoods: a few times the change that is passed on (.0007 nats), and a part of large values."""
 
@@ -154,6 +155,41 @@ def test_chain_of_a_task_without_an_end_follows_its_values():
     for state in sampled_chains(problem_of(one, terms=("actions",)), 9, heat=4.0):
         expected = values_of(one, state.chain.closed, [one.behavior])
         np.testing.assert_allclose(state.chain.values, expected, atol=TOLERANCE)
+
+
+def behind_an_obstacle() -> BarrierWorld:
+    """A corridor to the first cell; the last two lie behind a known obstacle, from where no way leads there."""
+    grid = Grid(np.array([[-1, -1, -1, 1, -1, -1]]))
+    walks = [([1, 0], [LEFT]), ([4, 5, 4, 4], [RIGHT, LEFT, LEFT])]
+    shown = [Trajectory(np.array(path), np.array(taken), task=0) for path, taken in walks]
+    agents, prior = Behavior(BoltzmannAverage(), 2.0), BinaryMRF(np.zeros(6), (1, 6))
+    return BarrierWorld(ObstacleGrid(grid), gather(shown, [COSTLY.reach(grid, 0)]), agents, prior)
+
+
+def test_chain_of_a_walk_where_the_task_cannot_end_has_the_likelihood_of_its_map():
+    one = behind_an_obstacle()
+    for state in sampled_chains(problem_of(one), 12):
+        expected = values_of(one, state.chain.closed, [one.behavior])
+        assert np.isneginf(expected[0, 4:]).all()
+        np.testing.assert_allclose(state.chain.values, expected, atol=TOLERANCE)
+        likelihood = log_likelihood(exact_model(one.model, state.chain.closed), one.demonstrations, one.behavior)
+        np.testing.assert_allclose(state.chain.totals, np.array(likelihood), atol=TOLERANCE)
+
+
+def to_a_dead_end(lapse: float | None) -> BarrierWorld:
+    """Roads from the first: one by another road to the third, which is the goal, the others to dead ends."""
+    roads = road_network(np.array([[0, 1], [0, 3], [0, 4], [0, 5], [1, 2]]), np.ones(6))
+    shown = gather([Trajectory(np.array([0, 3]), np.array([1]), task=0)], [COSTLY.reach(roads.graph, 2)])
+    return BarrierWorld(roads, shown, Behavior(BoltzmannAverage(), 2.0, lapse), BinaryMRF(np.zeros(6)))
+
+
+def test_chain_of_a_choice_after_which_the_task_cannot_end_needs_a_lapse():
+    with pytest.raises(InputError, match="'demonstrations': expected actions after which the task can end"):
+        sampled_chains(problem_of(to_a_dead_end(None)), 1)
+    one = to_a_dead_end(0.1)
+    for state in sampled_chains(problem_of(one), 12):
+        likelihood = log_likelihood(exact_model(one.model, state.chain.closed), one.demonstrations, one.behavior)
+        np.testing.assert_allclose(state.chain.totals, np.array(likelihood), atol=TOLERANCE)
 
 
 @pytest.mark.slow

@@ -5,16 +5,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.barrier_worlds import COSTLY, RIGHT, all_maps, corridor, world
+from helpers.barrier_worlds import COSTLY, RIGHT, all_maps, corridor, exact_model, world
 from helpers.problems import dense_obstacles, plain_policy, plain_values
 from sidestep.errors import InputError, NotConverged
 from sidestep.inference.chains import PASSING
 from sidestep.inference.enumeration import ExactPosterior, enumerate_barriers
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
-from sidestep.tabular.demonstrations import Trajectory, gather
+from sidestep.tabular.behavior_model import behavior_model
+from sidestep.tabular.demonstrations import Trajectory, gather, split_by_person
 from sidestep.tabular.grid import Grid
-from sidestep.tabular.models import ObstacleGrid, walled_grid
+from sidestep.tabular.likelihood import log_likelihood
+from sidestep.tabular.models import ObstacleGrid, road_network, walled_grid
 from sidestep.tabular.tasks import reach
 
 BETA, DISCOUNT, LAPSE = 5.0, 0.9, 0.1
@@ -52,6 +54,28 @@ def test_enumerate_barriers_equals_the_dense_sum(tempering, terms):
     assert exact.log_evidence == pytest.approx(np.logaddexp.reduce(log_weights), abs=1e-6)
     expected = np.average(maps, axis=0, weights=np.exp(log_weights - log_weights.max()))
     np.testing.assert_allclose(exact.closed, expected, atol=1e-7)
+
+
+def test_enumerate_barriers_with_a_learned_behavior_has_its_numbers():
+    """Two persons, with a discount that is not the tasks' own."""
+    walks = [WALK, WALK._replace(states=np.array([0, 2, 3]), actions=np.array([1, RIGHT]))]
+    shown, person = split_by_person(gather(walks, [TASK]), [0, 1])
+    agents = behavior_model(BEHAVIOR, ["discount"], discount=0.7, person=person)
+    agents = agents.with_parameters(agents.parameters._replace(log_beta=jnp.log(jnp.array([2.0, 9.0]))))
+    maps = np.array([[False] * 4, [False, True, False, False]])  # walks crossed the others
+    scores = [
+        float(log_likelihood(exact_model(MODEL, each), shown, agents).total) + PRIOR.log_density(each) for each in maps
+    ]
+    exact = enumerate_barriers(MODEL, shown, agents, PRIOR)
+    assert exact.log_evidence == pytest.approx(np.logaddexp.reduce(scores), abs=1e-6)
+    assert exact.closed[1] == pytest.approx(np.exp(scores[1] - np.logaddexp.reduce(scores)), abs=1e-6)
+
+
+def test_enumerate_barriers_of_a_choice_after_which_the_task_cannot_end_raises():
+    roads = road_network(np.array([[0, 1], [0, 3], [1, 2]]), np.ones(4))
+    shown = gather([Trajectory(np.array([0, 3]), np.array([1]), task=0)], [COSTLY.reach(roads.graph, 2)])
+    with pytest.raises(InputError, match="'demonstrations': expected actions after which the task can end"):
+        enumerate_barriers(roads, shown, Behavior(BoltzmannAverage()), BinaryMRF(np.zeros(4)))
 
 
 def test_enumerate_barriers_without_likelihood_is_the_prior():

@@ -95,7 +95,7 @@ def test_from_dense_ignores_rows_that_have_no_meaning():
     np.testing.assert_allclose(plan(world.model, world.task).solution.values, [1.0, 3.0, 0.0], rtol=1e-7)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, int, bool])
+@pytest.mark.parametrize("dtype", [np.float32, int])
 def test_from_dense_takes_numbers_of_other_types(dtype):
     P = np.eye(3)[:, None].astype(dtype)
     assert eqx.tree_equal(
@@ -121,16 +121,22 @@ NEVER = -np.inf
         (np.full((2, 3, 4), 1 / 4), np.zeros(2), {}, r"'P': expected P\[s, a, s′\] .*found shape \(2, 3, 4\)$"),
         (np.eye(2), np.zeros(2), {}, r"'P': expected P\[s, a, s′\] .*found shape \(2, 2\)"),
         (np.zeros((0, 1, 0)), np.zeros(0), {}, r"'P': expected P\[s, a, s′\] .*found shape \(0, 1, 0\)"),
-        ([[[1.0], [0.5, 0.5]]], [0.0], {}, "'P': expected a table of numbers"),
-        ([[["1"]]], [0.0], {}, "'P': expected numbers, found type <U1"),
-        ([[[1j]]], [0.0], {}, "'P': expected numbers, found type complex128"),
+        ([[[1.0], [0.5, 0.5]]], [0.0], {}, "'P': expected numbers, found"),
+        ([[["1"]]], [0.0], {}, "'P': expected numbers, found"),
+        ([[[1j]]], [0.0], {}, "'P': expected numbers, found complex128"),
+        (np.eye(2, dtype=bool)[:, None], np.zeros(2), {}, "'P': expected numbers, found bool"),
         (with_row(0.5, 0.0), np.zeros(2), {}, "^state 1, action 1: expected probabilities that sum to 1, .* 0.5"),
         (with_row(0.5, 1.0), np.zeros(2), {}, "^state 1, action 1: expected probabilities that sum to 1, .* 1.5"),
         (with_row(-0.5, 1.5), np.zeros(2), {}, r"^state 1, action 1: expected probabilities of at least 0.*\[-0.5\]"),
         (with_row(np.nan, 1.0), np.zeros(2), {}, r"^state 1, action 1: expected probabilities of at least 0.*\[nan\]"),
         (with_row(np.inf, -np.inf), np.zeros(2), {}, r"^state 1, action 1: expected probabilities of at least 0"),
-        (ROWS, np.zeros(3), {}, r"'R': expected one of the shapes .*\(2,\), \(2, 2\), \(2, 2, 2\).*found \(3,\)"),
-        (ROWS, np.zeros((2, 2, 1)), {}, r"'R': expected one of the shapes .*found \(2, 2, 1\)"),
+        (
+            ROWS,
+            np.zeros(3),
+            {},
+            r"'R': expected numbers of shape \(2,\) or \(2, 2\) or \(2, 2, 2\), found shape \(3,\)",
+        ),
+        (ROWS, np.zeros((2, 2, 1)), {}, r"'R': expected numbers of shape .*found shape \(2, 2, 1\)"),
         (ROWS, [["a", "b"], ["c", "d"]], {}, "'R': expected numbers"),
         (ROWS, [NEVER, 0.0], {}, r"'reward': expected finite numbers, found -inf"),
         (ROWS, [[0.0, np.nan], [0.0, 0.0]], {}, "^state 0, action 1, field 'R': expected finite rewards.*found nan"),

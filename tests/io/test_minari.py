@@ -69,7 +69,8 @@ def pursuits(states, actions, tasks, walks, seed):
         moves = random.integers(1, 5)
         acting = np.flatnonzero(~np.asarray(wanted[task].terminal))
         path = np.append(random.choice(acting, moves), random.integers(states))
-        walked.append(Trajectory(path, random.integers(actions, size=moves), int(task)))
+        truncated = bool(random.integers(2))
+        walked.append(Trajectory(path, random.integers(actions, size=moves), int(task), truncated))
     gathered = gather(walked, wanted)
     if random.integers(2):
         gathered = replace(gathered, weights=jnp.asarray(random.uniform(size=len(gathered))))
@@ -128,6 +129,17 @@ def test_write_demonstrations_is_readable_by_minari():
     assert [episode.actions.tolist() for episode in found] == [[3, 3]] * 2
     told = list(found.storage.get_episode_metadata([0, 1]))
     assert [(each["goal"], each["discount"], each["task"]) for each in told] == [(2, 0.95, 0), (5, 0.95, 1)]
+
+
+def test_demonstrations_in_a_dataset_keep_which_walks_were_truncated():
+    """Neither arrives. Datasets that others write tell only which episodes did not end."""
+    walks = [Trajectory(np.array([0, 1, 2]), np.array([3, 3]), 0, truncated) for truncated in (True, False)]
+    dataset = fresh("ours/cut")
+    write_demonstrations(dataset, gather(walks, [reach(GRID, 5)]), GRID)
+    assert read_demonstrations(dataset, GRID).truncated.tolist() == [True, True, False, False]
+    flags = {"terminations": np.array([False]), "truncations": np.array([True])}
+    theirs = store(SPACES, buffer([0, 1], [3]), buffer([0, 1], [3], **flags))
+    assert read_demonstrations(theirs, GRID, task=reach(GRID, 1)).truncated.tolist() == [False, True]
 
 
 # A frozen lake

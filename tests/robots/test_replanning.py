@@ -1,5 +1,7 @@
 """Executed paths: after a bump, repaired values lead as far as new plans, and as far as worked out by hand."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -54,6 +56,21 @@ def test_replanning_lengths_with_a_false_known_obstacle_are_infinite():
     for reward in REWARDS:
         model = ObstacleGrid(Grid(np.array([[-1, 1, -1]])), -20.0)
         assert lengths(model, truth, 2, [0, 2], reward) == [np.inf, 0]
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_replanning_lengths_take_the_better_of_two_ways_with_large_values(dtype):
+    """The way over 0 costs .1 more than that over 6, of 20,000; it would be the first of ties, and end in a bump at 1.
+
+    0 # 2
+    3 # 5        From 3 to 5; the obstacle at 4 is known, the one at 1 is not.
+    6 7 8
+    """
+    truth, known = Grid(np.array([[0, 1, 0], [0, 1, 0], [0, 0, 0]])), Grid(np.array([[-1] * 3, [-1, 1, -1], [-1] * 3]))
+    model = ObstacleGrid(known, jnp.full(9, -30.0, dtype))
+    costly = reach(known, 5, discount=1.0, step_cost=5_000.0)
+    dearer = replace(costly, reward=jnp.broadcast_to(costly.reward, (9, 4)).at[0].add(-0.1))
+    assert replanning_lengths(model, grid_environment(truth), dearer, 5, np.array([3])).tolist() == [4]
 
 
 def test_replanning_lengths_without_a_path_are_infinite():

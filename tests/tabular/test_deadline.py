@@ -71,6 +71,26 @@ def test_simulate_with_a_deadline_stops_there_and_follows_its_policies():
                 assert np.mean(taken) == pytest.approx(policies[time, state, 1], abs=4 * (0.25 / len(taken)) ** 0.5)
 
 
+# a deadline of two moves: of state 0, the pay of 1 at once is the better one at the end, the way to 3 before that
+PAY = ss.task(np.array([[0.0, 1.0], [3.0, 0.0], [0.0, 0.0]]), 1.0, np.arange(3) == 2)
+CHOICE = ss.tabular_model(ss.graph([[[1], [0]], [[2], [1]], [[2], [2]]]), np.ones((3, 2, 1)))
+TWO = ss.SolveOptions(horizon=2, deadline=True)
+
+
+def test_plan_with_a_deadline_follows_the_policy_of_each_move():
+    made = ss.plan(CHOICE, PAY, options=TWO)
+    assert np.asarray(made.policy)[:, 0].tolist() == [[1.0, 0.0], [0.0, 1.0]]
+    assert made.path_from(0).tolist() == [0, 1, 2]
+    rolled = ss.roll_out(jax.random.key(0), CHOICE, made.policy, made.terminal, [0, 1], 2)
+    assert rolled.states.tolist() == [[0, 1, 2], [1, 2, 2]]
+
+
+def test_path_from_with_a_deadline_ends_there():
+    """With one move left the plan stays for the pay; a state may repeat."""
+    made = ss.plan(CHOICE, PAY, options=ss.SolveOptions(horizon=1, deadline=True))
+    assert made.path_from(0).tolist() == [0, 0]
+
+
 def test_log_likelihood_of_a_walk_beyond_the_deadline_raises():
     walk = ss.Trajectory(np.array([0] * 7), np.array([1] * 6), 0)
     with pytest.raises(ss.InputError, match=r"trajectory 0.*at most 5 moves by the deadline, found 6"):

@@ -115,8 +115,9 @@ def test_to_table_and_from_table_are_inverse(walks, data):
         shown.tasks,
         changes[1],
         changes[0],
+        jax.numpy.asarray(random.random(shown.trajectories) < 0.5)[shown.trajectory],
     )
-    columns: dict[str, Any] = {name: name for name in ("next_state", "step", "task", "subject", "weight")}
+    columns: dict[str, Any] = {name: name for name in ("next_state", "step", "task", "subject", "weight", "truncated")}
     assert_same(ss.Demonstrations.from_table(shown.to_table(), shown.tasks, **columns), shown)
 
 
@@ -151,6 +152,13 @@ def changed(**columns):
     (changed(who={0: 1}), {"subject": "who"}, r"row 2, field 'who': expected a value"),
     (changed(w=dict.fromkeys(range(8), -1.0)), {"weight": "w"}, r"row 1, field 'w': .*at least 0"),
     (changed(w={0: 1.0}), {"weight": "w"}, r"row 2, field 'w': .*at least 0"),
+    (changed(cut=dict.fromkeys(range(8), 0)), {"truncated": "cut"}, r"field 'cut': expected booleans, found int64"),
+    (changed(cut={0: True}), {"truncated": "cut"}, r"row 2, field 'cut': expected a value, found an empty cell"),
+    (
+        changed(cut=dict.fromkeys(range(8), True) | {5: False}),
+        {"truncated": "cut"},
+        r"row 6, field 'cut': expected the same value in all rows of a walk",
+    ),
     (rows_of_states(), {"state": "place"}, r"field 'place': the table has 0 such columns: expected one of walk"),
     (rows_of_states(), {"state": "walk"}, r"field 'walk': expected whole numbers \(or labels.*found string"),
     (rows_of_states(), {"labels": ss.Labels(states=(0, 1, 2))}, r"row 4, field 'state': .*labels 0, 1, 2, found 3"),
@@ -207,6 +215,18 @@ def test_demonstrations_are_not_iterable():
 def test_join_of_slices_is_the_whole():
     whole = demonstrations()
     assert_same(ss.join([whole[:1], whole[1:2], whole[2:]]), whole)
+
+
+def test_truncated_walks_stay_truncated_when_they_are_gathered_chosen_and_joined():
+    cut = ss.Trajectory(np.array([1, 2, 1]), np.array([3, 2]), 0, truncated=True)
+    whole = ss.Trajectory(np.array([2, 3]), np.array([3]), 0)
+    shown = ss.gather([cut, whole], TASKS)
+    assert shown.truncated.tolist() == [True, True, False]
+    assert shown[[1, 0]].truncated.tolist() == [False, True, True]
+    assert ss.join([shown[1:], shown]).truncated.tolist() == [False, True, True, False]
+    assert ss.split_by_person(shown, [0, 1])[0].truncated.tolist() == [True, True, False]
+    with pytest.raises(InputError, match=r"trajectory, row 1, field 'truncated': expected .*bool"):
+        ss.gather([whole._replace(truncated="no")], TASKS)  # pyright: ignore[reportArgumentType]
 
 
 def test_join_gives_equal_tasks_one_number_and_others_another():

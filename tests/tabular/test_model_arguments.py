@@ -37,8 +37,8 @@ def test_tabular_model_with_known_rows_learns_the_others():
 
 @pytest.mark.parametrize(("table", "message"), [
     (TABLE[:1], "probabilities"),
-    (TABLE - np.array([1e-3, 0]), "probabilities.*sum of 1 for action 0 of state 0"),
-    (np.where(TABLE == 0.9, 0.91, TABLE), "sum of 1 for action 1 of state 1, found 1.01"),
+    (TABLE - np.array([1e-3, 0]), "^state 0, action 0, field 'probabilities': expected probabilities that sum to 1"),
+    (np.where(TABLE == 0.9, 0.91, TABLE), "^state 1, action 1, .*: expected .* that sum to 1, found a sum of 1.01"),
     (np.where(TABLE == 0.25, -0.25, TABLE), "probabilities"),
     (np.where(TABLE == 0.25, np.nan, TABLE), "probabilities"),
 ])  # fmt: skip

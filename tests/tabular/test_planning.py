@@ -11,10 +11,11 @@ from sidestep.tabular.behavior_model import behavior_model
 from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import ObstacleGrid, TabularModel, true_model
-from sidestep.tabular.planning import plan, roll_out
+from sidestep.tabular.planning import plan
+from sidestep.tabular.roll_outs import roll_out
 from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.solvers.jacobi import Jacobi
-from sidestep.tabular.tasks import reach
+from sidestep.tabular.tasks import reach, task
 
 OPEN = Grid(np.zeros((3, 3), dtype=int))
 BEND = Grid(np.array([[0, 0, 0], [1, 1, 0], [0, 0, 0]]))
@@ -43,6 +44,24 @@ def test_plan_optimal_is_uniform_over_ties():
     expected = {8: [UP, LEFT], 4: [UP, LEFT], 5: [UP, LEFT], 1: [LEFT], 2: [LEFT], 6: [UP]}
     for state, actions in expected.items():
         np.testing.assert_allclose(policy[state], np.isin(range(4), actions) / len(actions), atol=1e-12)
+
+
+@pytest.mark.parametrize(("costs", "expected"), [
+    ([(0.1, 0.1), (20_000.0, 20_000.1)], [1.0, 0.0]),
+    ([(0.2, 0.1), (20_000.0, 20_000.0)], [0.0, 1.0]),
+    ([(0.1, 0.1), (20_000.1, 20_000.1)], [0.5, 0.5]),
+    ([(0.1, 1000.3), (20_000.3, 19_000.1)], [0.5, 0.5]),
+])  # fmt: skip
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_plan_optimal_tells_actions_apart_by_more_than_the_rounding_of_values(costs, expected, dtype):
+    """Two ways to the end, each of two moves: what the first move costs, and what the second costs."""
+    ways = graph([[[1], [2]], [[3], [3]], [[3], [3]], [[3], [3]]])
+    first, second = -np.array(costs)
+    reward = np.array([first, second[[0, 0]], second[[1, 1]], [0, 0]])
+    model = TabularModel(ways, jnp.zeros((4, 2, 1), dtype))
+    made = plan(model, task(reward, 1.0, np.arange(4) == 3))
+    assert made.policy.dtype == dtype
+    assert made.policy[0].tolist() == expected
 
 
 def test_plan_with_a_behavior_follows_the_action_values():
@@ -161,3 +180,13 @@ def test_plan_of_a_person_that_does_not_exist_raises(learn, person):
     assert plan(true_model(OPEN), reach(OPEN, 8), agents).path_from(7).tolist() == [7, 8]
     with pytest.raises(InputError, match="field 'person'"):
         plan(true_model(OPEN), reach(OPEN, 8), agents, person=person)
+
+
+def test_roll_out_of_a_policy_with_an_action_that_is_not_available_raises():
+    world = graph([[[1], [1]], [[2], [2]], [[2], [2]]], available=[[True, True], [True, False], [True, False]])
+    model, key, ends = TabularModel(world, jnp.zeros((3, 2, 1))), jax.random.key(0), jnp.arange(3) == 2
+    half = np.full((3, 2), 0.5)
+    with pytest.raises(InputError, match=r"'policy': expected available .*, found action 1 in state 1"):
+        roll_out(key, model, jnp.asarray(half), ends, [0], 2)
+    half[1] = [1.0, 0.0]  # of the terminal state, the policy has no meaning
+    assert roll_out(key, model, jnp.asarray(half), ends, [0], 2).states.tolist() == [[0, 1, 2]]

@@ -1,14 +1,19 @@
 """Tasks with rewards of outcomes, stacks of tasks, places, and which tasks have values, at the edges of each rule."""
 
+from dataclasses import replace
+
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sidestep.errors import ImproperTask, InputError
 from sidestep.tabular.backups import Behavior, BoltzmannAverage, LogSumExp
+from sidestep.tabular.checks import check_model, check_task
 from sidestep.tabular.demonstrations import Trajectory, gather
-from sidestep.tabular.graph import graph
+from sidestep.tabular.graph import Graph, graph
 from sidestep.tabular.grid import Grid
+from sidestep.tabular.models import TabularModel
 from sidestep.tabular.proper import check_proper
 from sidestep.tabular.tasks import reach, stack_tasks, state_at, task, with_outcome_reward
 
@@ -170,3 +175,39 @@ def test_check_proper_counts_available_actions_only():
     check_proper(task(gains, 1.0, ENDS), SOFT, single)
     with pytest.raises(ImproperTask):
         check_proper(task(gains, 1.0, ENDS), SOFT, WORLD)
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"reward": np.array([[0.0, 0.0], [0.0, np.nan], [0.0, 0.0]])}, "'reward': .*found nan in state 1, action 1"),
+    ({"reward": np.array([[np.inf]])}, "'reward': expected finite rewards, found inf$"),
+    ({"terminal_reward": np.array([0.0, 0.0, np.nan])}, "'terminal_reward': .*found nan in state 2"),
+    ({"outcome_reward": np.array([[[0.0, -np.inf]]])}, "'outcome_reward': .*found -inf in outcome 1"),
+])  # fmt: skip
+def test_task_made_by_hand_with_rewards_that_are_not_finite_raises_where_it_is_used(change, message):
+    made = replace(costs(1.0, 0.9), **{name: jnp.asarray(numbers) for name, numbers in change.items()})
+    with pytest.raises(InputError, match=rf"^task, field {message}"):
+        check_task(made, WORLD)
+    with pytest.raises(InputError, match=r"^tasks, field"):
+        check_task(stack_tasks([costs(1.0, 0.9), made]), WORLD, "tasks")
+
+
+def test_task_made_by_hand_may_have_any_terminal_reward_where_it_goes_on():
+    made = replace(costs(1.0, 0.9), terminal_reward=jnp.asarray(np.where(ENDS, 1.0, np.nan)))
+    check_task(made, WORLD)
+
+
+def test_graph_made_by_hand_without_an_action_where_the_task_goes_on_raises():
+    arrays = WORLD.successors, WORLD.lengths
+    check_task(costs(1.0, 0.9), Graph(*arrays, jnp.asarray(np.array([[True, False], [True, True], [False, False]]))))
+    stuck = Graph(*arrays, jnp.asarray(np.array([[True, False], [False, False], [False, False]])))
+    with pytest.raises(InputError, match=r"'available': expected an available action .*, found none in state 1"):
+        check_task(costs(1.0, 0.9), stuck)
+    with pytest.raises(InputError, match="found none in state 1"):
+        check_task(stack_tasks([costs(1.0, 0.9)] * 2), stuck)
+
+
+@pytest.mark.parametrize("field", ["available", "lengths"])
+def test_graph_made_by_hand_with_a_table_of_another_shape_raises(field):
+    world = eqx.tree_at(lambda each: getattr(each, field), WORLD, jnp.ones((2, 2), getattr(WORLD, field).dtype))
+    with pytest.raises(InputError, match=rf"'graph': expected a table `{field}` of shape .*, found"):
+        check_model(TabularModel(world, jnp.zeros(WORLD.successors.shape)))

@@ -11,7 +11,8 @@ from sidestep.tabular.behavior_model import behavior_model
 from sidestep.tabular.graph import graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.models import TabularModel, true_model
-from sidestep.tabular.planning import RollOuts, plan, policy_by_time, roll_out
+from sidestep.tabular.planning import plan
+from sidestep.tabular.roll_outs import RollOuts, roll_out
 from sidestep.tabular.simulation import simulate
 from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.tasks import reach, task
@@ -53,8 +54,8 @@ def ones(*shape):
     (ones(6), GOAL.terminal, [0], 0, "max_moves"),
     (ones(5), GOAL.terminal[1:], [0], 2, "policy, terminal"),
     (ones(3, 6), GOAL.terminal, [0], 2, "policy"),
-    (ones(6).at[3, 1].set(0.26), GOAL.terminal, [0], 2, r"in state \[\[3\]\]"),
-    (ones(6).at[2, :2].set(jnp.array([-0.25, 0.75])), GOAL.terminal, [0], 2, r"in state \[\[2\]\]"),
+    (ones(6).at[3, 1].set(0.26), GOAL.terminal, [0], 2, "state 3, field 'policy'"),
+    (ones(6).at[2, :2].set(jnp.array([-0.25, 0.75])), GOAL.terminal, [0], 2, "state 2, field 'policy'"),
 ])  # fmt: skip
 def test_roll_out_of_wrong_arguments_raises(policy, terminal, starts, moves, field):
     with pytest.raises(InputError, match=field):
@@ -100,17 +101,17 @@ def test_simulate_with_a_deadline_stops_there():
     assert [len(walk.actions) for walk in walks] == [3, 2, 1]
     assert [walk.truncated for walk in walks] == [True, False, False]
     assert len(simulate(jax.random.key(0), WORLD, [GOAL], [[0]], SURE, 2, options=options)[0].actions) == 2
-    with pytest.raises(InputError, match="behavior"):
-        simulate(jax.random.key(0), WORLD, [GOAL], [[0]], options=options)
+    assert simulate(jax.random.key(0), WORLD, [GOAL], [[3]], options=options)[0].states.tolist() == [3, 4, 5]
 
 
-def test_policy_by_time_is_that_of_a_plan_with_the_moves_that_are_left():
-    agents = Behavior(BoltzmannAverage(), 3.0)
-    by_time = policy_by_time(WORLD, GOAL, agents, SolveOptions(horizon=3, deadline=True))
-    assert by_time.shape == (3, 6, 4)
+@pytest.mark.parametrize("agents", [None, Behavior(BoltzmannAverage(), 3.0)])
+def test_plan_with_a_deadline_has_the_policies_of_plans_with_the_moves_that_are_left(agents):
+    by_time = plan(WORLD, GOAL, agents, options=SolveOptions(horizon=3, deadline=True))
+    assert by_time.policy.shape == (3, 6, 4)
     for move in range(3):
-        left = plan(WORLD, GOAL, agents, options=SolveOptions(horizon=3 - move)).policy
-        np.testing.assert_allclose(by_time[move, :5], left[:5], rtol=1e-9)
+        left = plan(WORLD, GOAL, agents, options=SolveOptions(horizon=3 - move))
+        np.testing.assert_allclose(by_time.policy[move, :5], left.policy[:5], rtol=1e-9)
+        np.testing.assert_array_equal(by_time.intended[move, :5], left.intended[:5])
 
 
 @pytest.mark.parametrize(("tasks", "starts", "field"), [

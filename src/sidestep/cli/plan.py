@@ -1,11 +1,14 @@
 """`sidestep plan`: a path in a learned map, as CSV and PNG."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from sidestep.cli.options import BUMP_COST, BumpCost, LearnedFolder, position_of
+
+if TYPE_CHECKING:
+    from sidestep.maps.learned_map import PlannedPath
 
 _DOUBTFUL = 0.05
 """The P(blocked) of a goal above which a note says that it may not be free, where no risk is named."""
@@ -27,7 +30,7 @@ def plan(
     """Plan a path in a learned map: path.csv, path.png, summary.json."""
     import numpy as np
 
-    from sidestep.cli.display import print_lines, print_notes
+    from sidestep.cli.display import print_lines
     from sidestep.cli.drawing import draw
     from sidestep.maps.learned_map import add_to_summary, load_map
 
@@ -45,28 +48,46 @@ def plan(
 
     x, y = path.positions.T
     write_table(out / "path.csv", pa.table({"step": np.arange(len(x)), "x": x, "y": y, "blocked": path.blocked}))
-    moves, likeliest = len(path.states) - 1, float(path.blocked.max())
     settings = {"command": "plan", "start": first, "goal": last, "bump_cost": bump_cost, "max_risk": max_risk}
-    alternatives = [
-        {"length_metres": other.length, "open_probability": other.open_probability} for other in path.alternatives
-    ]
-    of_path = {
-        "max_probability_blocked": likeliest,
+    add_to_summary(folder, out, "plan", {**settings, **_summary(path)})
+    picture.result()
+    _print_path(path, "in maps from the posterior" if learned.samples is not None else "if cells were independent")
+    _print_doubts(path, max_risk)
+    print_lines(f"path in {out}")
+
+
+def _summary(path: "PlannedPath") -> dict[str, Any]:
+    """Return what summary.json says of a path."""
+    return {
+        "moves": len(path.states) - 1,
+        "length_metres": path.length,
+        "max_probability_blocked": float(path.blocked.max()),
         "open_probability": path.open_probability,
         "goal_probability_blocked": path.goal_blocked,
         "expected_length_metres": path.expected_length,
-        "alternatives": alternatives,
+        "alternatives": [
+            {"length_metres": other.length, "open_probability": other.open_probability} for other in path.alternatives
+        ],
     }
-    summary = {**settings, "moves": moves, "length_metres": path.length, **of_path}
-    add_to_summary(folder, out, "plan", summary)
-    picture.result()
+
+
+def _print_path(path: "PlannedPath", joint: str) -> None:
+    """Print the length and the risk of a path and its alternatives; `joint` says where its cells are open together."""
+    from sidestep.cli.display import print_lines
+
+    moves, likeliest = len(path.states) - 1, float(path.blocked.max())
     print_lines(f"{moves} moves, {path.length:g} m; the likeliest obstacle on the way has P(blocked) = {likeliest:.3f}")
-    joint = "in maps from the posterior" if learned.samples is not None else "if cells were independent"
     print_lines(f"open with probability {path.open_probability:.3f} {joint}, given that start and goal are free")
     if path.expected_length is not None:
         print_lines(f"expected length with bumps and detours: {path.expected_length:.4g} m")
     for other in path.alternatives:
         print_lines(f"alternative: {other.length:g} m, open with probability {other.open_probability:.3f}")
+
+
+def _print_doubts(path: "PlannedPath", max_risk: float | None) -> None:
+    """Print a note of a goal that may be blocked, and a warning of a risk above the one that is allowed."""
+    from sidestep.cli.display import print_notes
+
     if path.goal_blocked > (_DOUBTFUL if max_risk is None else max_risk):
         print_notes(
             f"note: the goal itself is blocked with probability {path.goal_blocked:.2g}; this is not counted above"
@@ -74,4 +95,3 @@ def plan(
     if max_risk is not None and not path.within(max_risk):
         risk = 1 - path.open_probability
         print_notes(f"warning: no path has a risk of at most {max_risk:g}; this one has the least, {risk:.2g}")
-    print_lines(f"path in {out}")

@@ -24,7 +24,7 @@ _STEPS = 16
 _FIRST = 4
 """The steps before those of which a mean counts: they are biased by where they start."""
 _FARTHER = 3.0
-"""By how many times its noise the distance may grow with a step that is not taken back."""
+"""By how many standard deviations the squared distance may grow with a step that is not taken back."""
 _VERIFICATIONS = 2
 """The most verifications of a mean; steps go on from the first that fails."""
 _NEAR = 0.25
@@ -52,7 +52,8 @@ def refine(first: Visit, visit: Visitor, schedule: Schedule) -> Visit:
         schedule: It has the tolerances.
 
     References:
-        Polyak and Juditsky, "Acceleration of stochastic approximation by averaging" (1992).
+        Polyak and Juditsky, "Acceleration of stochastic approximation by averaging" (1992); James and Stein,
+        "Estimation with quadratic loss" (1961).
     """
     visits, length, verified = [first], 1.0, 0
     for _ in range(_STEPS):
@@ -65,7 +66,7 @@ def refine(first: Visit, visit: Visitor, schedule: Schedule) -> Visit:
         current = visits[-1]
         if _noise_hides_steps(current.verification, schedule):
             return current
-        step = length * current.verification.step
+        step = length * _signal(current.verification) * current.verification.step
         after = visit(current.flat + step, current.planner_state, schedule.step_noise)
         if _leads_away(after.verification, current.verification):
             length /= 2
@@ -100,6 +101,14 @@ def _noise_hides_steps(last: Verification, schedule: Schedule) -> bool:
     return bool(last.noise > np.sqrt(_STEPS) * schedule.noise_tolerance and last.distance <= last.noise)
 
 
+def _signal(last: Verification) -> float:
+    """Return the part of a step that is not noise, by James and Stein; 1 for up to two parameters."""
+    squares = last.distance**2 + last.noise**2
+    return 1.0 if squares == 0 else 1 - max(0.0, 1 - 2 / len(last.step)) * last.noise**2 / squares
+
+
 def _leads_away(after: Verification, before: Verification) -> bool:
-    """Return whether a step leads away from the maximum, by much more than the noise of both distances."""
-    return bool(after.distance > before.distance + _FARTHER * np.hypot(after.noise, before.noise))
+    """Return whether a step leads away from the maximum, by much more than the noise of the step and of the distance."""
+    parameters = len(after.step)
+    noise = after.noise**2 * np.sqrt(2 / parameters) + 2 * after.distance * after.noise / np.sqrt(parameters)
+    return bool(after.distance**2 > before.distance**2 + before.noise**2 + _FARTHER * noise)

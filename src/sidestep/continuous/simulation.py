@@ -81,10 +81,11 @@ def simulate_trajectories(
         if not solution.converged:
             raise NotConverged(f"values did not converge for task {index}: a finer lattice or a smaller β may help")
         parts = _simulate(agent, real, task, solution.values, to_jax(own), jax.random.fold_in(key, index), moves)
-        for states, choices, acting in zip(*map(np.asarray, parts), strict=True):
+        goes_on = parts[2][:, -1] & ~jax.vmap(task.terminal)(parts[0][:, -1])
+        for states, choices, acting, stopped in zip(*map(np.asarray, (*parts, goes_on)), strict=True):
             length = int(acting.sum())
             if length:
-                trajectories.append(Trajectory(states[: length + 1], choices[:length], index))
+                trajectories.append(Trajectory(states[: length + 1], choices[:length], index, bool(stopped)))
     return trajectories
 
 
@@ -112,12 +113,15 @@ def gather_trajectories(trajectories: Sequence[Trajectory], tasks: Sequence[Cont
     check_tasks(batched)
     trajectories = to_list(trajectories, Trajectory, "trajectories")
     checked = [_checked(trajectory, trajectories[0], len(tasks), row) for row, trajectory in enumerate(trajectories, 1)]
-    states, actions, task = zip(*checked, strict=True)
+    states, actions, *of_each = zip(*checked, strict=True)
     parts = [each[:-1] for each in states], actions, [each[1:] for each in states]
     moves = (to_jax(np.concatenate(part)) for part in parts)
     lengths = [len(each) for each in actions]
-    which, trajectory = (np.repeat(each, lengths).astype(np.int32) for each in (task, np.arange(len(lengths))))
-    demonstrations = Demonstrations(*moves, *map(to_jax, (which, trajectory)), tasks=batched)
+    task, truncated, trajectory = (
+        np.repeat(each, lengths) for each in (*of_each, np.arange(len(lengths), dtype=np.int32))
+    )
+    numbers = to_jax(task.astype(np.int32)), to_jax(trajectory)
+    demonstrations = Demonstrations(*moves, *numbers, tasks=batched, truncated=to_jax(truncated))
     ended = np.asarray(has_ended(batched, demonstrations.task, demonstrations.states))
     row = int(trajectory[ended.argmax()]) + 1
     state = demonstrations.states[int(ended.argmax())]
@@ -126,11 +130,12 @@ def gather_trajectories(trajectories: Sequence[Trajectory], tasks: Sequence[Cont
     return demonstrations
 
 
-def _checked(trajectory: Trajectory, first: Trajectory, tasks: int, row: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return the states, the actions and the task of a trajectory; refuse one with other shapes than the first."""
+def _checked(trajectory: Trajectory, first: Trajectory, tasks: int, row: int) -> Trajectory:
+    """Return a trajectory with arrays and numbers; refuse one with other shapes than the first."""
     try:
         states, actions = (_numbers(trajectory, name) for name in ("states", "actions"))
         task = to_count(trajectory.task, "task", 0, tasks - 1)
+        check_instance(trajectory.truncated, (bool, np.bool_), "truncated")
     except InputError as error:
         raise InputError(error.message, source="trajectory", row=row, field=error.field) from error
     shape, action = np.shape(first.states)[1:], np.shape(first.actions)[1:]
@@ -140,7 +145,7 @@ def _checked(trajectory: Trajectory, first: Trajectory, tasks: int, row: int) ->
     expect(
         actions.shape[1:] == action, f"expected actions of shape {action}, found {actions.shape[1:]}", field="actions"
     )
-    return states, actions, task
+    return Trajectory(states, actions, task, bool(trajectory.truncated))
 
 
 def _numbers(trajectory: Trajectory, name: str) -> np.ndarray:

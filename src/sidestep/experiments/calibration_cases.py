@@ -160,9 +160,9 @@ def simulate_walks(config: CalibrationConfig, closed: Closed, seed: int) -> ss.D
         starts = np.resize(config.places[config.places != goal], len(range(index, config.walks, 2)))
         made = ss.plan(world, tasks[index], behavior)
         walks = ss.roll_out(keys[index], world, made.policy, made.terminal, to_jax(starts, np.int32), config.moves)
-        for states, actions in zip(np.asarray(walks.states), np.asarray(walks.actions), strict=True):
+        for states, actions, arrived in zip(*map(np.asarray, walks), strict=True):
             taken = int((actions >= 0).sum())
-            trajectories.append(ss.Trajectory(states[: taken + 1], actions[:taken], index))
+            trajectories.append(ss.Trajectory(states[: taken + 1], actions[:taken], index, not arrived))
     return ss.gather(trajectories, tasks)
 
 

@@ -30,7 +30,9 @@ class World(NamedTuple):
     """The barriers of a model, and what depends on which, as native code reads them.
 
     Attributes:
-        successors, attempts, needed: As in `Barriers`.
+        successors: As in `Barriers`, but the state itself for attempts that cannot succeed, so that no value of −∞ is
+            multiplied by 0.
+        attempts, needed: As in `Barriers`.
         passing: o(i) of a barrier that is open, and of one that is closed.
         gated: The states with an action that needs barrier i are `gated[gated_begin[i] : gated_begin[i + 1]]`.
         before: The states with an action that may lead to s are `before[before_begin[s] : before_begin[s + 1]]`.
@@ -83,7 +85,9 @@ class Chain(NamedTuple):
         closed: z, whether each barrier is closed (0 or 1).
         passing: The probability that each barrier lets an agent pass: o(i), or its mean in a mean field.
         probs: The probability of each attempt's success.
-        values: V of each task.
+        values: V of each task; −∞ in states from which it cannot end. An action that may lead there is worth −∞ and is
+            never taken. Which states these are depends on known barriers only: a closed one that is not known lets
+            agents pass, if rarely.
         row_log_likelihood: The log-likelihood of the choices in each row.
         totals: The log-likelihood of all choices and of all transitions.
     """
@@ -188,11 +192,11 @@ def chain_kernels(actions: int, width: int) -> ChainKernels:
     """Return the native code for worlds with a number of actions, and of attempts at each."""
 
     @part(fastmath=_FAST)
-    def fill(task, s, world, evidence, chain, neg_inf, scratch):  # pragma: no cover
+    def fill(task, s, world, evidence, chain, scratch):  # pragma: no cover
         """Fill in c(a) and l(a) of a state (see `base`); return its repeat-action value."""
         discount = evidence.discount[task]
         row = s if evidence.reward.shape[1] > 1 else 0
-        repeat_value = neg_inf
+        repeat_value = -np.inf
         for a in range(actions):
             exit_value = evidence.reward[task, row, a if evidence.reward.shape[2] > 1 else 0]
             weight = 1 - discount
@@ -209,11 +213,10 @@ def chain_kernels(actions: int, width: int) -> ChainKernels:
         return repeat_value
 
     @part(fastmath=_FAST)
-    def settle(task, count, world, evidence, chain, work, kind, tie, neg_inf, scratch):  # pragma: no cover
+    def settle(task, count, world, evidence, chain, work, kind, tie, scratch):  # pragma: no cover
         """Solve the states in the active list, and those that depend on what changes, until nothing does."""
         beta, tolerance = evidence.beta[task], evidence.tolerance[task]
         backup = NativeBackup(kind, beta, tie)
-        reachable_above = -np.sqrt(-neg_inf)
         states, head = chain.values.shape[1], 0
         while count > 0:
             s = np.int64(work.queue[head])
@@ -222,17 +225,17 @@ def chain_kernels(actions: int, width: int) -> ChainKernels:
             work.queued[s] = False
             work.counters[BACKUPS] += 1
             old = chain.values[task, s]
-            repeat_value = fill(task, s, world, evidence, chain, neg_inf, scratch)
-            value = neg_inf
-            if repeat_value > reachable_above:
-                guess = old if old > reachable_above else repeat_value
+            repeat_value = fill(task, s, world, evidence, chain, scratch)
+            value = -np.inf
+            if repeat_value > -np.inf:
+                guess = old if old > -np.inf else repeat_value
                 value = _own_root(actions, backup, evidence.choosable[s], guess, repeat_value, scratch)
             if work.logged[task, s] != work.counters[PROPOSAL]:
                 at = work.counters[LOGGED]
                 work.log_task[at], work.log_state[at], work.log_value[at] = task, s, old
                 work.logged[task, s] = work.counters[PROPOSAL]
                 work.counters[LOGGED] += 1
-            if abs(value - old) > tolerance:
+            if value != old and abs(value - old) > tolerance:
                 chain.values[task, s] = value
                 for at in range(world.before_begin[s], world.before_begin[s + 1]):
                     j = world.before[at]
@@ -243,11 +246,21 @@ def chain_kernels(actions: int, width: int) -> ChainKernels:
                         count += 1
 
     @part(fastmath=_FAST)
-    def choices_in(task, s, world, evidence, chain, neg_inf, scratch):  # pragma: no cover
-        """Return the log-likelihood of the choices in a state for a task."""
-        fill(task, s, world, evidence, chain, neg_inf, scratch)
-        for a in range(actions):
-            scratch.advantages[a] = scratch.exit_values[a] - scratch.exit_weights[a] * chain.values[task, s]
+    def choices_in(task, s, world, evidence, chain, scratch):  # pragma: no cover
+        """Return the log-likelihood of the choices in a state for a task.
+
+        Where the task cannot end from, all available actions are as good.
+        """
+        value = chain.values[task, s]
+        if value > -np.inf:
+            fill(task, s, world, evidence, chain, scratch)
+            for a in range(actions):
+                scratch.advantages[a] = scratch.exit_values[a] - scratch.exit_weights[a] * value
+        else:
+            row = s if evidence.reward.shape[1] > 1 else 0
+            for a in range(actions):
+                reward = evidence.reward[task, row, a if evidence.reward.shape[2] > 1 else 0]
+                scratch.advantages[a] = 0.0 if reward > -np.inf else -np.inf
         counts = evidence.choices[evidence.choice_row[task, s]]
         rules = evidence.choosable[s], evidence.lapse[task], evidence.beta[task]
         return _choice_log_likelihood(actions, *rules, counts, scratch.advantages)
@@ -265,7 +278,7 @@ def chain_kernels(actions: int, width: int) -> ChainKernels:
                 chain.probs[s, a, k] = success
 
     @compiled()
-    def refresh(world, evidence, chain, work, kind, tie, neg_inf):  # pragma: no cover
+    def refresh(world, evidence, chain, work, kind, tie):  # pragma: no cover
         """Compute the probabilities, values and log-likelihoods of a chain from its barriers and values nearby."""
         scratch = Scratch(np.empty(actions), np.empty(actions), np.empty(actions))
         tasks, states = chain.values.shape
@@ -283,11 +296,11 @@ def chain_kernels(actions: int, width: int) -> ChainKernels:
                     work.queue[count] = s
                     work.queued[s] = True
                     count += 1
-            settle(task, np.int64(count), world, evidence, chain, work, kind, tie, neg_inf, scratch)
+            settle(task, np.int64(count), world, evidence, chain, work, kind, tie, scratch)
             for s in range(states):
                 row = evidence.choice_row[task, s]
                 if row >= 0:
-                    chain.row_log_likelihood[row] = choices_in(task, s, world, evidence, chain, neg_inf, scratch)
+                    chain.row_log_likelihood[row] = choices_in(task, s, world, evidence, chain, scratch)
                     chain.totals[0] += chain.row_log_likelihood[row]
 
     @part(fastmath=_FAST)
@@ -311,7 +324,7 @@ def chain_kernels(actions: int, width: int) -> ChainKernels:
         return change
 
     @part(fastmath=_FAST)
-    def change_choices(task, world, evidence, chain, work, kind, tie, neg_inf, scratch):  # pragma: no cover
+    def change_choices(task, world, evidence, chain, work, kind, tie, scratch):  # pragma: no cover
         """Solve a task after a change of transitions; return the change of the choices' log-likelihood."""
         first, count = work.counters[LOGGED], 0
         for n in range(work.counters[SOURCES]):
@@ -320,7 +333,7 @@ def chain_kernels(actions: int, width: int) -> ChainKernels:
                 work.queue[count] = s
                 work.queued[s] = True
                 count += 1
-        settle(task, np.int64(count), world, evidence, chain, work, kind, tie, neg_inf, scratch)
+        settle(task, np.int64(count), world, evidence, chain, work, kind, tie, scratch)
         change = 0.0
         for at in range(first, work.counters[LOGGED]):
             s = work.log_state[at]
@@ -329,12 +342,12 @@ def chain_kernels(actions: int, width: int) -> ChainKernels:
                 place, old = work.counters[LOGGED_ROWS], chain.row_log_likelihood[row]
                 work.log_row[place], work.log_row_value[place] = row, old
                 work.counters[LOGGED_ROWS] += 1
-                chain.row_log_likelihood[row] = choices_in(task, s, world, evidence, chain, neg_inf, scratch)
+                chain.row_log_likelihood[row] = choices_in(task, s, world, evidence, chain, scratch)
                 change += chain.row_log_likelihood[row] - old
         return change
 
     @part(fastmath=_FAST)
-    def change(count, world, evidence, chain, work, kind, tie, neg_inf, scratch):  # pragma: no cover
+    def change(count, world, evidence, chain, work, kind, tie, scratch):  # pragma: no cover
         """Follow the change of `count` barriers; return how the log-likelihoods of choices and transitions change."""
         work.counters[PROPOSAL] += 1
         work.counters[LOGGED] = 0
@@ -342,7 +355,7 @@ def chain_kernels(actions: int, width: int) -> ChainKernels:
         of_transitions = change_transitions(count, world, evidence, chain, work)
         of_choices = 0.0
         for task in range(chain.values.shape[0]):
-            of_choices += change_choices(task, world, evidence, chain, work, kind, tie, neg_inf, scratch)
+            of_choices += change_choices(task, world, evidence, chain, work, kind, tie, scratch)
         return of_choices, of_transitions
 
     @part()
@@ -357,7 +370,7 @@ def chain_kernels(actions: int, width: int) -> ChainKernels:
 
     @compiled()
     def sweep(
-        rng, proposals, heat, free, is_free, world, evidence, prior, kinds, chain, work, kind, tie, neg_inf
+        rng, proposals, heat, free, is_free, world, evidence, prior, kinds, chain, work, kind, tie
     ):  # pragma: no cover
         """Make proposals and accept or reject each; return the number that were accepted."""
         scratch = Scratch(np.empty(actions), np.empty(actions), np.empty(actions))
@@ -377,7 +390,7 @@ def chain_kernels(actions: int, width: int) -> ChainKernels:
             for n in range(count):
                 i = work.changed[n]
                 chain.passing[i] = world.passing[i, chain.closed[i]]
-            of_choices, of_transitions = change(count, world, evidence, chain, work, kind, tie, neg_inf, scratch)
+            of_choices, of_transitions = change(count, world, evidence, chain, work, kind, tie, scratch)
             if of_transitions + of_choices >= threshold:
                 chain.totals[0] += of_choices
                 chain.totals[1] += of_transitions
@@ -391,7 +404,7 @@ def chain_kernels(actions: int, width: int) -> ChainKernels:
         return accepted
 
     @compiled()
-    def ascend(order, step, world, evidence, prior, means, chain, work, kind, tie, neg_inf):  # pragma: no cover
+    def ascend(order, step, world, evidence, prior, means, chain, work, kind, tie):  # pragma: no cover
         """Move P(closed) of each barrier towards that which the others at their means imply; return the largest gap."""
         scratch = Scratch(np.empty(actions), np.empty(actions), np.empty(actions))
         largest = 0.0
@@ -401,7 +414,7 @@ def chain_kernels(actions: int, width: int) -> ChainKernels:
             work.changed[0] = i
             for closed in range(2):
                 chain.passing[i] = world.passing[i, closed]
-                of_choices, of_transitions = change(1, world, evidence, chain, work, kind, tie, neg_inf, scratch)
+                of_choices, of_transitions = change(1, world, evidence, chain, work, kind, tie, scratch)
                 gain += (2 * closed - 1) * (of_choices + of_transitions)
                 chain.passing[i] = old_passing
                 undo(world, chain, work)
@@ -409,7 +422,7 @@ def chain_kernels(actions: int, width: int) -> ChainKernels:
             largest = max(largest, abs(implied - old))
             means[i] = old + step * (implied - old)
             chain.passing[i] = (1 - means[i]) * world.passing[i, 0] + means[i] * world.passing[i, 1]
-            of_choices, of_transitions = change(1, world, evidence, chain, work, kind, tie, neg_inf, scratch)
+            of_choices, of_transitions = change(1, world, evidence, chain, work, kind, tie, scratch)
             chain.totals[0] += of_choices
             chain.totals[1] += of_transitions
         return largest

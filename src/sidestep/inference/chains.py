@@ -4,6 +4,7 @@
 sweep, by the solver of `sidestep.tabular.solvers.values`, and followed by local value iteration from then on.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -30,16 +31,12 @@ from sidestep.tabular.solvers.bounds import MoveCosts
 from sidestep.tabular.solvers.gauss_seidel import KERNELS
 from sidestep.tabular.solvers.native import HostProcess, NativeBackup, NativeEquation
 from sidestep.tabular.solvers.values import solve_values
+from sidestep.tabular.tasks import Task
 
 PASSING = (0.997, 0.003)
 """The probability that an open barrier, and a closed one, lets an agent pass."""
 _FRESH_SWEEPS = 10
 """The number of sweeps after which all states are solved again, from the values at hand."""
-NEG_INF = -1e200
-"""The value of states from which a task cannot end.
-
-As barriers open and close these values return to finite ones; closed barriers pass rarely, so no finite value is near.
-"""
 _TOLERANCE = 7e-4
 """The change of β V that is passed on (nats)."""
 _FINER = 0.01
@@ -164,7 +161,7 @@ class BarrierProblem:
         Raises:
             NotConverged: Where values do not converge.
         """
-        successors, probabilities = _outcomes(self.barriers, self.world, chain.passing)
+        successors, probabilities = _outcomes(self.barriers, chain.passing)
         kind, tie = self.backup
         for task, values in enumerate(chain.values):
             reward, discount = self.evidence.reward[task], np.float64(self.evidence.discount[task])
@@ -179,9 +176,13 @@ class BarrierProblem:
         Args:
             chain: The chain, changed in place.
             work: Its memory.
+
+        Raises:
+            InputError: For actions that no map gives a probability.
         """
         exact = self.evidence._replace(tolerance=_FINER * self.evidence.tolerance)
-        self.kernels.refresh(self.world, exact, chain, work, *self.backup, NEG_INF)
+        self.kernels.refresh(self.world, exact, chain, work, *self.backup)
+        check_possible(chain.totals)
 
     def sweep(self, state: ChainState, number: int, heat: float) -> None:
         """Make as many proposals as there are free barriers.
@@ -201,7 +202,7 @@ class BarrierProblem:
         terms = native_terms(self.prior.at(*density))
         arguments = (*free, self.world, self.evidence, terms, KINDS, state.chain, state.work)
         sweep = self.kernels.sweep
-        state.accepted[number] = sweep(state.random, len(self.free), heat, *arguments, *self.backup, NEG_INF)
+        state.accepted[number] = sweep(state.random, len(self.free), heat, *arguments, *self.backup)
         state.samples[number] = state.chain.closed
         state.log_likelihoods[number] = state.chain.totals
         state.log_priors[number] = self._log_priors(state)[place]
@@ -281,11 +282,33 @@ def barrier_problem(
     tasks = agents.tasks_of(demonstrations.tasks)
     message = "expected rewards R(s, a), found R(s, a, s′), which depends on the barriers"
     check(tasks.outcome_reward is None, message, field="tasks")
-    shape = barriers.successors.shape[:2]
-    mask, reward = np.broadcast_to(np.asarray(available), shape), np.array(tasks.reward, np.float64)
-    terminal, discount = np.array(tasks.terminal), np.array(tasks.discount, np.float64)
-    persons = [None] * len(terminal) if agents.person is None else np.asarray(agents.person).tolist()
+    persons = [None] * len(tasks.terminal) if agents.person is None else np.asarray(agents.person).tolist()
     behaviors = [agents.behavior_of(person) for person in persons]
+    backup = behaviors[0].backup
+    if type(backup) not in KERNELS:
+        raise InputError(f"expected one of {', '.join(kind.__name__ for kind in KERNELS)}", field="backup")
+    tie = backup.tie if isinstance(backup, HardMax) else 0.0
+    mask = np.broadcast_to(np.asarray(available), barriers.successors.shape[:2])
+    weight = tempering if "actions" in terms else 0.0
+    crossed = crossed_barriers(barriers, demonstrations, terms)
+    free = np.flatnonzero((barriers.known == Cell.UNKNOWN) & ~crossed).astype(np.int64)
+    hierarchical = as_hierarchical(prior)
+    return BarrierProblem(
+        barriers,
+        _world_of(barriers),
+        _evidence_of(barriers, demonstrations, tasks, behaviors, mask, weight, terms),
+        hierarchical,
+        evidence_normalizers(hierarchical, barriers.known, free, seed),
+        free,
+        (KERNELS[type(backup)], tie),
+        np.array(tasks.terminal),
+        np.array(tasks.terminal_reward, np.float64),
+        mask,
+    )
+
+
+def _world_of(barriers: Barriers) -> World:
+    """Return barriers with what depends on which."""
     passing = np.where(
         (barriers.known == Cell.UNKNOWN)[:, None], PASSING, np.where(barriers.known == Cell.FREE, 1.0, 0.0)[:, None]
     )
@@ -295,19 +318,31 @@ def barrier_problem(
     gated_begin, gated = _grouped(needed[needed != NO_BARRIER], state, len(barriers.known))
     leads = (barriers.attempts > 0) & (barriers.successors != states[:, None, None])
     before_begin, before = _grouped(barriers.successors[leads], np.nonzero(leads)[0], len(states))
-    world = World(
-        barriers.successors.astype(np.int32), barriers.attempts, needed.astype(np.int32), passing,
+    successors = np.where(_possible(barriers), barriers.successors, states[:, None, None])
+    return World(
+        successors.astype(np.int32), barriers.attempts, needed.astype(np.int32), passing,
         gated_begin, gated, before_begin, before,
     )  # fmt: skip
+
+
+def _evidence_of(
+    barriers: Barriers,
+    demonstrations: Demonstrations,
+    tasks: Task,
+    behaviors: Sequence[Behavior],
+    available: Bool[np.ndarray, "states actions"],
+    weight: float,
+    terms: Terms,
+) -> Evidence:
+    """Return the tasks, with the behavior of each, and the observed moves; `weight` is that of the actions."""
+    discount, reward = np.array(tasks.discount, np.float64), np.array(tasks.reward, np.float64)
     moved, stayed = _transitions(barriers, demonstrations, terms)
-    crossed = crossed_barriers(barriers, demonstrations, terms)
     choice_row, choices = _choices(demonstrations, barriers.successors.shape[1])
-    weight = tempering if "actions" in terms else 0.0
     beta = np.array([float(each.beta) for each in behaviors])
-    evidence = Evidence(
-        reward=reward if mask.all() else np.where(mask, reward, -np.inf),
-        choosable=mask.sum(axis=1),
-        solved=_solvable(barriers, terminal, discount),
+    return Evidence(
+        reward=reward if available.all() else np.where(available, reward, -np.inf),
+        choosable=available.sum(axis=1),
+        solved=_solvable(barriers, np.array(tasks.terminal), discount),
         discount=discount,
         beta=beta,
         lapse=np.array([0.0 if each.lapse is None else float(each.lapse) for each in behaviors]),
@@ -318,16 +353,16 @@ def barrier_problem(
         stayed=stayed,
         has_transitions=np.asarray(moved.any(axis=(1, 2)) | stayed.any(axis=1)),
     )
-    backup = behaviors[0].backup
-    if type(backup) not in KERNELS:
-        raise InputError(f"expected one of {', '.join(kind.__name__ for kind in KERNELS)}", field="backup")
-    tie = backup.tie if isinstance(backup, HardMax) else 0.0
-    free = np.flatnonzero((barriers.known == Cell.UNKNOWN) & ~crossed).astype(np.int64)
-    rewards = np.array(tasks.terminal_reward, np.float64)
-    hierarchical = as_hierarchical(prior)
-    normalizers = evidence_normalizers(hierarchical, barriers.known, free, seed)
-    native = KERNELS[type(backup)], tie
-    return BarrierProblem(barriers, world, evidence, hierarchical, normalizers, free, native, terminal, rewards, mask)
+
+
+def check_possible(log_likelihoods: Float[np.ndarray, "..."]) -> None:
+    """Raise `InputError` for demonstrations that have the probability 0 whatever barriers are closed.
+
+    Args:
+        log_likelihoods: Of one map or more.
+    """
+    message = "expected actions after which the task can end (or agents with a lapse), found one after which it cannot"
+    check(not np.isneginf(log_likelihoods).any(), message, field="demonstrations")
 
 
 def check_prior(barriers: Barriers, prior: BinaryMRF | HierarchicalMRF) -> None:
@@ -347,11 +382,11 @@ def check_prior(barriers: Barriers, prior: BinaryMRF | HierarchicalMRF) -> None:
     check(prior.shape is None or prior.shape == barriers.shape, message, field="prior")
 
 
-def _outcomes(barriers: Barriers, world: World, passing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _outcomes(barriers: Barriers, passing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return successors and probabilities with staying as the last outcome."""
     success = barriers.attempts * np.append(passing, 1.0)[barriers.needed].prod(axis=-1)
     stay = np.broadcast_to(np.arange(len(success))[:, None, None], (*success.shape[:2], 1))
-    successors = np.concatenate([world.successors, stay], axis=-1).astype(np.int32)
+    successors = np.concatenate([barriers.successors, stay], axis=-1).astype(np.int32)
     return successors, np.concatenate([success, 1 - success.sum(axis=-1, keepdims=True)], axis=-1)
 
 
@@ -371,7 +406,7 @@ def _solved(equation: NativeEquation) -> Float[np.ndarray, " states"]:
     solve_values(_MAX_SWEEPS, result, equation, bound, costs, WarmStart(*start), everywhere)
     if not result.converged:
         raise NotConverged(f"the values of a task did not converge in {_MAX_SWEEPS} sweeps")
-    return np.where(np.isneginf(arrays[0]), NEG_INF, arrays[0])
+    return arrays[0]
 
 
 def _grouped(keys: np.ndarray, items: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:

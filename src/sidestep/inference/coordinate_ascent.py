@@ -37,7 +37,7 @@ from sidestep._arguments import to_key
 from sidestep._repr import short_repr
 from sidestep.errors import check, check_count, check_function, check_instance
 from sidestep.inference.chain_kernels import Chain, Workspace
-from sidestep.inference.chains import NEG_INF, BarrierProblem, problem_of
+from sidestep.inference.chains import BarrierProblem, problem_of
 from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
 from sidestep.inference.fit import Estimate
 from sidestep.inference.maximize import Status
@@ -341,7 +341,7 @@ def _sweep(problem: BarrierProblem, prior: BinaryMRF, state: _State, number: int
         problem.refresh(state.chain, state.work)
     arguments = problem.world, problem.evidence, native_terms(prior), state.means, state.chain, state.work
     ascend, order = problem.kernels.ascend, _order(problem.free, number)
-    gap = ascend(order, _step(number), *arguments, *problem.backup, NEG_INF)
+    gap = ascend(order, _step(number), *arguments, *problem.backup)
     problem.refresh(state.chain, state.work)
     return gap, *state.chain.totals.tolist(), _mean_log_density(prior, state.means)
 

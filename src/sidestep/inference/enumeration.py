@@ -1,6 +1,5 @@
 """The exact posterior of few barriers, by the likelihood of every map: the standard that samplers are compared with."""
 
-from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,13 +9,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sidestep._repr import short_repr
-from sidestep.errors import NotConverged, check, check_instance, to_count
+from sidestep.errors import NotConverged, check, to_count
 from sidestep.inference.arguments import check_evidence
-from sidestep.inference.chains import PASSING, check_prior, crossed_barriers
+from sidestep.inference.chains import PASSING, check_possible, check_prior, crossed_barriers
 from sidestep.inference.hierarchical import HierarchicalMRF, as_hierarchical, evidence_normalizers
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior
+from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Cell
 from sidestep.tabular.likelihood import (
@@ -31,6 +31,7 @@ from sidestep.tabular.likelihood import (
 )
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.models.barriers import barriers_of
+from sidestep.tabular.proper import check_proper
 from sidestep.tabular.solve import SolveOptions, default_solver
 from sidestep.tabular.tasks import Task
 
@@ -56,7 +57,7 @@ class ExactPosterior(NamedTuple):
 def enumerate_barriers(
     model: TransitionModel,
     demonstrations: Demonstrations,
-    behavior: Behavior,
+    behavior: Behavior | BehaviorModel,
     prior: BinaryMRF | HierarchicalMRF,
     *,
     tempering: float = 1.0,
@@ -68,7 +69,7 @@ def enumerate_barriers(
     Args:
         model: The transition model; see `barriers_of`.
         demonstrations: The moves and tasks.
-        behavior: The behavior of the agents.
+        behavior: The behavior of the agents, or a fitted `BehaviorModel`; it stays as it is.
         prior: The prior of the barriers; the density and strength of a `HierarchicalMRF` are summed over.
         tempering: κ, the weight of the actions' log-likelihood.
         terms: The parts of the likelihood that count.
@@ -78,7 +79,9 @@ def enumerate_barriers(
         P(closed) of each barrier, and the evidence.
 
     Raises:
-        InputError: For more than 16 barriers that are unknown and that no walk crossed, and a prior of others.
+        InputError: For more than 16 barriers that are unknown and that no walk crossed, a prior of others, and actions
+            that no map gives a probability.
+        ImproperTask: For tasks without finite values.
         NotConverged: Where the values of a map do not converge, as those of Boltzmann averages at a small β may not.
 
     Example:
@@ -91,10 +94,11 @@ def enumerate_barriers(
         [0.0, 0.0, 0.5]
     """
     check_evidence(model, demonstrations, behavior, tempering, ALL_TERMS if terms == () else terms)
-    check_instance(behavior, Behavior, "behavior")
-    barriers = barriers_of(model)
-    check_prior(barriers, prior)
     to_count(seed, "seed", 0)
+    agents, barriers = as_behavior_model(behavior), barriers_of(model)
+    check_prior(barriers, prior)
+    tasks = agents.tasks_of(demonstrations.tasks)
+    check_proper(tasks, agents.behavior_of(), model.graph)
     crossed = crossed_barriers(barriers, demonstrations, terms)
     free = np.flatnonzero((barriers.known == Cell.UNKNOWN) & ~crossed)
     message = f"expected at most {MAX_BARRIERS} unknown barriers to enumerate, found {len(free)}"
@@ -104,13 +108,14 @@ def enumerate_barriers(
     maps[:, barriers.known == Cell.OCCUPIED] = 1
     choices = choices_of(demonstrations) if "actions" in terms else None
     arrivals = arrivals_of(demonstrations) if "transitions" in terms else None
-    evidence = demonstrations.tasks, choices, arrivals, behavior
+    evidence = tasks, choices, arrivals, agents
     # whole batches, so that one compiled function serves any number of maps
     batches = np.resize(maps, (-(-len(maps) // _BATCH), _BATCH, maps.shape[1]))
     parts = np.concatenate([_log_likelihoods(model, to_jax(batch), *evidence) for batch in batches])[: len(maps)]
     if np.isnan(parts).any():
         missing = int(np.isnan(parts).any(axis=1).sum())
         raise NotConverged(f"expected values in each of {len(maps)} maps; in {missing} of them they did not converge")
+    check_possible(parts)
     hierarchical = as_hierarchical(prior)
     log_normalizers = evidence_normalizers(hierarchical, barriers.known, free, seed)
     densities = hierarchical.log_densities(maps) - log_normalizers
@@ -128,10 +133,11 @@ def _log_likelihoods(
     tasks: Task,
     choices: Choices | None,
     arrivals: Arrivals | None,
-    behavior: Behavior,
+    agents: BehaviorModel,
 ) -> Float[Array, "maps 2"]:
     """Return the log-likelihoods of actions and transitions in each map; 0 for what does not count."""
     dtype, states = jax.eval_shape(model.probabilities).dtype, model.graph.states
+    behavior, betas = agents.behavior_of(), agents.betas(len(tasks.terminal))
     # the solver of large problems: `Jacobi` sweeps over all maps until the slowest one has converged
     solver = default_solver(behavior.backup, states * len(maps))
     start, options = solver.cold_start(states, dtype), SolveOptions(solver=solver)
@@ -141,8 +147,12 @@ def _log_likelihoods(
         parameters = model.parameters.at[: len(closed)].set(log_odds * (2.0 * closed - 1))
         actions, transitions, world = jnp.zeros((), dtype), jnp.zeros((), dtype), model.with_parameters(parameters)
         if choices is not None:
-            of_task = partial(choice_log_likelihood, world, behavior=behavior, start=start, options=options)
-            actions = jax.vmap(of_task)(tasks, choices)[0].sum()
+
+            def of_task(task: Task, own: Choices, beta: Array) -> Array:
+                agent = Behavior(behavior.backup, beta, behavior.lapse)
+                return choice_log_likelihood(world, task, own, agent, start, options=options)[0]
+
+            actions = jax.vmap(of_task)(tasks, choices, betas).sum()
         if arrivals is not None:
             transitions = arrival_log_likelihood(world, arrivals)
         return jnp.stack([actions, transitions])

@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Shaped
 
-from sidestep.errors import InputError, check, input_errors
-from sidestep.io.environments import TOLERANCE, Environment, check_distribution, model_of
+from sidestep._arguments import to_floats
+from sidestep.errors import InputError, check
+from sidestep.io.environments import Environment, model_of
+from sidestep.tabular.distributions import check_distributions
 from sidestep.tabular.tasks import Task, check_discount, task, with_outcome_reward
 
 Table = Shaped[ArrayLike, "..."] | Sequence[Any]
@@ -49,14 +51,12 @@ def from_dense(
     check_discount(discount)
     probabilities = _probabilities(P)
     states, actions, _ = probabilities.shape
-    rewards = _numbers(R, "R")
-    shapes = (states,), (states, actions), probabilities.shape
-    check(rewards.shape in shapes, f"expected one of the shapes {shapes}, found {rewards.shape}", field="R")
+    rewards = np.asarray(to_floats(R, "R", (states,), (states, actions), probabilities.shape), np.float64)
     ends = _booleans(terminal, np.zeros(states, bool), "terminal")
     can = _booleans(available, np.ones((states, actions), bool), "available")
     can = ends[:, None] | can & ~_marked(rewards, probabilities)
     acting = can & ~ends[:, None]
-    _check_rows(probabilities, acting)
+    check_distributions(probabilities, ("state", "action"), counts=acting)
     staying = np.broadcast_to(np.eye(states)[:, None], probabilities.shape)
     probabilities = np.where(acting[..., None], probabilities, staying)
     width = int((probabilities > 0).sum(axis=-1).max())
@@ -88,7 +88,7 @@ def _task(
 
 def _probabilities(P: Table) -> Float[np.ndarray, "states actions states"]:
     """Return P as an array; raise `InputError` for another shape."""
-    table = _numbers(P, "P")
+    table = np.asarray(to_floats(P, "P"), np.float64)
     message = f"expected P[s, a, s′] of shape (states, actions, states), found shape {table.shape}"
     check(table.ndim == 3 and table.size, message, field="P")
     first, second, third = table.shape
@@ -96,14 +96,6 @@ def _probabilities(P: Table) -> Float[np.ndarray, "states actions states"]:
     check(not turned, f"{message}; for P[a, s, s′] pass np.moveaxis(P, 0, 1), and of R likewise", field="P")
     check(first == third, message, field="P")
     return table
-
-
-def _numbers(table: Table, field: str) -> Float[np.ndarray, "..."]:
-    """Return a table as numbers."""
-    with input_errors("expected a table of numbers", TypeError, ValueError, source=None, field=field):
-        array = np.asarray(table)
-    check(array.dtype.kind in "biuf", f"expected numbers, found type {array.dtype}", field=field)
-    return array.astype(np.float64)
 
 
 def _booleans(table: Table | None, default: Bool[np.ndarray, "..."], field: str) -> Bool[np.ndarray, "..."]:
@@ -126,16 +118,6 @@ def _marked(
         return rewards == -np.inf
     marked, possible = rewards == -np.inf, probabilities > 0
     return (marked | ~possible).all(axis=-1) & marked.any(axis=-1)
-
-
-def _check_rows(
-    probabilities: Float[np.ndarray, "states actions states"], acting: Bool[np.ndarray, "states actions"]
-) -> None:
-    """Raise `InputError`, with state and action, for a row that counts and is no distribution."""
-    with np.errstate(invalid="ignore"):  # of ∞ − ∞
-        valid = (probabilities >= 0).all(axis=-1) & (np.abs(probabilities.sum(axis=-1) - 1) <= TOLERANCE)
-    for state, action in np.argwhere(acting & ~valid)[:1].tolist():
-        check_distribution(probabilities[state, action], state, action)
 
 
 def _check_finite(paid: Float[np.ndarray, "states actions *outcomes"]) -> None:

@@ -16,12 +16,10 @@ from jaxtyping import Bool, Float, Int
 
 from sidestep.errors import InputError, check
 from sidestep.tabular.arrays import to_jax
+from sidestep.tabular.distributions import check_distribution
 from sidestep.tabular.graph import graph
 from sidestep.tabular.models import TabularModel
 from sidestep.tabular.tasks import Task, task, with_outcome_reward
-
-TOLERANCE = 1e-5
-"""How far the probabilities of an action may be from a sum of 1; wide enough for tables in 32 bits."""
 
 
 class Environment(NamedTuple):
@@ -100,7 +98,8 @@ def environment_of(
         name = state + first[0]
         check(rows[state], "expected an action, found none, and no episode ends there", source=f"state {name}")
         for action, outcomes in rows[state].items():
-            check_distribution(np.array([each.probability for each in outcomes]), name, action + first[1])
+            source = f"state {name}, action {action + first[1]}"
+            check_distribution(np.array([each.probability for each in outcomes]), source=source)
             # padding repeats the first outcome, so that what is impossible pays nothing else than what is possible
             padded = [*outcomes, *[outcomes[0]._replace(probability=0.0)] * (width - len(outcomes))]
             place = state, action
@@ -128,21 +127,6 @@ def model_of(
     possible = probabilities > 0
     logits = to_jax(np.log(np.where(possible, probabilities, 1.0)), jnp.result_type(float))
     return TabularModel(graph(successors, available), logits, to_jax(possible))
-
-
-def check_distribution(probabilities: Float[np.ndarray, " outcomes"], state: object, action: object) -> None:
-    """Raise `InputError` unless the probabilities of an action are finite, not negative, and sum to 1.
-
-    Args:
-        probabilities: Of the outcomes of the action.
-        state: The state, for the message.
-        action: The action, for the message.
-    """
-    source = f"state {state}, action {action}"
-    wrong = probabilities[~(probabilities >= 0) | ~np.isfinite(probabilities)][:1]
-    check(not len(wrong), f"expected probabilities of at least 0, found {wrong}", source=source)
-    total = float(probabilities.sum())
-    check(abs(total - 1) <= TOLERANCE, f"expected probabilities that sum to 1, found a sum of {total:g}", source=source)
 
 
 def check_single(env: Any) -> None:

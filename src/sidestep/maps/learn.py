@@ -5,12 +5,13 @@ The command line, the comparison, the demo and the benchmarks call `learn_map`.
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from sidestep.errors import check, check_function, check_instance
 from sidestep.inference.coordinate_ascent import AscentProgress
@@ -169,21 +170,9 @@ def learn_map(
     walks = annotations.without_goals(sample_walks(walks, config))
     moves = grid_walks(walks, grid)
     resumed = resume and checkpoint is not None and Path(checkpoint).exists()
-    model = ObstacleGrid(grid, first_logits(sensor, grid.known, config.prior))
-    candidates, goals, names, person = annotations.goal_candidates, None, [], None
-    if candidates is not None:
-        message = "maps are not sampled where goals are unknown: expected mean_field, or none for the default"
-        check(config.posterior.method != "sample", message, field="posterior")
-        goals = fit_with_unknown_goals(model, grid, moves, candidates, walks.labels, config, sensor, callback)
-        fit, demonstrations = goals.fit.fit, demonstrations_of(goals.moves, grid, config)
-    else:
-        demonstrations = demonstrations_of(moves, grid, config)
-        if annotations.person_column is not None:
-            names, person_of_walk = persons_of(walks, moves, annotations.person_column)
-            demonstrations, person = split_by_person(demonstrations, person_of_walk)
-        behavior = behavior_model_of(config, person)
-        run: dict[str, Any] = {"callback": callback, "checkpoint": checkpoint, "resume": resume}
-        fit = infer_map(model, demonstrations, config, sensor=sensor, behavior=behavior, **run)
+    run: dict[str, Any] = {"callback": callback, "checkpoint": checkpoint, "resume": resume}
+    inferred = _infer(grid, walks, moves, config, sensor, annotations, run)
+    fit, demonstrations, names = inferred.fit, inferred.demonstrations, inferred.names
     nats = map_information(fit, config)
     learning = Learning(
         config=config,
@@ -191,20 +180,60 @@ def learn_map(
         demonstrations=demonstrations,
         data=_counts(grid, moves, demonstrations, sensor),
         persons={str(name): float(fit.behavior.behavior_of(index).beta) for index, name in enumerate(names)},
-        goals=goals,
+        goals=inferred.goals,
         sensor=sensor,
         notes=_notes(grid, demonstrations, config, resume and not resumed),
         resumed=resumed,
         seconds=round(time.monotonic() - started, 3),
         peak_memory_bytes=peak_memory(),
     )
-    blocked, samples = np.asarray(fit.model.blocked, dtype=np.float64), None
-    if isinstance(fit, BarrierPosterior):
-        samples = fit.thinned(_KEPT_SAMPLES).reshape(-1, *grid.shape)
+    return _learned_map(grid, learning, nats)
+
+
+class _Inferred(NamedTuple):
+    """A posterior of a map, the moves that counted, and the names of persons and the goals where these are learned."""
+
+    fit: MapPosterior
+    demonstrations: Demonstrations
+    names: Sequence[object]
+    goals: GoalPosterior | None
+
+
+def _infer(
+    grid: Grid,
+    walks: Walks,
+    moves: Moves,
+    config: MapConfig,
+    sensor: SensorMap | None,
+    annotations: WalkAnnotations,
+    run: dict[str, Any],
+) -> _Inferred:
+    """Return the posterior of a map; `run` has the callback, the checkpoint, and whether to resume from it."""
+    model = ObstacleGrid(grid, first_logits(sensor, grid.known, config.prior))
+    candidates = annotations.goal_candidates
+    if candidates is not None:
+        message = "maps are not sampled where goals are unknown: expected mean_field, or none for the default"
+        check(config.posterior.method != "sample", message, field="posterior")
+        goals = fit_with_unknown_goals(model, grid, moves, candidates, walks.labels, config, sensor, run["callback"])
+        return _Inferred(goals.fit.fit, demonstrations_of(goals.moves, grid, config), [], goals)
+    demonstrations, names, person = demonstrations_of(moves, grid, config), [], None
+    if annotations.person_column is not None:
+        names, person_of_walk = persons_of(walks, moves, annotations.person_column)
+        demonstrations, person = split_by_person(demonstrations, person_of_walk)
+    behavior = behavior_model_of(config, person)
+    return _Inferred(
+        infer_map(model, demonstrations, config, sensor=sensor, behavior=behavior, **run), demonstrations, names, None
+    )
+
+
+def _learned_map(grid: Grid, learning: Learning, nats: Float[np.ndarray, "rows columns"]) -> LearnedMap:
+    """Return the map of a posterior, with its samples where it has some, and what walks say of each cell in nats."""
+    fit, config = learning.fit, learning.config
+    samples = fit.thinned(_KEPT_SAMPLES).reshape(-1, *grid.shape) if isinstance(fit, BarrierPosterior) else None
     return LearnedMap(
         grid,
-        blocked,
-        demonstrations.visited_state_goals(),
+        np.asarray(fit.model.blocked, dtype=np.float64),
+        learning.demonstrations.visited_state_goals(),
         config.reward,
         learning,
         samples,

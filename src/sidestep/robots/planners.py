@@ -33,7 +33,7 @@ from sidestep.tabular.backups import HardMax
 from sidestep.tabular.graph import moves_into
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid
-from sidestep.tabular.planning import followed, plan
+from sidestep.tabular.planning import followed, plan, rounding_of
 from sidestep.tabular.tasks import Task
 
 Starts = Int[np.ndarray, " starts"]
@@ -171,6 +171,7 @@ class BeliefState(NamedTuple):
         discount: γ in (0, 1].
         goal: The goal state.
         tolerance: The relative difference within which values count as equal.
+        rounding: The error of an advantage as a part of what it is summed from.
     """
 
     success: Float[np.ndarray, "states actions"]
@@ -179,6 +180,7 @@ class BeliefState(NamedTuple):
     discount: float
     goal: int
     tolerance: float
+    rounding: float
 
 
 def replanning_lengths(
@@ -213,7 +215,7 @@ def _first_belief(model: ObstacleGrid, values: Float[Array, " states"], task: Ta
     on_map = moves_into(model.blank)[..., 0] < len(initial_values)
     success = np.where(on_map, np.asarray(model.probabilities(), dtype=np.float64)[..., 0], 0.0)
     reward = np.array(np.broadcast_to(task.reward, success.shape), dtype=np.float64)
-    return BeliefState(success, initial_values, reward, float(task.discount), goal, tolerance)
+    return BeliefState(success, initial_values, reward, float(task.discount), goal, tolerance, rounding_of(known.dtype))
 
 
 def policy_lengths(
@@ -230,7 +232,7 @@ def policy_lengths(
     Returns:
         Lengths in cell sides, failed moves included; infinite if the robot moves in a cycle or has no action left.
     """
-    belief = BeliefState(np.array(policy, dtype=np.float64), np.empty(0), np.empty((0, 0)), 1.0, goal, 0.0)
+    belief = BeliefState(np.array(policy, dtype=np.float64), np.empty(0), np.empty((0, 0)), 1.0, goal, 0.0, 0.0)
     return _executed_lengths(belief, environment, starts)
 
 

@@ -43,14 +43,19 @@ def _next_action(belief, required, state):  # pragma: no cover
     success = belief.success[state]
     if not len(belief.values):
         return np.argmax(success) if success.max() > 0 else -1
-    q = np.full(len(success), -np.inf)
+    # as in plans: by advantages, and what their rounding cannot tell apart is a tie
+    most, least = np.full(len(success), -np.inf), -np.inf
     value = belief.values[state]
     if value > -np.inf:
         for a in np.flatnonzero(success > 0):
-            gain = success[a] * (belief.values[required[state, a, 0]] - value)
-            q[a] = belief.reward[state, a] + belief.discount * (value + gain)
-    best = q.max()
-    return np.argmax(q >= best - belief.tolerance * abs(best)) if best > -np.inf else -1
+            after, reward, move = belief.values[required[state, a, 0]], belief.reward[state, a], success[a]
+            if after > -np.inf:
+                advantage = reward + belief.discount * move * (after - value) - (1 - belief.discount) * value
+                summed = abs(reward) + belief.discount * move * (abs(after) + abs(value))
+                error = belief.rounding * (summed + (1 - belief.discount) * abs(value))
+                most[a] = advantage + error
+                least = max(least, advantage - error)
+    return np.argmax(most >= least) if least > -np.inf else -1
 
 
 @part()

@@ -1,13 +1,18 @@
 """Checks that tasks, behavior and demonstrations are of a model's world; what JAX is tracing is not looked at."""
 
+from typing import Any
+
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 
 from sidestep.errors import InputError, check, check_instance
 from sidestep.tabular.arrays import is_traced
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.behavior_model import BehaviorModel
 from sidestep.tabular.demonstrations import Demonstrations
+from sidestep.tabular.distributions import check_distributions
 from sidestep.tabular.graph import Graph, check_states
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.tasks import Task
@@ -27,6 +32,10 @@ def check_model(model: TransitionModel) -> None:
             check(not missing.any(), f"expected numbers as parameters, found nan at {places}", field="model")
     if isinstance(model.graph, Graph) and not is_traced(model.graph.successors):
         check_states(np.asarray(model.graph.successors), model.graph.states, "successors")
+        for name in ("available", "lengths"):
+            _check_axes(
+                getattr(model.graph, name).shape, model.graph.successors.shape[:2], f"a table `{name}`", "graph"
+            )
 
 
 def check_persons(behavior: Behavior | BehaviorModel | None, tasks: int) -> None:
@@ -60,7 +69,9 @@ def check_behavior(behavior: Behavior | BehaviorModel, world: Graph) -> None:
 
 
 def check_task(task: Task, world: Graph, field: str = "task") -> None:
-    """Raise `InputError` unless a task, or a stack of tasks, is of the world of a graph and has discounts in (0, 1].
+    """Raise `InputError` unless a task, or a stack of tasks, is of the world of a graph, and its numbers are valid.
+
+    These are discounts in (0, 1] and finite rewards. Each state that is not terminal needs an available action.
 
     Args:
         task: One task or a stack.
@@ -72,18 +83,73 @@ def check_task(task: Task, world: Graph, field: str = "task") -> None:
     states = task.terminal.shape[-1]
     message = f"expected a task of the model's {world.states} states, found one of {states}"
     check(states == world.states, message, field=field)
-    own: list[tuple[str, tuple[int, ...], tuple[int, ...]]] = [
-        ("rewards", task.reward.shape[-2:], (world.states, world.actions))
-    ]
+    _check_axes(task.reward.shape[-2:], world.successors.shape[:2], "rewards", field)
+    _check_rewards(task.reward, ("state", "action"), field, "reward")
     if task.outcome_reward is not None:
-        own.append(("rewards of outcomes", task.outcome_reward.shape[-3:], world.successors.shape))
-    for what, axes, expected in own:
-        fits = all(axis in (1, size) for axis, size in zip(axes, expected, strict=True))
-        check(fits, f"expected {what} of shape {expected}, or 1 instead of an axis, found {axes}", field=field)
+        _check_axes(task.outcome_reward.shape[-3:], world.successors.shape, "rewards of outcomes", field)
+        _check_rewards(task.outcome_reward, ("state", "action", "outcome"), field, "outcome_reward")
+    if not is_traced(task.terminal, task.terminal_reward):
+        paid = np.where(np.asarray(task.terminal), np.asarray(task.terminal_reward), 0)
+        _check_rewards(paid, ("state",), field, "terminal_reward")
+    if not is_traced(task.terminal, world.available):
+        _check_actions(np.asarray(task.terminal), np.asarray(world.available), field)
     if not is_traced(task.discount):
         discounts = np.atleast_1d(np.asarray(task.discount))
         wrong = discounts[~((discounts > 0) & (discounts <= 1))][:1].tolist()
         check(not wrong, f"expected a discount above 0 and at most 1, found {wrong}", source=field, field="discount")
+
+
+def _check_axes(axes: tuple[int, ...], expected: tuple[int, ...], what: str, field: str) -> None:
+    """Raise `InputError` unless each axis has the size expected, or 1."""
+    fits = len(axes) == len(expected) and all(axis in (1, size) for axis, size in zip(axes, expected, strict=True))
+    check(fits, f"expected {what} of shape {expected}, or 1 instead of an axis, found {axes}", field=field)
+
+
+def _check_rewards(rewards: Any, names: tuple[str, ...], source: str, field: str) -> None:
+    """Raise `InputError`, with the place, for a reward that is not finite; `names` are those of the last axes."""
+    if is_traced(rewards):
+        return
+    numbers = np.asarray(rewards)
+    for place in np.argwhere(~np.isfinite(numbers))[:1].tolist():
+        named = zip(("task", *names)[-numbers.ndim :], place, numbers.shape, strict=True)
+        where = ", ".join(f"{name} {index}" for name, index, size in named if size > 1)
+        message = f"expected finite rewards, found {numbers[tuple(place)]}{f' in {where}' if where else ''}"
+        raise InputError(message, source=source, field=field)
+
+
+def _check_actions(
+    terminal: Bool[np.ndarray, "*tasks states"], available: Bool[np.ndarray, "#states #actions"], field: str
+) -> None:
+    """Raise `InputError` for a state in which a task goes on and no action is available."""
+    stuck = ~terminal & ~available.any(axis=1)
+    for *_, state in np.argwhere(stuck)[:1].tolist():
+        message = f"expected an available action in each state that is not terminal, found none in state {state}"
+        raise InputError(message, source=field, field="available")
+
+
+def check_policy(policy: Any, terminal: Any, world: Graph, moves: int) -> None:
+    """Raise `InputError` unless a policy gives probabilities to the available actions of states that are not terminal.
+
+    Args:
+        policy: π(a | s); with an axis of moves before its own, for each move.
+        terminal: Where no action is taken.
+        world: The graph of a model.
+        moves: The number of moves.
+    """
+    shape = world.states, world.actions
+    fits = jnp.shape(policy) in (shape, (moves, *shape)) and jnp.shape(terminal) == shape[:1]
+    message = f"expected a policy of shape {shape}, or one for each of {moves} moves, and terminal states of shape "
+    message += f"{shape[:1]}, found "
+    check(fits, f"{message}{jnp.shape(policy)} and {jnp.shape(terminal)}", field="policy, terminal")
+    if is_traced(policy, terminal, world):
+        return
+    numbers, acts = np.asarray(policy), ~np.asarray(terminal, bool)
+    names = ("state",) if numbers.ndim == 2 else ("move", "state")
+    check_distributions(numbers, names, counts=acts, field="policy")
+    wrong = (numbers > 0) & ~np.asarray(world.available) & acts[:, None]
+    for *_, state, action in np.argwhere(wrong)[:1].tolist():
+        message = f"expected available actions only, found action {action} in state {state} with a probability above 0"
+        raise InputError(message, field="policy")
 
 
 def check_demonstrations(demonstrations: Demonstrations, world: Graph) -> None:

@@ -45,7 +45,8 @@ class Columns(NamedTuple):
     """The names of a table's columns; None for those that it does not have.
 
     Attributes:
-        state, action, next_state, step, task, subject, weight: As the arguments of `Demonstrations.from_table`.
+        state, action, next_state, step, task, subject, weight, truncated: As the arguments of
+            `Demonstrations.from_table`.
         walk: The columns that tell walks apart; empty for a single walk.
     """
 
@@ -57,6 +58,7 @@ class Columns(NamedTuple):
     task: str | None = None
     subject: str | None = None
     weight: str | None = None
+    truncated: str | None = None
 
 
 def read_moves(table: Any, tasks: Task | Sequence[Task], columns: Columns, labels: Labels) -> Demonstrations[Task]:
@@ -81,10 +83,11 @@ def read_moves(table: Any, tasks: Task | Sequence[Task], columns: Columns, label
     task = rows.numbers("task", labels.tasks, len(stacked.terminal)) if columns.task else np.zeros(len(rows), np.int64)
     check(columns.task or len(stacked.terminal) == 1, "several tasks: expected a column with the task", field="task")
     weight = rows.weights() if columns.weight else np.ones(len(rows))
+    truncated = rows.booleans("truncated") if columns.truncated else np.zeros(len(rows), bool)
     after = rows.numbers("next_state", labels.states, states, empty=True) if columns.next_state else None
     number = rows.number[order]
     walk, state, action, task = (each[order] for each in (walk, state, action, task))
-    weight = weight[order]
+    weight, truncated = weight[order], truncated[order]
     after = np.full(len(state), _NONE) if after is None else after[order]
     last = np.append(walk[1:] != walk[:-1], True)
     if columns.step:
@@ -92,6 +95,7 @@ def read_moves(table: Any, tasks: Task | Sequence[Task], columns: Columns, label
     next_state = _next_states(rows, number, last, state, action, after)
     moves = action != _NONE
     _check_walks(rows, number, walk, task, "task")
+    _check_walks(rows, number, walk, truncated.astype(np.int64), "truncated")
     ended = moves & np.asarray(stacked.terminal)[task, state]
     rows.check(~ended, number, "the walk goes on after a terminal state of its task", "state")
     return Demonstrations(
@@ -99,6 +103,7 @@ def read_moves(table: Any, tasks: Task | Sequence[Task], columns: Columns, label
         tasks=stacked,
         weights=to_jax(weight[moves]),
         person=None if person is None else flat_moves([person[order][moves]]),
+        truncated=to_jax(truncated[moves]),
     )
 
 
@@ -120,6 +125,7 @@ def write_moves(demonstrations: Demonstrations[Task], labels: Labels) -> pa.Tabl
     if demonstrations.person is not None:
         columns["subject"] = _labeled(np.asarray(demonstrations.person), labels.persons, "subject")
     columns["weight"] = np.asarray(demonstrations.weights)
+    columns["truncated"] = np.asarray(demonstrations.truncated)
     return pa.table({name: pa.array(values) for name, values in columns.items()})
 
 
@@ -202,6 +208,14 @@ class _Rows:
             message = f"expected a whole number, found {filled[row]}"
             raise InputError(message, source="table", row=int(row) + 1, field=self.name(kind))
         return filled.astype(np.int64)
+
+    def booleans(self, kind: str) -> Bool[np.ndarray, " rows"]:
+        """Return a column of booleans."""
+        column = self.column(kind)
+        of_type = pa.types.is_boolean(column.type)
+        check(of_type, f"expected booleans, found {column.type}", source="table", field=self.name(kind))
+        self.check(~np.asarray(column.is_null()), self.number, "expected a value, found an empty cell", kind)
+        return column.to_numpy(zero_copy_only=False).astype(bool)
 
     def weights(self) -> Float[np.ndarray, " rows"]:
         """Return the weights of moves, 0 where a cell is empty and there is no action."""

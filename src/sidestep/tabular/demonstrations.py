@@ -60,6 +60,8 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         tasks: All tasks, stacked.
         weights: How much each move counts in the likelihood of discrete worlds; 1 by default.
         person: The person of each move; None where persons are not told apart.
+        truncated: Whether the trajectory of each move was stopped by a limit of moves (see `Trajectory`); by default
+            none was.
 
     Example:
         >>> from sidestep.tabular.grid import Grid
@@ -77,14 +79,17 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
     tasks: Tasks
     weights: Float[Array, " moves"] = eqx.field(default=None)
     person: Int[Array, " moves"] | None = None
+    truncated: Bool[Array, " moves"] = eqx.field(default=None)
 
     def __post_init__(self) -> None:
         if self.weights is None:
             self.weights = to_jax(np.ones(len(self.states)))
+        if self.truncated is None:
+            self.truncated = to_jax(np.zeros(len(self.states), bool))
 
     def __check_init__(self) -> None:
         moves = getattr(self.states, "shape", ())[:1]
-        for name in ("states", "actions", "next_states", "task", "trajectory", "weights"):
+        for name in ("states", "actions", "next_states", "task", "trajectory", "weights", "truncated"):
             value = getattr(self, name)
             fits = isinstance(value, jax.Array | np.ndarray) and value.shape[:1] == moves != ()
             check(fits, f"expected an array with a row for each move, found {describe(value)}", field=name)
@@ -129,6 +134,7 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         task: str | None = None,
         subject: str | None = None,
         weight: str | None = None,
+        truncated: str | None = None,
         labels: "Labels | None" = None,
     ) -> "Demonstrations[Task]":
         """Return the demonstrations in a table of pandas, polars, pyarrow or another library that speaks Arrow.
@@ -152,6 +158,7 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
             task: The column with the task of each walk.
             subject: The column with the person of each walk.
             weight: The column with how much each move counts.
+            truncated: The column with whether each walk was stopped by a limit of moves.
             labels: The names of states, actions, tasks and persons, where cells hold names.
 
         Returns:
@@ -161,7 +168,7 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
             InputError: With row and column, for a column that is missing or of another kind, an empty cell, a state,
                 action or task that does not exist, a label that is not known, moves that do not follow each other, a
                 step that is left out, a walk without a move or that goes on after a terminal state, and two tasks or
-                persons in one walk.
+                persons in one walk, or one that is truncated in some of its rows only.
 
         Example:
             >>> from sidestep.tabular.grid import Grid
@@ -174,7 +181,7 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         from sidestep.tabular.demonstration_tables import Columns, Labels, read_moves
 
         of_walk = [] if walk is None else [walk] if isinstance(walk, str) else to_list(walk, str, "walk")
-        columns = Columns(state, action, next_state, tuple(of_walk), step, task, subject, weight)
+        columns = Columns(state, action, next_state, tuple(of_walk), step, task, subject, weight, truncated)
         return read_moves(table, tasks, columns, labels or Labels())
 
     def to_table(self: "Demonstrations[Task]", labels: "Labels | None" = None) -> "pyarrow.Table":
@@ -185,7 +192,7 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
 
         Returns:
             A row for each move, with the columns `walk`, `step`, `state`, `action`, `next_state`, `task`, `subject`
-            where there are persons, and `weight`.
+            where there are persons, `weight` and `truncated`.
 
         Raises:
             InputError: Where there are too few labels.
@@ -319,6 +326,7 @@ def to_trajectories(
     def checked(trajectory: Trajectory) -> Trajectory:
         path, acted, task, truncated = trajectory
         own = to_count(task, "task", 0, len(terminal) - 1)
+        check_instance(truncated, (bool, np.bool_), "truncated")
         states = to_states(path, terminal.shape[1], "states")
         last = None if actions is None else actions - 1
         taken = to_integers(acted, "actions", ("moves",), least=0, most=last, what="actions")
@@ -344,11 +352,12 @@ def flatten(trajectories: Sequence[Trajectory], tasks: Task) -> Demonstrations[T
         trajectories: At least one, each with at least one move.
         tasks: The tasks that `Trajectory.task` counts through, stacked.
     """
-    paths, actions, task, _ = zip(*trajectories, strict=True)
+    paths, actions, task, truncated = zip(*trajectories, strict=True)
     lengths = [len(taken) for taken in actions]
     states, next_states = flat_moves([path[:-1] for path in paths]), flat_moves([path[1:] for path in paths])
     of_moves, number = (flat_moves([np.repeat(each, lengths)]) for each in (task, np.arange(len(lengths))))
-    return Demonstrations(states, flat_moves(actions), next_states, of_moves, number, tasks)
+    stopped = to_jax(np.repeat(np.array(truncated, bool), lengths))
+    return Demonstrations(states, flat_moves(actions), next_states, of_moves, number, tasks, truncated=stopped)
 
 
 def flat_moves(parts: Sequence[np.ndarray]) -> Int[Array, " moves"]:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
@@ -53,6 +54,19 @@ class Graph(eqx.Module):
     def actions(self) -> int:
         """Return the number of actions."""
         return self.successors.shape[1]
+
+
+def available_mask(
+    available: Bool[Array, "#states #actions"], states: int, actions: int
+) -> Bool[Array, "states actions"] | None:
+    """Return which actions are available in each state; None where all are.
+
+    Args:
+        available: As in `Graph`.
+        states: The number of states.
+        actions: The number of actions.
+    """
+    return None if available.shape == (1, 1) else jnp.broadcast_to(available, (states, actions))
 
 
 def graph(

@@ -27,6 +27,7 @@ from sidestep.tabular.checks import (
     check_persons,
 )
 from sidestep.tabular.demonstrations import Demonstrations, next_power_of_two, pad_to_power_of_two
+from sidestep.tabular.graph import available_mask
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.proper import check_proper
 from sidestep.tabular.solve import Solution, SolveOptions, expected_reward, solve
@@ -428,10 +429,9 @@ def _log_policy(
     states: Int[Array, " visits"],
     actions: Int[Array, " visits"],
 ) -> Float[Array, " visits"]:
-    world = model.graph
-    everywhere = world.available.shape == (1, 1)
-    mask = None if everywhere else jnp.broadcast_to(world.available, (world.states, world.actions))[states]
-    return jnp.take_along_axis(behavior.log_policy(q, mask), actions[:, None], axis=-1)[:, 0]
+    mask = available_mask(model.graph.available, model.graph.states, model.graph.actions)
+    log_policy = behavior.log_policy(q, None if mask is None else mask[states])
+    return jnp.take_along_axis(log_policy, actions[:, None], axis=-1)[:, 0]
 
 
 def _first(each: Float[Array, " padded"], count: int) -> Float[Array, " moves"]:

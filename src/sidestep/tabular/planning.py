@@ -1,31 +1,27 @@
-"""Planning under a model: policies, the paths that they intend, and roll-outs of policies in other models.
+"""Planning under a model: policies, and the paths that they intend."""
 
-A plan knows only the model it was made with. Followed in another one, such as the true world, it may meet a wall that
-the model did not know: the move fails, and an optimal plan repeats it forever. `roll_out` shows that.
-"""
-
-from collections.abc import Sequence
-from typing import NamedTuple
+from itertools import takewhile
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, Shaped
+from jaxtyping import Array, Bool, Float, Int
 
-from sidestep._arguments import to_key, to_states
 from sidestep._programs import keep_program
 from sidestep._repr import short_repr
-from sidestep.errors import NotConverged, check, check_instance, to_count
-from sidestep.tabular.arrays import is_traced, to_jax
-from sidestep.tabular.backups import Behavior, HardMax, tied_where_lost
+from sidestep.errors import NotConverged, check, check_instance
+from sidestep.tabular.backups import Behavior, HardMax, finite_or_zero, tied_where_lost
 from sidestep.tabular.behavior_model import BehaviorModel
 from sidestep.tabular.checks import check_behavior, check_model, check_task
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.proper import check_proper
-from sidestep.tabular.solve import Solution, SolveOptions, solve
-from sidestep.tabular.solvers.base import is_reachable
+from sidestep.tabular.solve import Solution, SolveOptions, decision_process, solve
+from sidestep.tabular.solvers.base import DecisionProcess, finite_horizon, is_reachable
 from sidestep.tabular.tasks import Task
+
+_TIE = 1e-12
+"""The error of an advantage in 64-bit numbers, of solvers and not of rounding, as a part of what it is summed from."""
 
 
 @short_repr()
@@ -33,11 +29,12 @@ class Plan(eqx.Module):
     """A policy for one task under a model; made by `plan`.
 
     Attributes:
-        policy: The probability of each action in every state; an optimal policy is uniform over ties.
+        policy: The probability of each action in every state; an optimal policy is uniform over ties. With a deadline
+            (`SolveOptions`), policies depend on the time: an axis of moves comes first, one entry for each move.
         intended: The state that the most probable action (the first of ties) is meant to reach: its most probable
-            outcome other than the state itself, or the state itself if there is none.
+            outcome other than the state itself, or the state itself if there is none. With a deadline, for each move.
         terminal: Where the task ends.
-        solution: Values and convergence.
+        solution: Values and convergence; with a deadline, values before the first move.
 
     Example:
         >>> from sidestep.tabular.grid import Grid
@@ -49,15 +46,16 @@ class Plan(eqx.Module):
         [1, 2, 3, 3]
     """
 
-    policy: Float[Array, "states actions"]
-    intended: Int[Array, " states"]
+    policy: Float[Array, "*moves states actions"]
+    intended: Int[Array, "*moves states"]
     terminal: Bool[Array, " states"]
     solution: Solution
 
     def path_from(self, start: int) -> Int[np.ndarray, " steps"]:
         """Return the states that the plan intends to visit from `start` on, which is the first.
 
-        The path ends at a terminal state; if the plan never arrives, before the first state that would repeat.
+        The path ends at a terminal state; if the plan never arrives, before the first state that would repeat. With a
+        deadline it ends there at the latest, and states may repeat.
 
         Args:
             start: A state.
@@ -81,12 +79,15 @@ class Plan(eqx.Module):
 
 
 def followed(
-    intended: Int[np.ndarray, " states"], terminal: Bool[np.ndarray, " states"], starts: Int[np.ndarray, " starts"]
+    intended: Int[np.ndarray, "*moves states"],
+    terminal: Bool[np.ndarray, " states"],
+    starts: Int[np.ndarray, " starts"],
 ) -> list[Int[np.ndarray, " _"]]:
     """Return the states from each start on, `intended` after each, up to a terminal one or before one would repeat.
 
     Args:
-        intended: The state after each state.
+        intended: The state after each state; with an axis of moves before it, for each move. Paths then end after the
+            last move, and states may repeat.
         terminal: Where paths end.
         starts: The first state of each path.
     """
@@ -98,7 +99,13 @@ def followed(
             seen.add(state)
         return np.asarray(states)
 
-    return [path(start) for start in starts.tolist()]
+    def path_by_time(start: int) -> Int[np.ndarray, " steps"]:
+        states = [start]
+        for own in takewhile(lambda _: not terminal[states[-1]], intended):
+            states.append(int(own[states[-1]]))
+        return np.asarray(states)
+
+    return [(path if intended.ndim == 1 else path_by_time)(start) for start in starts.tolist()]
 
 
 def plan(
@@ -117,8 +124,8 @@ def plan(
         behavior: The agent's, π ∝ exp βQ; None for the optimal policy. With a `BehaviorModel`, such as that of a fit,
             the task has its discount, reward weights and costs.
         person: The person that plans, where a `BehaviorModel` distinguishes them; by default a typical one.
-        options: How values are computed; by default `SolveOptions()`. With a deadline the plan is that of the first
-            action; later ones are in `log_policies`.
+        options: How values are computed; by default `SolveOptions()`. With a deadline, the plan has a policy for each
+            move up to it.
 
     Returns:
         The probabilities of actions and the intended next state of every state, with the values.
@@ -165,167 +172,79 @@ def plan(
 @keep_program
 def _plan(model: TransitionModel, task: Task, behavior: Behavior, optimal: bool, options: SolveOptions) -> Plan:
     solution = solve(model, task, behavior, options=options)
-    available = jnp.broadcast_to(model.graph.available, solution.action_values.shape)
-    q, advantages = (tied_where_lost(each, available) for each in (solution.action_values, solution.advantages))
-    policy = (
-        behavior.backup.fixed_policy_weights(q, behavior.beta)
-        if optimal
-        else jnp.exp(behavior.log_policy(advantages, available))
-    )
-    states = jnp.arange(model.graph.states)
+    process = decision_process(model, model.probabilities(), task)
+    if options.deadline:
+        beta = behavior.beta.astype(solution.values.dtype)
+        _, later = finite_horizon(process, behavior.backup, beta, options.horizon or 1, options.gradient)
+        advantages = jax.vmap(process.advantages)(later)
+        decided = jax.vmap(lambda *own: _decided(process, behavior, optimal, *own))(later, advantages)
+    else:
+        decided = _decided(process, behavior, optimal, solution.values_after, solution.advantages)
+    return Plan(*decided, task.terminal, solution)
+
+
+def _decided(
+    process: DecisionProcess,
+    behavior: Behavior,
+    optimal: bool,
+    values: Float[Array, " states"],
+    advantages: Float[Array, "states actions"],
+) -> tuple[Float[Array, "states actions"], Int[Array, " states"]]:
+    """Return the policy, and the intended state of each state, of agents with these values after an action."""
+    available = jnp.broadcast_to(process.available, advantages.shape)
+    advantages = tied_where_lost(advantages, available)
+    if optimal:
+        policy = _uniform_over_best(advantages, _summed(process, values))
+    else:
+        policy = jnp.exp(behavior.log_policy(advantages, available))
+    states = jnp.arange(len(policy))
     best = _first_best(policy, advantages)
-    outcomes = model.graph.successors[states, best]
-    elsewhere = jnp.where(outcomes == states[:, None], 0, model.probabilities()[states, best])
+    outcomes = process.successors[states, best]
+    elsewhere = jnp.where(outcomes == states[:, None], 0, process.probabilities[states, best])
     most_probable = jnp.take_along_axis(outcomes, jnp.argmax(elsewhere, axis=-1)[:, None], axis=-1)[:, 0]
-    intended = jnp.where(elsewhere.max(axis=-1) > 0, most_probable, states)
-    return Plan(policy, intended.astype(jnp.int32), task.terminal, solution)
+    return policy, jnp.where(elsewhere.max(axis=-1) > 0, most_probable, states).astype(jnp.int32)
 
 
-def policy_by_time(
-    model: TransitionModel, task: Task, behavior: Behavior, options: SolveOptions
-) -> Float[Array, "moves states actions"]:
-    """Return the policy before each move of agents with a deadline.
+def _summed(process: DecisionProcess, values: Float[Array, " states"]) -> Float[Array, "states actions"]:
+    """Return the sum of the absolute numbers that each advantage is summed from; its rounding is a fraction of it."""
+    sizes = jnp.abs(finite_or_zero(values))
+    here, after = sizes[:, None], sizes[process.successors]
+    stays = process.successors == jnp.arange(len(sizes))[:, None, None]
+    moves = jnp.sum(jnp.where(stays, 0, process.probabilities * (after + here[..., None])), axis=-1)
+    return jnp.abs(process.reward) + process.discount * moves + (1 - process.discount) * here
+
+
+def rounding_of(dtype: np.dtype) -> float:
+    """Return the error of an advantage, as a part of the sum of the absolute numbers that it is summed from.
 
     Args:
-        model: The transition model.
-        task: One task.
-        behavior: The agents'.
-        options: With the deadline.
+        dtype: Of the values.
     """
-    states, moves = model.graph.states, options.horizon or 1
-    every = np.tile(np.arange(states), moves), np.repeat(np.arange(moves), states)
-    visited, times = (to_jax(each, np.int32) for each in every)
-    solution = solve(model, task, behavior, options=options, visited=visited, times=times)
-    advantages = solution.advantages.reshape(moves, states, -1)
-    available = jnp.broadcast_to(model.graph.available, advantages.shape[1:])
-    return jnp.exp(behavior.log_policy(advantages, available))
+    return max(_TIE, 2 * float(jnp.finfo(dtype).eps))
+
+
+def _uniform_over_best(
+    advantages: Float[Array, "states actions"], summed: Float[Array, "states actions"]
+) -> Float[Array, "states actions"]:
+    """Return the policy that is uniform over actions that may be the best, given the rounding of their advantages.
+
+    Advantages are differences, so those of values that are large against their differences keep what tells actions
+    apart; of Q it would be lost.
+    """
+    rounding = rounding_of(advantages.dtype) * summed
+    # the best counts even if a compiler, rounding twice, makes it fall short of itself
+    first = jax.nn.one_hot(advantages.argmax(axis=-1), advantages.shape[-1], dtype=bool)
+    least = (advantages - rounding).max(axis=-1, keepdims=True)
+    ties = ((advantages + rounding >= least) | first).astype(advantages.dtype)
+    return ties / ties.sum(axis=-1, keepdims=True)
 
 
 def _first_best(
     policy: Float[Array, "states actions"], advantages: Float[Array, "states actions"]
 ) -> Int[Array, " states"]:
-    """Return the first of the most probable actions; of ties by the precision of Q, the best by its advantage."""
+    """Return the first of the most probable actions; of those that are as probable, the best by its advantage."""
     tied = policy >= policy.max(axis=-1, keepdims=True)
     among = jnp.where(tied, advantages, -jnp.inf)
     largest = among.max(axis=-1, keepdims=True)
     size = jnp.where(jnp.isneginf(advantages), 0, jnp.abs(advantages)).max(axis=-1, keepdims=True)
     return jnp.argmax(among >= largest - 64 * jnp.finfo(advantages.dtype).eps * size, axis=-1)
-
-
-@short_repr()
-class RollOuts(NamedTuple):
-    """Trajectories of several agents that follow a policy; made by `roll_out`.
-
-    Attributes:
-        states: The state before every move, and at the end.
-        actions: The action of every move; −1 after the agent has arrived.
-        arrived: Whether the agent reached a terminal state.
-
-    Example:
-        >>> from sidestep.tabular.grid import Grid
-        >>> from sidestep.tabular.models import true_model
-        >>> from sidestep.tabular.tasks import reach
-        >>> grid = Grid(np.zeros((1, 4), dtype=int))
-        >>> world = true_model(grid)
-        >>> made = plan(world, reach(grid, 3))
-        >>> rolled = roll_out(jax.random.key(0), world, made.policy, made.terminal, jnp.array([0, 2]), max_moves=5)
-        >>> rolled.moves.tolist()
-        [3, 1]
-    """
-
-    states: Int[Array, "agents moves+1"]
-    actions: Int[Array, "agents moves"]
-    arrived: Bool[Array, " agents"]
-
-    @property
-    def moves(self) -> Int[Array, " agents"]:
-        """Return the number of moves of each agent."""
-        return jnp.sum(self.actions >= 0, axis=-1)
-
-    @property
-    def failed(self) -> Int[Array, " agents"]:
-        """Return the number of moves of each agent that left it in the same state."""
-        return jnp.sum((self.actions >= 0) & (self.states[:, 1:] == self.states[:, :-1]), axis=-1)
-
-
-def roll_out(
-    key: PRNGKeyArray,
-    world: TransitionModel,
-    policy: Float[Array, "*moves states actions"],
-    terminal: Bool[Array, " states"],
-    starts: Shaped[ArrayLike, "..."] | Sequence[int],
-    max_moves: int,
-) -> RollOuts:
-    """Return trajectories of agents that follow a policy in a world.
-
-    Args:
-        key: Of the random choices; the trajectory of agent i does not depend on how many agents come after it.
-        world: The transition model that moves follow; the policy may have been made for another one.
-        policy: The probability of each action in every state; with an axis of moves before these, of each move.
-        terminal: Where agents stop.
-        starts: The state that each agent starts in.
-        max_moves: The number of moves after which an agent stops anyway.
-
-    Returns:
-        The trajectories, one for each start.
-
-    Raises:
-        InputError: For a start that is not a state, a policy of another shape or with rows that do not sum to one, and
-            a number of moves below 1.
-
-    Example:
-        >>> from sidestep.tabular.grid import Grid
-        >>> from sidestep.tabular.models import true_model
-        >>> from sidestep.tabular.tasks import reach
-        >>> grid = Grid(np.zeros((1, 4), dtype=int))
-        >>> world = true_model(grid)
-        >>> made = plan(world, reach(grid, 3))
-        >>> rolled = roll_out(jax.random.key(0), world, made.policy, made.terminal, jnp.array([0, 2]), max_moves=5)
-        >>> rolled.arrived.tolist()
-        [True, True]
-    """
-    max_moves = to_count(max_moves, "max_moves")
-    check_model(world)
-    shape = world.graph.states, world.graph.actions
-    fits = jnp.shape(policy) in (shape, (max_moves, *shape)) and jnp.shape(terminal) == shape[:1]
-    message = f"expected a policy of shape {shape}, or one for each of {max_moves} moves, and terminal states of shape "
-    message += f"{shape[:1]}, found "
-    check(fits, f"{message}{jnp.shape(policy)} and {jnp.shape(terminal)}", field="policy, terminal")
-    if not is_traced(policy):
-        numbers = np.asarray(policy)
-        valid = np.isclose(numbers.sum(axis=-1), 1, atol=1e-4) & (numbers >= 0).all(axis=-1)
-        wrong = np.argwhere(~valid)[:1].tolist()
-        message = f"expected probabilities that sum to one in every state, found other ones in state {wrong}"
-        check(not wrong, message, field="policy")
-    states = to_jax(to_states(starts, world.graph.states, "starts"), np.int32)
-    return _roll_out(to_key(key), world, policy, terminal, states, max_moves)
-
-
-@eqx.filter_jit
-def _roll_out(
-    key: PRNGKeyArray,
-    world: TransitionModel,
-    policy: Float[Array, "*moves states actions"],
-    terminal: Bool[Array, " states"],
-    starts: Int[Array, " agents"],
-    max_moves: int,
-) -> RollOuts:
-    log_policy, log_probabilities = jnp.log(policy), jnp.log(world.probabilities())
-    each = jnp.arange(max_moves)
-
-    def of_agent(key: PRNGKeyArray, start: Int[Array, ""]) -> tuple[Array, Array]:
-        def step(state: Int[Array, ""], move: tuple[PRNGKeyArray, Array]) -> tuple[Array, tuple[Array, Array]]:
-            action_key, outcome_key = jax.random.split(move[0])
-            own = log_policy[state] if log_policy.ndim == 2 else log_policy[move[1], state]
-            action = jax.random.categorical(action_key, own)
-            outcome = jax.random.categorical(outcome_key, log_probabilities[state, action])
-            done = terminal[state]
-            next_state = jnp.where(done, state, world.graph.successors[state, action, outcome])
-            return next_state, (next_state, jnp.where(done, -1, action))
-
-        _, (states, actions) = jax.lax.scan(step, start, (jax.random.split(key, max_moves), each))
-        return jnp.concatenate([start[None], states]), actions
-
-    starts = starts.astype(world.graph.successors.dtype)
-    states, actions = jax.vmap(of_agent)(jax.random.split(key, len(starts)), starts)
-    return RollOuts(states, actions, terminal[states[:, -1]])

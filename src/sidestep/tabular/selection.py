@@ -1,6 +1,7 @@
 """Choosing trajectories out of demonstrations, and joining demonstrations."""
 
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Any
 
 import equinox as eqx
@@ -8,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Int
 
+from sidestep._arguments import to_indices
 from sidestep.errors import check, to_list
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.demonstrations import Demonstrations, Tasks, flat_moves
@@ -34,16 +36,12 @@ def choose(demonstrations: Demonstrations[Tasks], chosen: Any) -> Demonstrations
 
 def _indices(chosen: Any, count: int) -> Int[np.ndarray, " chosen"]:
     """Return the indices of chosen trajectories, of which there are `count`."""
-    indices = np.atleast_1d(np.arange(count)[chosen] if isinstance(chosen, slice) else np.asarray(chosen))
-    expected = f"expected a slice, indices of trajectories in 0…{count - 1}, or a boolean for each of them"
-    if indices.dtype == bool:
-        check(indices.shape == (count,), f"{expected}, found booleans {indices.shape}", field="chosen")
-        indices = np.flatnonzero(indices)
+    single = isinstance(chosen, Integral) or getattr(chosen, "shape", None) == ()
+    if isinstance(chosen, slice):
+        indices = np.arange(count)[chosen]
+    else:
+        indices = to_indices([chosen] if single else chosen, count, "chosen", "trajectories")
     check(indices.size, "expected at least one trajectory", field="chosen")
-    whole = indices.ndim == 1 and indices.dtype.kind in "iu"
-    check(whole, f"{expected}, found {indices.dtype} {indices.shape}", field="chosen")
-    outside = (indices < -count) | (indices >= count)
-    check(not outside.any(), f"{expected}, found {indices[outside][:1]}", field="chosen")
     return indices
 
 
@@ -93,13 +91,17 @@ def join(parts: Sequence[Demonstrations[Task]]) -> Demonstrations[Task]:
     def joined(name: str) -> Int[Array, " moves"]:
         return flat_moves([np.asarray(getattr(part, name)) for part in parts])
 
+    def concatenated(name: str) -> Array:
+        return to_jax(np.concatenate([np.asarray(getattr(part, name)) for part in parts]))
+
     return Demonstrations(
         *map(joined, ("states", "actions", "next_states")),
         task=flat_moves([number[np.asarray(part.task) + start] for part, start in zip(parts, begins[0], strict=False)]),
         trajectory=flat_moves([np.asarray(p.trajectory) + start for p, start in zip(parts, begins[1], strict=False)]),
         tasks=tasks,
-        weights=to_jax(np.concatenate([np.asarray(part.weights) for part in parts])),
+        weights=concatenated("weights"),
         person=joined("person") if all(known) else None,
+        truncated=concatenated("truncated"),
     )
 
 

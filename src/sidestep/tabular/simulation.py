@@ -10,11 +10,12 @@ from sidestep._arguments import to_key, to_states
 from sidestep.errors import InputError, check, to_count, to_list
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior
-from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
+from sidestep.tabular.behavior_model import BehaviorModel
 from sidestep.tabular.checks import check_model, check_persons
 from sidestep.tabular.demonstrations import Trajectory, next_power_of_two
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.planning import plan, policy_by_time, roll_out
+from sidestep.tabular.planning import plan
+from sidestep.tabular.roll_outs import roll_out
 from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.tasks import Task
 
@@ -46,8 +47,7 @@ def simulate(
         max_moves: The number of moves after which an agent stops; its trajectory is then `truncated`. By default no
             agent stops before it arrives, and one that has not arrived after twice the number of states, and at least
             1000 moves, is an error.
-        options: How the agents plan; by default `SolveOptions()`. With a deadline all agents stop there, and have a
-            `behavior`.
+        options: How the agents plan; by default `SolveOptions()`. With a deadline all agents stop there.
 
     Returns:
         The trajectories, those of the first task first. An agent that starts in a terminal state makes no move.
@@ -76,13 +76,12 @@ def simulate(
     check_persons(behavior, len(tasks))
     options = options or SolveOptions()
     if options.deadline and options.horizon is not None:
-        check(behavior is not None, "expected a behavior with a deadline, found none", field="behavior")
         limit = min(limit, options.horizon)
     key, trajectories = to_key(key), []
     for index, (task, own) in enumerate(zip(tasks, starts, strict=True)):
         begin = to_states(own, world.graph.states, f"starts[{index}]")
         person = _person_of(behavior, index)
-        policy = _policy_of(world, task, behavior, person, options)
+        policy = plan(world, task, behavior, person=person, options=options).policy
         if not len(begin):
             continue
         key, own_key = jax.random.split(key)
@@ -97,20 +96,6 @@ def simulate(
             taken = int((own_actions >= 0).sum())
             trajectories.append(Trajectory(own_states[: taken + 1], own_actions[:taken], index, not ended))
     return trajectories
-
-
-def _policy_of(
-    world: TransitionModel,
-    task: Task,
-    behavior: Behavior | BehaviorModel | None,
-    person: int | None,
-    options: SolveOptions,
-) -> Float[Array, "*moves states actions"]:
-    """Return the policy of agents, with a deadline one for each move."""
-    if not options.deadline or behavior is None:
-        return plan(world, task, behavior, person=person, options=options).policy
-    agents = as_behavior_model(behavior)
-    return policy_by_time(world, agents.tasks_of(task), agents.behavior_of(person), options)
 
 
 def _person_of(behavior: Behavior | BehaviorModel | None, task: int) -> int | None:

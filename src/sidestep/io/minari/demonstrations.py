@@ -9,7 +9,8 @@ Complete tasks are in the metadata, so that a dataset suffices for learning. The
 one entry per task (`task_entries`). The metadata of each episode have `goal` (the terminal state that pays most on
 arrival, or a list of several), `discount`, and `task`, the number of its entry. In a dataset without `tasks`, the task
 of each episode is to reach its `goal` at its `discount`, as in `reach`. Weights other than 1 are in `infos`, as
-`move_weight`, beside the observation after each move.
+`move_weight`, beside the observation after each move. Minari calls every episode truncated that is not terminated;
+`walk_truncated` in the metadata of an episode says whether a limit of moves stopped the agent.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -33,7 +34,7 @@ from sidestep.tabular.tasks import Task, reach
 StateOf = Callable[[Any], int]
 """Returns the state of an observation."""
 _NO_ENDS: Mapping[int, int] = {}
-_WEIGHT = "move_weight"
+_WEIGHT, _TRUNCATED = "move_weight", "walk_truncated"
 
 
 def write_demonstrations(
@@ -168,7 +169,7 @@ def _episodes(
         index, last = int(task[0]), int(after[-1])
         path = np.append(before, origin.get(last, last)).astype(np.int64)
         acted = moves.actions[own].astype(np.int64)
-        metadata = {"task": index, "discount": tasks[index]["discount"]}
+        metadata = {"task": index, "discount": tasks[index]["discount"], _TRUNCATED: bool(moves.truncated[own[0]])}
         best = goals[index]
         metadata |= {"goal": best[0] if len(best) == 1 else best} if best else {}
         infos = {_WEIGHT: np.append(0.0, moves.weights[own])} if weighted else {}
@@ -201,7 +202,9 @@ def _trajectory(
     path = _within(observations, moves + 1, seen, episode.source)
     if episode.terminated:
         path[-1] = ends.get(int(path[-1]), int(path[-1]))
-    return Trajectory(path, _within(episode.actions, moves, acted, episode.source), task)
+    truncated: Any = episode.metadata.get(_TRUNCATED, not episode.terminated)
+    check_instance(truncated, (bool, np.bool_), _TRUNCATED, source=episode.source)
+    return Trajectory(path, _within(episode.actions, moves, acted, episode.source), task, bool(truncated))
 
 
 def _at(observations: Any, step: int) -> Any:

@@ -23,8 +23,9 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
 from sidestep._arguments import to_finite, to_floats, to_integers, to_logits, to_mask
-from sidestep.errors import InputError, check, check_instance
+from sidestep.errors import check, check_instance
 from sidestep.tabular.arrays import to_jax
+from sidestep.tabular.distributions import check_distributions
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.models.base import TransitionModel
 
@@ -145,10 +146,7 @@ def tabular_model(
     check_instance(world, Graph, "world")
     shape = tuple(world.successors.shape)
     table = np.asarray(to_finite(probabilities, "probabilities", shape, least=0))
-    wrong = np.argwhere(~np.isclose(table.sum(axis=-1), 1, rtol=0, atol=1e-6))[:1]
-    for state, action in wrong.tolist():
-        message = f"expected a sum of 1 for action {action} of state {state}, found {table[state, action].sum():g}"
-        raise InputError(message, field="probabilities")
+    check_distributions(table, ("state", "action"), field="probabilities")
     mask = np.full(shape[:2], known) if isinstance(known, bool) else known
     logits = np.log(np.where(table > 0, table, 1))
     return TabularModel(world, logits, table > 0, known=None if known is False else mask)

@@ -54,6 +54,7 @@ from jaxtyping import Array, Bool, Float, Int, Scalar
 from sidestep._arguments import to_finite
 from sidestep.errors import to_count
 from sidestep.tabular.backups import Backup, Gradient, finite_or_zero, zero_with_gradient
+from sidestep.tabular.graph import available_mask
 
 Beta = Float[Scalar, ""]
 Values = Float[Array, " states"]
@@ -83,8 +84,7 @@ class DecisionProcess(eqx.Module):
 
     def available_actions(self) -> Bool[Array, "states actions"] | None:
         """Return which actions are available; None where all are."""
-        is_mask = self.available.shape != (1, 1)
-        return jnp.broadcast_to(self.available, self.successors.shape[:2]) if is_mask else None
+        return available_mask(self.available, *self.successors.shape[:2])
 
     def with_terminal_rewards(self, values: Float[Array, " states"]) -> Float[Array, " states"]:
         """Return the values with those of terminal states put in."""
