@@ -108,7 +108,7 @@ def _signal(last: Verification) -> float:
 
 
 def _leads_away(after: Verification, before: Verification) -> bool:
-    """Return whether a step leads away from the maximum, by much more than the noise of the step and of the distance."""
+    """Return whether a step leads away from the maximum, by more than the noise of step and distance explains."""
     parameters = len(after.step)
     noise = after.noise**2 * np.sqrt(2 / parameters) + 2 * after.distance * after.noise / np.sqrt(parameters)
     return bool(after.distance**2 > before.distance**2 + before.noise**2 + _FARTHER * noise)
