@@ -142,3 +142,11 @@ def test_refine_ends_after_sixteen_steps_and_is_verified_there():
     assert len(objective.noises) == 1 + 16 + 1
     np.testing.assert_allclose(last.flat, [2.0 * 17])
     assert not last.verification.passes(TIGHT)
+
+
+def test_refine_where_every_step_leads_away_ends_where_it_began():
+    """The expected information is much less than the curvature: each step is 20,000 times as long as it should be."""
+    objective = Objective(lambda flat: -np.clip(100 * flat, -90, 90), [[1e-4]], least_noise=None)
+    last = refined(objective, [0.01])
+    assert abs(last.flat[0]) < 0.02
+    assert not last.verification.passes(TIGHT)

@@ -59,7 +59,7 @@ def refine(first: Visit, visit: Visitor, schedule: Schedule) -> Visit:
     for _ in range(_STEPS):
         recent = _averaged(visits[_FIRST:], schedule)
         if recent and _mean_distance(recent) <= _NEAR * schedule.distance_tolerance:
-            mean, verified = _at_mean(recent, visit, schedule), verified + 1
+            mean, verified = _at_mean(recent, length, visit, schedule), verified + 1
             if verified == _VERIFICATIONS or mean.verification.passes(schedule):
                 return mean
             visits.append(mean)
@@ -72,7 +72,7 @@ def refine(first: Visit, visit: Visitor, schedule: Schedule) -> Visit:
             length /= 2
         else:
             visits.append(after)
-    return _at_mean(_averaged(visits[_FIRST:], schedule) or visits[-1:], visit, schedule)
+    return _at_mean(_averaged(visits[_FIRST:], schedule) or visits[-1:], length, visit, schedule)
 
 
 def _averaged(visits: Sequence[Visit], schedule: Schedule) -> Sequence[Visit]:
@@ -90,9 +90,9 @@ def _mean_distance(visits: Sequence[Visit]) -> float:
     return float(np.sqrt(max(gradient @ covariance @ gradient / len(gradient) - noise, 0.0)))
 
 
-def _at_mean(visits: Sequence[Visit], visit: Visitor, schedule: Schedule) -> Visit:
+def _at_mean(visits: Sequence[Visit], length: float, visit: Visitor, schedule: Schedule) -> Visit:
     """Return a visit of the mean of the places that steps lead to, with as little noise as the tolerance asks for."""
-    target = np.mean([each.flat + each.verification.step for each in visits], axis=0)
+    target = np.mean([each.flat + length * each.verification.step for each in visits], axis=0)
     return visit(target, visits[-1].planner_state, schedule.noise_tolerance)
 
 
