@@ -18,8 +18,6 @@ from helpers.families import Drift, Gusts, LaplaceDrift, vector
 from sidestep.continuous.fit import problem_fingerprint
 from sidestep.continuous.policies import ScaledNetwork
 
-pytestmark = pytest.mark.slow
-
 # Agents on a line move by −1, 0 or 1 and look two moves ahead, to stay near 0: R(s, a) = −s². With the Boltzmann
 # average, Q(s, a) = −s² − γ E(s + a + θ + noise)², for every later choice.
 WAYS, DISCOUNT, NOISE, TRUTH, MOVES = np.array([-1.0, 0.0, 1.0]), 0.9, 0.4, 0.6, 90
@@ -68,6 +66,7 @@ def fitted(seed=0):
 # Results
 
 
+@pytest.mark.slow
 def test_fit_dynamics_transitions_alone_give_least_squares():
     seen = np.column_stack([STATES, WAYS[CHOICES]])
     following = seen @ [0.7, 0.5] + 0.3 * np.random.default_rng(0).normal(size=MOVES)
@@ -85,6 +84,7 @@ def test_fit_dynamics_transitions_alone_give_least_squares():
     assert (result.converged, result.verification.policy_gap, result.verification.samples) == (True, 0, 0)
 
 
+@pytest.mark.slow
 def test_fit_dynamics_actions_alone_give_the_maximum_likelihood():
     """The tolerance allows for the noise of rollouts."""
 
@@ -99,6 +99,7 @@ def test_fit_dynamics_actions_alone_give_the_maximum_likelihood():
     assert result.history[0].prior == pytest.approx(-(0.5**2) / 100)
 
 
+@pytest.mark.slow
 def test_fit_dynamics_vector_actions_give_the_true_drift():
     """With R(s, a) = −s² − a² the policy is normal, by Riccati's equation."""
     beta, discount, count = 4.0, 0.6, 300
@@ -127,6 +128,7 @@ def test_fit_dynamics_vector_actions_give_the_true_drift():
     assert learned == pytest.approx(likelihood, abs=0.1)
 
 
+@pytest.mark.slow
 def test_fit_dynamics_policy_warmup_plans_for_the_first_model():
     """Without the actions' term there is no policy to plan."""
     by_both, by_transitions = fitted()[0], BOTH(terms=("transitions",))
@@ -171,6 +173,7 @@ def test_fit_dynamics_newton_steps_end_at_the_maximum_of_transitions():
     assert (result.verification.noise, result.converged) == (0, True)
 
 
+@pytest.mark.slow
 def test_verification_gradient_agrees_with_the_likelihood_within_its_standard_error():
     result = learn(terms=("actions",), schedule=replace(LONG, iterations=20))
     at, step, found = float(result.dynamics.parameters[0]), 1e-4, result.verification
@@ -229,6 +232,7 @@ def test_fit_dynamics_newton_step_too_far_is_taken_back():
     assert result.converged
 
 
+@pytest.mark.slow
 def test_fit_dynamics_noise_above_its_tolerance_is_not_converged():
     schedule = sc.Schedule(16, policy_warmup=0, batch_size=30, distance_tolerance=0.01, verification_samples=8)
     result = learn(terms=("actions",), schedule=schedule)
@@ -236,6 +240,7 @@ def test_fit_dynamics_noise_above_its_tolerance_is_not_converged():
     assert not result.converged
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("horizon", "short"), [(2, True), (30, False)])
 def test_fit_dynamics_horizon_before_the_goal_is_seen(horizon, short):
     """Agents are four to six moves away from their goal."""
@@ -253,6 +258,7 @@ def test_fit_dynamics_horizon_before_the_goal_is_seen(horizon, short):
     assert not (short and result.converged)
 
 
+@pytest.mark.slow
 def test_fit_dynamics_horizon_with_values_beyond_it_is_not_converged():
     """Agents look two moves ahead, and what follows would change their choices."""
     result = sc.fit_dynamics(
@@ -264,6 +270,7 @@ def test_fit_dynamics_horizon_with_values_beyond_it_is_not_converged():
     assert not result.converged
 
 
+@pytest.mark.slow
 def test_fit_dynamics_of_one_move_sees_the_values_after_it():
     """Rewards are paid in the next state: one move looks at none, and its choices would change with them."""
     schedule = sc.Schedule(4, policy_warmup=40, batch_size=MOVES, learning_rate=1e-3, verification_samples=8)
@@ -306,6 +313,7 @@ def leaves(result):
     return [np.asarray(leaf) for leaf in jax.tree.leaves((result.dynamics, result.planner_state)) if eqx.is_array(leaf)]
 
 
+@pytest.mark.slow
 def test_fit_dynamics_resumed_is_identical(checkpoint):
     whole = partial(BOTH, checkpoint=checkpoint)
     expected = whole()

@@ -15,8 +15,6 @@ from sidestep.continuous.information import RolloutInformation
 from sidestep.inference.decomposition import whole
 from sidestep.inference.normal_posterior import Laplace
 
-pytestmark = pytest.mark.slow
-
 # Agents on a line move by −1, 0 or 1 and look two moves ahead, to stay near 0: R(s, a) = −s². A later choice counts
 # for nothing, so that Q(s, a) = −s² − γ E(s + a + θ + noise)², ∇Q = −2γ(s + a + θ), and ∇²Q is the same for all a.
 WAYS, DISCOUNT, NOISE, TRUTH, MOVES, BETA = np.array([-1.0, 0.0, 1.0]), 0.9, 0.4, 0.6, 90, 1.5
@@ -73,6 +71,7 @@ def loss(terms, drift):
     return total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("terms", [("actions",), ("transitions",), ("actions", "transitions")])
 def test_laplace_of_continuous_dynamics_has_the_second_difference_of_the_objective(terms):
     result = fitted(terms)
@@ -87,6 +86,7 @@ def test_laplace_of_continuous_dynamics_has_the_second_difference_of_the_objecti
     np.testing.assert_allclose((upper.model - lower.model) / 2, 1.959964 * normal.standard_errors.model, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["score", "pathwise"])
 def test_laplace_of_continuous_dynamics_knows_the_errors_by_rollouts(estimator):
     """The error of a standard error, and the noise of a gradient, over draws of rollouts."""
@@ -103,6 +103,7 @@ def test_laplace_of_continuous_dynamics_knows_the_errors_by_rollouts(estimator):
     assert np.mean(squared) / 4 < np.mean(np.square(noise)) < 4 * np.mean(squared)
 
 
+@pytest.mark.slow
 def test_laplace_of_vector_actions_has_the_information_of_a_normal_policy():
     """With R(s, a) = −s² − a² the policy is normal, by Riccati's equation, with a mean that is linear in θ."""
     discount, count, beta, random = 0.6, 300, 4.0, np.random.default_rng(2)
@@ -127,6 +128,7 @@ def test_laplace_of_vector_actions_has_the_information_of_a_normal_policy():
     np.testing.assert_allclose(ss.laplace(result).standard_errors.model, [information**-0.5], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_information_of_vector_actions_knows_the_noise_of_drawn_choices():
     """The noise of the gradient over draws of choices and rollouts is what the difference of its halves says."""
     task = sc.QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.eye(1), jnp.asarray(0.6))
@@ -149,6 +151,7 @@ def test_information_of_vector_actions_knows_the_noise_of_drawn_choices():
     assert np.mean(known) / 2 < noise < 2 * np.mean(known)
 
 
+@pytest.mark.slow
 def test_laplace_of_linear_dynamics_has_the_covariance_of_least_squares():
     states, choices, _ = walks()
     seen = np.column_stack([WAYS[choices], states])  # in the order of the parameters' names
@@ -169,18 +172,21 @@ def test_laplace_of_linear_dynamics_has_the_covariance_of_least_squares():
 # Refusals
 
 
+@pytest.mark.slow
 def test_laplace_of_a_continuous_fit_away_from_its_maximum_raises():
     away = eqx.tree_at(lambda fit: fit.dynamics.parameters, fitted(("transitions",)), vector(1.0))
     with pytest.raises(ss.InputError, match=r"standard errors from it \(the maximum is"):
         ss.laplace(away)
 
 
+@pytest.mark.slow
 def test_laplace_of_a_continuous_fit_that_has_not_converged_raises():
     early = learn(("actions",), schedule=sc.Schedule(2, policy_warmup=0, learning_rate=1e-3, distance_tolerance=1e-9))
     with pytest.raises(ss.InputError, match="'fit': expected a fit that converged: the maximum is"):
         ss.laplace(early)
 
 
+@pytest.mark.slow
 def test_laplace_of_few_rollouts_raises():
     with_wrong_critic = eqx.tree_at(
         lambda fit: fit.planner_state.critic.spread, fitted(("actions",), "score"), jnp.asarray(10.0)
@@ -190,6 +196,7 @@ def test_laplace_of_few_rollouts_raises():
         ss.laplace(few)
 
 
+@pytest.mark.slow
 def test_information_of_one_rollout_raises():
     with pytest.raises(ss.InputError, match="'samples': expected at least 2, found 1"):
         fitted(("actions",)).information(samples=1)

@@ -94,7 +94,6 @@ def around(dynamics, state, action):
 # What holds for every family
 
 
-@pytest.mark.slow
 @gaussian
 def test_log_prob_integrates_to_one_and_samples_have_its_moments(name):
     """Sums over a lattice as wide as the noise are exact to 1e-7 for Gaussians."""
@@ -108,7 +107,6 @@ def test_log_prob_integrates_to_one_and_samples_have_its_moments(name):
     np.testing.assert_allclose((away.T @ away / SAMPLES - covariance) / np.outer(spread, spread), 0, atol=0.05)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", [*GAUSSIAN, "table"])
 def test_transition_control_variate_has_mean_0_and_removes_linear_noise(name):
     seen = evaluate(name)
@@ -122,7 +120,6 @@ def test_transition_control_variate_has_mean_0_and_removes_linear_noise(name):
         np.testing.assert_allclose(seen.linear, expected - mean, atol=1e-6)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted((GAUSSIAN.keys() | {"table"}) - {"walls"}))  # known walls have no parameters
 def test_score_control_variate_derivative_has_mean_0(name):
     seen = evaluate(name)

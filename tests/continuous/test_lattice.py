@@ -94,7 +94,6 @@ MOVES = jnp.asarray([[1.0, 0.0], [0.0, -1.0], [-1.0, 1.0]])
     (sc.Pendulum(), CYLINDER, jnp.asarray([[-2.0], [0.0], [2.0]])),
     (sc.ObstacleMotion(WALL, BOX.low, BOX.high, jnp.full(2, 0.1)), BOX, MOVES / 3),
 ])  # fmt: skip
-@pytest.mark.slow
 def test_tabular_model_probabilities_add_up_and_keep_the_mean(dynamics, lattice, actions):
     model = tabular_model(sc.LatticePlanner(dynamics, actions, SOFT, lattice))
     transitions = np.asarray(dense(model))
@@ -136,7 +135,6 @@ LINE = sc.Lattice(jnp.zeros(1), jnp.full(1, 9.0), (10,))
 WALKER = sc.LatticePlanner(WALK, jnp.asarray([[-1.0], [1.0]]), SOFT, LINE)
 
 
-@pytest.mark.slow
 def test_solve_corridor_with_step_cost_matches_closed_form():
     """With β = 2, Z = exp βV solves Z(k) = e⁻² (Z(k − 1) + Z(k + 1)), Z(0) = 1 and, at the far end, Z(10) = Z(9).
 

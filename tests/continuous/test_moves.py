@@ -8,8 +8,6 @@ import pytest
 import sidestep.continuous as sc
 from sidestep.continuous.moves import map_moves, sum_gradients
 
-pytestmark = pytest.mark.slow
-
 GOALS = np.random.default_rng(0).uniform(-1, 1, (40, 3, 1))
 TASKS = sc.ReachTask(jnp.asarray(GOALS), *(jnp.asarray(np.full((40, 3), number)) for number in (0.5, 1.0, 0.0, 0.9)))
 

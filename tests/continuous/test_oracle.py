@@ -12,8 +12,6 @@ import sidestep.continuous as sc
 from helpers.families import Drift, vector
 from sidestep.continuous.oracle import NoisyPlanner
 
-pytestmark = pytest.mark.slow
-
 # Agents on a line move by −1, 0 or 1 at the cost of s² + a²; they look ahead without end.
 WAYS, NOISE, DISCOUNT, BETA, TRUTH, VARIANCE = np.array([-1.0, 0.0, 1.0]), 0.4, 0.6, 1.5, 0.3, 4.0
 TASK = sc.QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.eye(1), jnp.asarray(DISCOUNT))
@@ -62,6 +60,7 @@ def fitted(terms=("actions",), horizon=10):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_compare_with_lattice_has_the_gradient_of_a_dense_reference():
     result = fitted()
     (states, choices), at, step = walks(), float(result.dynamics.parameters[0]), 1e-3
@@ -89,6 +88,7 @@ def test_compare_with_lattice_points_around_an_outcome_have_its_mean_and_varianc
     assert (places - 0.37) ** 2 @ np.asarray(weights) == pytest.approx(NOISE**2, rel=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lattice", "match"), [
     (sc.Lattice(vector(-8), vector(8), (11,)), "'lattice': expected a spacing of at most 1.5 times the noise"),
     (sc.Lattice(vector(-8, -8), vector(8, 8), (9, 9)), "'lattice': expected 1 dimensions, at most 3, found 2"),
@@ -98,6 +98,7 @@ def test_compare_with_lattice_that_does_not_fit_is_refused(lattice, match):
         sc.compare_with_lattice(fitted(), lattice)
 
 
+@pytest.mark.slow
 def test_compare_with_lattice_of_another_fit_is_refused():
     with pytest.raises(ss.InputError, match="'terms': expected a fit with the actions' term"):
         sc.compare_with_lattice(fitted(("transitions",)), LATTICE)

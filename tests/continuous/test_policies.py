@@ -115,7 +115,6 @@ def test_scaled_network_standardizes_by_examples():
     np.testing.assert_allclose(FRESH.network.scale, [*EXAMPLES.std(axis=0)[:2], 1])
 
 
-@pytest.mark.slow
 def test_make_critic_begins_at_the_mean_and_learns_its_network_only():
     random, left = np.random.default_rng(1), jnp.linspace(0, 1, 30)
     returns = jnp.asarray(random.normal(-40, 7, 30))

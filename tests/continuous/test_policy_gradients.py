@@ -16,8 +16,6 @@ from helpers import small_worlds
 from helpers.small_worlds import ACTIONS, PLACES, STATES, TASKS, WHICH, entropies, exact_values, policy_table
 from sidestep.continuous.planner import minibatches
 
-pytestmark = pytest.mark.slow
-
 WORLD, BETA = small_worlds.table(), 1.5
 SOFT, OPTIMAL = ss.Behavior(ss.LogSumExp(), BETA), ss.Behavior(ss.HardMax(), BETA)
 BACKUPS = {"log-sum-exp": ss.LogSumExp(), "Boltzmann": ss.BoltzmannAverage(), "mellowmax": ss.Mellowmax()}
@@ -58,6 +56,7 @@ def plans(initial):
     return {"log-sum-exp": first} | others
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BEHAVIORS)
 def test_plan_policy_soft_agent_converges_to_its_own_exact_policy(name, plans, exact):
     pi = np.asarray(policy_table(plans[name].policy))
@@ -68,6 +67,7 @@ def test_plan_policy_soft_agent_converges_to_its_own_exact_policy(name, plans, e
             assert divergence(pi, policy).max() > 0.03
 
 
+@pytest.mark.slow
 def test_plan_policy_optimal_agent_chooses_the_best_actions(initial):
     best = np.asarray(small_worlds.exact_policy(WORLD, OPTIMAL)).argmax(axis=-1)[WHICH, PLACES]
     pi = np.asarray(policy_table(planned(OPTIMAL, warm_start=initial, steps=150).policy))[WHICH, PLACES]
@@ -75,6 +75,7 @@ def test_plan_policy_optimal_agent_chooses_the_best_actions(initial):
     assert pi.max(axis=-1).min() > 0.9
 
 
+@pytest.mark.slow
 def test_plan_policy_critic_approaches_exact_values(plans, exact, initial):
     bonus = entropies(exact["log-sum-exp"]) / BETA
     values, _ = exact_values(WORLD, WORLD.dynamics.parameters, exact["log-sum-exp"], PLANNER.horizon, bonus)
@@ -95,6 +96,7 @@ def optimal_control(task, dynamics):
     return gain, np.sqrt(np.diag(np.linalg.inv(curvature)) / (2 * BETA))
 
 
+@pytest.mark.slow
 def test_plan_policy_gaussian_policy_matches_maximum_entropy_control():
     dynamics, tasks, _ = small_worlds.linear(goals=((0.0, 0.0),))
     starts = jax.random.normal(jax.random.key(1), (256, 2))
@@ -141,6 +143,7 @@ def exact_figures(pi, optimal):
     return earned[WHICH, PLACES].mean(), jnp.linalg.norm(slope), entropy, gap
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("behavior", [SOFT, OPTIMAL], ids=["log-sum-exp", "hard max"])
 @pytest.mark.parametrize("policy", [UNIFORM, WORLD.policy], ids=["uniform", "another"])
 def test_progress_figures_match_dynamic_programming(policy, behavior, initial):

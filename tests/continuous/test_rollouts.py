@@ -12,8 +12,6 @@ import sidestep as ss
 import sidestep.continuous as sc
 from helpers.small_worlds import ACTIONS, ENDS, PLACES, WHICH, entropies, exact_values, policy_table, table
 
-pytestmark = pytest.mark.slow
-
 WORLD, HORIZON, BETA, SAMPLES = table(), 6, 2.0, 300
 AGENT = sc.Agent(WORLD.dynamics, WORLD.policy, ss.Behavior(ss.LogSumExp(), BETA))
 PI = np.asarray(policy_table(WORLD.policy))

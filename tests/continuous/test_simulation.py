@@ -43,7 +43,6 @@ def walks():
     return simulate(ROOM, SHARP, tasks=2)
 
 
-@pytest.mark.slow
 def test_simulate_trajectories_start_as_asked_and_arrive(walks):
     assert [walk.task for walk in walks] == [0] * COUNT + [1] * COUNT
     np.testing.assert_array_equal([walk.states[0] for walk in walks], np.concatenate(STARTS))
@@ -102,7 +101,6 @@ def test_simulate_trajectories_start_at_goal_gives_none():
     np.testing.assert_array_equal([walk.states[0] for walk in walking], np.delete(starts, [0, 2], axis=0))
 
 
-@pytest.mark.slow
 def test_simulate_trajectories_soft_choices_match_action_values():
     place = np.array([4.2, 4.0])
     walking = simulate(ROOM, SOFT, starts=[np.tile(place, (COUNT, 1))])
@@ -115,7 +113,6 @@ def test_simulate_trajectories_soft_choices_match_action_values():
     assert frequencies.min() < 0.1 < np.sort(frequencies)[1]
 
 
-@pytest.mark.slow
 def test_simulate_trajectories_wrong_gravity_changes_actions():
     """Agents that believe in less gravity push less, and hold it lower; it swings as the real one."""
     lattice = sc.Lattice(jnp.asarray([-np.pi, -8.0]), jnp.asarray([np.pi, 8.0]), (20, 17), (True, False))
