@@ -240,7 +240,8 @@ def test_solution_error_bounds_the_error_of_a_loose_solve(backup, solver, seed, 
     assume(values.min() > -50)
     solution = loose_solution(backup, solver)(world)
     error = jnp.abs(jnp.where(mask.states, solution.values - values, 0)).max()
-    assert error <= float(solution.error) * (1 + 1e-6)
+    # the reference is rounded, too
+    assert error <= float(solution.error) * (1 + 1e-6) + 1e-11 * jnp.abs(values).max()
     assert bool(solution.converged)
     assert solution.error <= jnp.sqrt(LOOSE) * jnp.abs(values).max() * (1 + 1e-6)
 
