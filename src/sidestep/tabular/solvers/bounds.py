@@ -1,25 +1,47 @@
 """Bounds of values, and of their errors.
 
-**Errors.** If a sweep, V ← F(V), has changed no value by more than δ, then |V − V*| ≤ δ N, where N bounds the expected
-number of moves until a task ends, each discounted. N is at most 1/(1 − γ). Where every move costs at least c, and
-ending is worth at most e ≥ 0, it is at most (e − min V)/c too, because V ≤ e − c N. So the change alone says little
-where N is large.
+**By the largest change.** If a sweep, V ← F(V), has changed no value by more than δ, then |V − V*| ≤ δ N, where N
+bounds the expected number of moves until a task ends, each discounted. N is at most 1/(1 − γ). Where every move costs
+at least c, and ending is worth at most e ≥ 0, it is at most (e − min V)/c too, because V ≤ e − c N. So the change alone
+says little where N is large. Rounding adds ε max |V| to a change. Bertsekas (*Dynamic Programming and Optimal Control*
+II, 2012, section 2.2) has such bounds for the hard maximum.
 
-The bound holds for backups that are convex with weights of at least 0: the hard maximum, the mellowmax, and the
-log-sum-exp, where the entropy bonus log(actions)/β makes a move cheaper. Bertsekas (*Dynamic Programming and Optimal
-Control* II, 2012, section 2.2) has such bounds for the first. For the Boltzmann average it is an estimate: an action
-that is worse by more than 1/β lowers a state's value where it becomes better. Rounding adds ε max |V| to a change.
-Where a few states are nearly closed the bound may be far too large, because these take most of the moves, and others
-most of the changes; `direct` has a better estimate.
+**By a potential.** Where a few states are nearly closed, that bound is far too large: these states take most of the
+moves, but few exits. A second bound compares values. F is monotone, so V* ≤ U for all U with F(U) ≤ U, and V* ≥ U for
+all U with F(U) ≥ U (Bertsekas and Tsitsiklis, *An analysis of stochastic shortest path problems*, 1991). Try
+U = V ± t u, with a potential u ≥ 0. With A the advantages at V, and d(s, a) = u(s) − γ Σ P u the fall of the potential,
+F(U) − U is B(A ∓ t d). The bound is t max u for a t where that has the right sign in every state. Rounding moves each
+advantage by less than some ε times the terms of its sum, and the sign has to be right for both ends of that interval.
+
+The potential is u = log(1 + X/c), X = e − V. It is concave in X, so d(s, a) ≥ c/(c + X) for moves that cost c and lead
+on as V says, and d(s, a) < 0 only for actions that are worse than the best by at least c. One exit of a nearly closed
+state has a large fall. Where a move may cost nothing it is u = 1, and the bound is that by 1/(1 − γ), state by state.
+
+Newton's method finds t. It starts from 0, with steps of twice the length: B is convex, so single ones would end below
+the root. Where a few steps do not find any t, only the first bound is known. The second takes a few passes over all
+states, so it is computed only where the first does not suffice; and not by `Jacobi` in small worlds, where `direct` has
+an estimate.
+
+**For which backups.** The bounds hold for backups that are convex with weights of at least 0: the hard maximum, the
+mellowmax, and the log-sum-exp, where the entropy bonus log(actions)/β makes a move cheaper. For the Boltzmann average
+they are estimates: an action that is worse by more than 1/β lowers a state's value where it becomes better. The first
+bound takes a Newton step of a state's own equation for its solution.
 """
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sidestep.tabular.backups import Backup
-from sidestep.tabular.solvers.base import Beta, DecisionProcess, Values, is_reachable
+from sidestep.tabular.solvers.base import BellmanEquation, Beta, DecisionProcess, Values, is_reachable
+from sidestep.tabular.solvers.direct import MOST_STATES, step_divisor
+
+MOST_STEPS, STEP_LENGTH = 4, 2.0
+"""The most steps to t, the factor of the potential; and their length, in steps of Newton's method."""
+ROUNDINGS = 4
+"""How often a term of an advantage is rounded, apart from the sum over outcomes."""
 
 
 class MoveCosts(NamedTuple):
@@ -69,19 +91,68 @@ def move_costs(process: DecisionProcess, backup: Backup, beta: Beta) -> MoveCost
     return MoveCosts(least, jnp.maximum(worth, 0) + jnp.maximum(gain, 0))
 
 
-def error_bound(process: DecisionProcess, costs: MoveCosts, values: Values, change: Float[Array, ""]) -> Array:
+def error_bound(
+    equation: BellmanEquation,
+    costs: MoveCosts,
+    values: Values,
+    change: Float[Array, ""],
+    allowed: Float[Array, ""],
+) -> Array:
     """Return the bound of the values' error after a sweep; ∞ where none is known.
 
     Args:
-        process: The decision process.
-        costs: Of its moves.
+        equation: The Bellman equation.
+        costs: Of the moves.
         values: V after the sweep.
         change: The largest change of a value in it.
+        allowed: The error that values may have; in large worlds, there is a second bound where the first is larger.
     """
     lowest, size = jnp.where(is_reachable(values), values, jnp.inf).min(), largest_value(values)
     by_cost = costs.least / jnp.maximum(costs.ending - lowest, jnp.finfo(values.dtype).tiny)
     error = change + jnp.finfo(values.dtype).eps * size
-    return error / jnp.maximum(jnp.maximum(by_cost, 0), 1 - process.discount)
+    bound = error / jnp.maximum(jnp.maximum(by_cost, 0), 1 - equation.process.discount)
+    if len(values) <= MOST_STATES:
+        return bound
+    is_needed = jnp.isfinite(bound) & (bound > allowed)
+    return jnp.minimum(bound, _bound_by_potential(equation, costs, values, is_needed))
+
+
+def _bound_by_potential(equation: BellmanEquation, costs: MoveCosts, values: Values, is_needed: Array) -> Array:
+    """Return the bound by a potential; ∞ where it is not needed or no factor is found."""
+    process, backup, beta = equation
+    live, limits = equation.is_live(values), jnp.finfo(values.dtype)
+    is_dear = costs.least > 0
+    above = jnp.where(is_reachable(values), jnp.maximum(costs.ending - values, 0), 0)
+    potential = jnp.where(is_dear, jnp.log1p(above / jnp.where(is_dear, costs.least, 1)), 1)
+
+    def excess(factor: Array) -> Array:
+        """Return by how much the factor is too small, to first order: at most 0 if it suffices."""
+        moves, staying = process.discount * process.probabilities, 1 - process.discount
+        own = jnp.where(live[:, None], process.advantages(values), 0)
+        here, after = (jnp.where(is_reachable(v), v, 0) for v in (values[:, None, None], values[process.successors]))
+        spread = jnp.sum(moves * jnp.abs(after - here), axis=-1)
+        terms = jnp.abs(process.reward) + spread + staying * jnp.abs(here[..., 0])
+        rounding = (ROUNDINGS + moves.shape[-1]) * limits.eps * terms
+        fall = jnp.sum(moves * (potential[:, None, None] - potential[process.successors]), axis=-1)
+        fall = fall + staying * potential[:, None]
+        most = jnp.where(jnp.isneginf(own), 0, rounding - factor * fall)
+        ends = jnp.stack([own + most, own - most])
+        gains = backup.value(ends, beta, process.available_actions())
+        slope = step_divisor(backup.weights(ends[0], beta), backup.fixed_policy_weights(ends[0], beta), fall.T)
+        return jnp.where(live, jnp.maximum(gains[0], -gains[1]) / slope, 0).max(initial=0)
+
+    def is_unfinished(state: tuple[Array, Array, Array]) -> Array:
+        steps, _, left = state
+        return is_needed & (left > 0) & (steps <= MOST_STEPS)
+
+    def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        steps, factor, left = state
+        factor = jnp.where(steps > 0, factor + STEP_LENGTH * left, factor)
+        return steps + 1, factor, excess(factor)
+
+    begun = jnp.asarray(0), jnp.zeros((), values.dtype), jnp.asarray(jnp.inf, values.dtype)
+    _, factor, left = jax.lax.while_loop(is_unfinished, step, begun)
+    return jnp.where(left <= 0, factor * jnp.where(live, potential, 0).max(), jnp.inf)
 
 
 def largest_error(tolerance: Float[Array, ""] | float, values: Values) -> Array:

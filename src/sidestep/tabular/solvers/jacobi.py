@@ -112,7 +112,7 @@ class Jacobi(base.Solver):
 
         known = jnp.where(base.is_reachable(start.values), start.values, lower_bound(process))
         begun = jnp.where(finite, process.with_terminal_rewards(known), -jnp.inf)
-        error = partial(error_bound, process, move_costs(process, backup, beta))
+        error = partial(error_bound, equation, move_costs(process, backup, beta))
         iteration = self._iteration(sweep, begun.dtype, partial(newton_step, equation), error)
         return iterate(iteration, begun, start.order, earlier)
 
@@ -132,7 +132,7 @@ class Jacobi(base.Solver):
 
         begun = jnp.nan_to_num(start.adjoint, nan=0)
 
-        def error(adjoint: Values, _: Array) -> Array:
+        def error(adjoint: Values, *_: Array) -> Array:
             # sums over many states are too large to say much
             own = adjoint_error(linear, cotangent, adjoint, equation.process.discount)
             return own if len(adjoint) <= MOST_STATES else jnp.zeros_like(own)

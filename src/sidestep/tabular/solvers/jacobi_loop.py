@@ -41,14 +41,14 @@ class Iteration(NamedTuple):
         tolerance: The relative change at which to stop.
         max_sweeps: When to stop without convergence.
         step_all: Takes a step on all equations; None for none.
-        error: Returns a bound of the error from the values and the largest change; None for none.
+        error: Returns a bound of the error from the values, the largest change and the error allowed; None for none.
     """
 
     sweep: Callable[[Values], tuple[Values, Values]]
     tolerance: Float[Array, ""] | float
     max_sweeps: int
     step_all: Callable[[Values], DirectStep] | None = None
-    error: Callable[[Values, Float[Array, ""]], Float[Array, ""]] | None = None
+    error: Callable[[Values, Float[Array, ""], Float[Array, ""]], Float[Array, ""]] | None = None
 
     @property
     def is_direct(self) -> bool:
@@ -187,8 +187,9 @@ def _judge(iteration: Iteration, state: _State) -> _State:
     is_small = state.residual <= state.tolerance
     if iteration.error is None:
         return state._replace(error=jnp.zeros_like(state.residual), is_near=is_small)
-    error = jnp.minimum(iteration.error(state.values, state.moved), state.direct_error)
+    allowed = largest_error(iteration.tolerance, state.values)
+    error = jnp.minimum(iteration.error(state.values, state.moved, allowed), state.direct_error)
     is_known = jnp.isfinite(error) | iteration.is_direct
-    is_near = is_small & (~is_known | (error <= largest_error(iteration.tolerance, state.values)))
+    is_near = is_small & (~is_known | (error <= allowed))
     tolerance = jnp.where(is_small & ~is_near, _FINER * state.tolerance, state.tolerance)
     return state._replace(error=error, is_near=is_near, tolerance=tolerance)

@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sidestep.tabular.solvers import native
+from sidestep.tabular.solvers.bound_kernels import bound_by_potential
 from sidestep.tabular.solvers.bounds import MoveCosts
 from sidestep.tabular.solvers.ordering import NumberedProcess
 from sidestep.tabular.solvers.value_kernels import SweepHistory, sweep_kernel
@@ -108,6 +109,9 @@ class SweepLoop:
             if residual <= self.tolerance and not self._limit_reached():
                 residual, change = self.jacobi_sweep()
                 error, size = self._error(change)
+                if np.isfinite(error) and error > largest_error * size:
+                    solved = self.process, self.backup, self.costs, self.values, self.positions
+                    error = min(error, bound_by_potential(*solved))
                 is_near = not np.isfinite(error) or error <= largest_error * size
                 converged = bool(residual <= self.tolerance and is_near)
                 if not is_near:
