@@ -170,7 +170,7 @@ def test_fit_dynamics_newton_steps_end_at_the_maximum_of_transitions():
     mode = np.sum(FOLLOWING - STATES - WAYS[CHOICES]) / NOISE**2 / precision
     np.testing.assert_allclose(result.dynamics.parameters, [mode], atol=1e-9)
     np.testing.assert_allclose(result.verification.covariance, [[1 / precision]])
-    assert (result.verification.noise, result.converged) == (0, True)
+    assert (result.verification.noise, result.verification.samples, result.converged) == (0, 0, True)
 
 
 @pytest.mark.slow

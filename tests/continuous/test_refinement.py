@@ -16,7 +16,7 @@ class Objective:
     `information` is the expected one: the steps' noise is normal with its inverse as covariance, times noise².
     """
 
-    def __init__(self, slope, information, *, least_noise=0.0, seed=0, **figures):
+    def __init__(self, slope, information, *, least_noise: float | None = 0.0, seed=0, **figures):
         self.slope, self.information = slope, np.atleast_2d(information)
         self.random, self.least_noise, self.figures = np.random.default_rng(seed), least_noise, figures
         self.noises, self.places = [], []

@@ -47,6 +47,14 @@ def test_schedule_falls_along_a_cosine_to_a_twentieth():
     np.testing.assert_allclose([schedule.fraction(jnp.asarray(k)) for k in at], cosine, rtol=1e-6)
 
 
+def test_schedule_tolerances_are_those_of_the_page():
+    """A converged fit is half a posterior standard deviation from its maximum at most, and its policy .1 nats away."""
+    schedule = sc.Schedule()
+    assert (schedule.distance_tolerance, schedule.noise_tolerance, schedule.policy_gap_tolerance) == (0.5, 0.25, 0.1)
+    # eight steps have a mean with the noise that is asked for
+    assert schedule.step_noise / np.sqrt(8) == pytest.approx(schedule.noise_tolerance)
+
+
 def figures(**changes):
     numbers = {"distance": 0.7, "noise": 0.3, "policy_gap": -0.09, "beyond_horizon": 0.05, "unfinished": 0.1}
     arrays = np.zeros(1), np.ones(1), np.ones((1, 1)), np.zeros(1)

@@ -77,7 +77,7 @@ def test_gather_trajectories_truncated_walks_stay_so():
     """Two moves of one do not lead to a goal that is 0.6 around 3, from 0; they do from 1.5."""
     task = sc.reach_region((3.0,), 0.6, discount=1.0, step_cost=1.0)
     real = sc.ObstacleMotion(
-        sc.Walls(jnp.ones((1, 1)), jnp.ones((1, 1))), jnp.zeros(1), jnp.full(1, 4.0), jnp.full(1, 0.01)
+        sc.Walls(low=jnp.ones((1, 1)), high=jnp.ones((1, 1))), jnp.zeros(1), jnp.full(1, 4.0), jnp.full(1, 0.01)
     )
     agent = sc.LatticePlanner(real, jnp.array([[-1.0], [1.0]]), SHARP, sc.Lattice(jnp.zeros(1), jnp.full(1, 4.0), (9,)))
     walks = sc.simulate_trajectories(KEY, agent, real, [task], [np.array([[0.0], [1.5]])], 2)

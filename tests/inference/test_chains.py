@@ -74,6 +74,7 @@ SETTINGS = {
 
 # the longest of all, where no cache has the native code: three kinds of it (4 and 8 moves, slips)
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:agents of task 0 avoid its goal")  # as log-sum-exp agents do at this β
 @pytest.mark.parametrize("name", SETTINGS)
 def test_chain_after_sweeps_has_the_values_and_likelihood_of_its_map(name):
     kind, settings = SETTINGS[name]

@@ -27,6 +27,9 @@ References:
     simultaneous estimation of rewards and dynamics. Artificial Intelligence and Statistics.
 """
 
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -35,7 +38,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sidestep.baselines.interface import ModelResult, check_arguments, model_result, with_normal_prior
-from sidestep.errors import NotConverged
+from sidestep.errors import NotConverged, SidestepWarning
 from sidestep.inference.fit import fit
 from sidestep.inference.optimizers import LBFGS
 from sidestep.maps.config import MapConfig
@@ -94,13 +97,22 @@ def maxent_irl(grid: Grid, demonstrations: Demonstrations, config: MapConfig) ->
     check_arguments(grid, demonstrations, config)
     model, agents = true_model(grid.passable()), cost_behavior_model(grid, config)
     optimizer, options = LBFGS(_ITERATIONS, _TOLERANCE), SolveOptions(horizon=config.behavior.horizon)
-    result = fit(model, demonstrations, agents, terms=("actions",), optimizer=optimizer, options=options)
+    with _agents_may_wander():
+        result = fit(model, demonstrations, agents, terms=("actions",), optimizer=optimizer, options=options)
     if not result.converged:
         raise NotConverged(f"the costs of cells did not converge: {result.message}")
     costs = np.asarray(result.behavior.costs)
     reward = CostlyReward(config.reward.discount, config.reward.step_cost, costs=costs)
     planner = ModelPlanner(model, partial(reward.reach, model.blank))
     return ModelResult(model, reward, result.behavior.behavior_of(), costs.reshape(grid.shape), planner, True, options)
+
+
+@contextmanager
+def _agents_may_wander() -> Iterator[None]:
+    """Say nothing of agents that avoid their goal: the method has the log-sum-exp, and others need not know."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SidestepWarning)
+        yield
 
 
 def cost_behavior_model(grid: Grid, config: MapConfig) -> BehaviorModel:
@@ -128,7 +140,8 @@ def joint_estimation(grid: Grid, demonstrations: Demonstrations, config: MapConf
     check_arguments(grid, demonstrations, config)
     config = with_normal_prior(config)
     model, agents = ObstacleGrid(grid, config.prior.first_logit), cost_behavior_model(grid, config)
-    fit = fit_map(model, demonstrations, config, behavior=agents)
+    with _agents_may_wander():
+        fit = fit_map(model, demonstrations, config, behavior=agents)
     result = model_result(fit.model, demonstrations, config)
     reward = CostlyReward(config.reward.discount, config.reward.step_cost, costs=np.asarray(fit.behavior.costs))
     return result._replace(reward=reward, behavior=fit.behavior.behavior_of(), converged=fit.converged)

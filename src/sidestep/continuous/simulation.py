@@ -114,14 +114,23 @@ def gather_trajectories(trajectories: Sequence[Trajectory], tasks: Sequence[Cont
     trajectories = to_list(trajectories, Trajectory, "trajectories")
     checked = [_checked(trajectory, trajectories[0], len(tasks), row) for row, trajectory in enumerate(trajectories, 1)]
     states, actions, *of_each = zip(*checked, strict=True)
-    parts = [each[:-1] for each in states], actions, [each[1:] for each in states]
-    moves = (to_jax(np.concatenate(part)) for part in parts)
+    leaving, taken, following = (
+        to_jax(np.concatenate(part))
+        for part in ([each[:-1] for each in states], actions, [each[1:] for each in states])
+    )
     lengths = [len(each) for each in actions]
     task, truncated, trajectory = (
         np.repeat(each, lengths) for each in (*of_each, np.arange(len(lengths), dtype=np.int32))
     )
-    numbers = to_jax(task.astype(np.int32)), to_jax(trajectory)
-    demonstrations = Demonstrations(*moves, *numbers, tasks=batched, truncated=to_jax(truncated))
+    demonstrations = Demonstrations(
+        leaving,
+        taken,
+        following,
+        to_jax(task.astype(np.int32)),
+        to_jax(trajectory),
+        batched,
+        truncated=to_jax(truncated),
+    )
     ended = np.asarray(has_ended(batched, demonstrations.task, demonstrations.states))
     row = int(trajectory[ended.argmax()]) + 1
     state = demonstrations.states[int(ended.argmax())]

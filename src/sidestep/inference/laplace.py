@@ -88,7 +88,9 @@ def behavior_estimates(fit: Fit[Any]) -> dict[str, Estimate]:
         states and tasks, and where the posterior has no normal approximation.
     """
     parameters = Parameters(fit.model.parameters, fit.behavior.parameters)
-    numbers, count = jax.jit(_typical)(parameters), sum(leaf.size for leaf in jax.tree.leaves(parameters))
+    values, count = jax.jit(_typical)(parameters), sum(leaf.size for leaf in jax.tree.leaves(parameters))
+    # a compiled function returns them by the alphabet
+    numbers = {name: values[name] for name in ("beta", "lapse", "discount") if name in values}
     errors: list[float | None] = [None] * len(numbers)
     if numbers and count * fit.problem.demonstrations.tasks.terminal.size <= _SMALL:
         with suppress(SidestepError):
