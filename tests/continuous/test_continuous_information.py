@@ -213,3 +213,16 @@ def test_laplace_of_the_boltzmann_average_by_rollouts_raises():
 def test_fit_dynamics_of_agents_with_lapses_raises():
     with pytest.raises(ss.InputError, match="'lapse': expected an agent without lapses"):
         learn(("actions",), ss.Behavior(ss.HardMax(), BETA, 0.1))
+
+
+def test_information_of_transitions_is_exact_and_has_no_errors_by_rollouts():
+    """A drift's information is moves / noise², and 1 / variance by the prior."""
+    fit = fitted(("transitions",))
+    information, vectors = fit.information(), np.array([[1.0], [-2.0], [0.5]])
+    np.testing.assert_allclose(information.of_prior(vectors), vectors / VARIANCE)
+    np.testing.assert_allclose(information.products(vectors), vectors * (MOVES / NOISE**2 + 1 / VARIANCE), rtol=1e-6)
+    normal = ss.laplace(fit)
+    assert information.simulation(normal) == (0.0, 0.0)
+    np.testing.assert_allclose(
+        normal.covariance_products(vectors), vectors / (MOVES / NOISE**2 + 1 / VARIANCE), rtol=1e-6
+    )

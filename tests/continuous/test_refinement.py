@@ -19,7 +19,7 @@ class Objective:
     def __init__(self, slope, information, *, least_noise: float | None = 0.0, seed=0, **figures):
         self.slope, self.information = slope, np.atleast_2d(information)
         self.random, self.least_noise, self.figures = np.random.default_rng(seed), least_noise, figures
-        self.noises, self.places = [], []
+        self.noises, self.places, self.steps = [], [], []
 
     def __call__(self, flat, state, noise):
         noise, size = max(noise, self.least_noise) if self.least_noise is not None else 0.0, len(flat)
@@ -33,6 +33,7 @@ class Objective:
         figures = {"policy_gap": 0.0, "beyond_horizon": 0.0, "unfinished": 0.0} | self.figures
         self.noises.append(noise)
         self.places.append(flat)
+        self.steps.append(step)
         numbers = gradient, np.abs(errors), covariance, step, float(distance), float(noise)
         return Visit(flat, state, Verification(*numbers, **figures, samples=8))
 
@@ -90,6 +91,27 @@ def test_refine_signal_in_many_directions_is_followed():
     objective = Objective(lambda flat: -flat, np.eye(100))
     refined(objective, np.full(100, 1.9))
     assert np.sqrt(np.mean(objective.places[1] ** 2)) < 0.6 * 1.9
+
+
+def test_refine_noise_alone_takes_back_few_steps():
+    """Whole steps lead on from the place before; one that was taken back leads on from an earlier one."""
+    kept = []
+    for seed in range(40):
+        objective = Objective(quadratic, QUADRATIC, seed=seed)
+        refined(objective, [0.0, 0.0])
+        kept += [
+            np.allclose(at + step, to)
+            for at, step, to in zip(objective.places[:10], objective.steps, objective.places[1:], strict=False)
+        ]
+    assert np.mean(kept) > 0.98
+
+
+@pytest.mark.parametrize("count", [1, 2, 40])
+def test_refine_steps_that_lead_away_by_more_than_noise_are_shortened(count):
+    """The expected information is a quarter of the curvature: whole steps go three times as far to the other side."""
+    objective = Objective(lambda flat: -4 * flat, np.eye(count), least_noise=0.05)
+    last = refined(objective, np.full(count, 0.6), sc.Schedule(distance_tolerance=0.2))
+    assert np.sqrt(np.mean(last.flat**2)) < 0.1
 
 
 def shoulder(flat):
