@@ -30,7 +30,7 @@ SPEED = frozenset({
     *("filter_checkpoint", "override", "abstractmethod", "runtime_checkable", "overload", "short_repr"),
 })  # fmt: skip
 """Decorators that change speed, types or texts only."""
-WITHOUT_EFFECT = frozenset(["strict", "stacklevel", "unroll", "nogil", "inline", "static_argnames", "donate"])
+WITHOUT_EFFECT = frozenset(["strict", "stacklevel", "unroll", "nogil", "inline", "static", "static_argnames", "donate"])
 """Arguments that change no result of a call that is right."""
 SPEED_CONSTANTS = frozenset({
     *("MEMORY", "LARGE_MAP", "SMALL_PROBLEM", "_BATCH", "_BLOCK_FACTOR", "_CHUNK", "_FIXED_WORKSPACE", "_MIN_LENGTH"),
