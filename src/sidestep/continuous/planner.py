@@ -142,7 +142,7 @@ class Planner(eqx.Module):
 
         Raises:
             InputError: For no start where a task goes on.
-        NotConverged: For rollouts with numbers that are not finite.
+            NotConverged: For rollouts with numbers that are not finite.
         """
         critic_key, *first = _first_moves(self, agent, tasks, states, key)
         acting, *examples = map(np.asarray, first)
