@@ -66,7 +66,6 @@ def fitted(seed=0):
 # Results
 
 
-@pytest.mark.slow
 def test_fit_dynamics_transitions_alone_give_least_squares():
     seen = np.column_stack([STATES, WAYS[CHOICES]])
     following = seen @ [0.7, 0.5] + 0.3 * np.random.default_rng(0).normal(size=MOVES)

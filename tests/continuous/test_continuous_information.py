@@ -151,7 +151,6 @@ def test_information_of_vector_actions_knows_the_noise_of_drawn_choices():
     assert np.mean(known) / 2 < noise < 2 * np.mean(known)
 
 
-@pytest.mark.slow
 def test_laplace_of_linear_dynamics_has_the_covariance_of_least_squares():
     states, choices, _ = walks()
     seen = np.column_stack([WAYS[choices], states])  # in the order of the parameters' names
@@ -172,7 +171,6 @@ def test_laplace_of_linear_dynamics_has_the_covariance_of_least_squares():
 # Refusals
 
 
-@pytest.mark.slow
 def test_laplace_of_a_continuous_fit_away_from_its_maximum_raises():
     away = eqx.tree_at(lambda fit: fit.dynamics.parameters, fitted(("transitions",)), vector(1.0))
     with pytest.raises(ss.InputError, match=r"standard errors from it \(the maximum is"):

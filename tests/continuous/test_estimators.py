@@ -98,7 +98,6 @@ def exact_table(name, world, level, tilt=0.0):
     return values, q, np.asarray(gradient).ravel()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("name", "critic"), [
     ("log-sum-exp", "no"), ("log-sum-exp", "an exact"), ("log-sum-exp", "a wrong"), ("Boltzmann", "a wrong"),
 ])  # fmt: skip
@@ -168,7 +167,6 @@ def test_value_gradient_exact_critic_halves_the_variance():
     assert draw(critic=critic_of(values)).var(axis=0).sum() < 0.5 * draw().var(axis=0).sum()
 
 
-@pytest.mark.slow
 def test_with_control_variates_exact_critic_removes_all_noise():
     pi = small_worlds.exact_policy(TABLE, SOFT)
     values, q = exact_values(TABLE, TABLE.dynamics.parameters, pi, 40, small_worlds.entropies(pi) / BETA)
@@ -185,7 +183,6 @@ def test_with_control_variates_exact_critic_removes_all_noise():
     np.testing.assert_allclose(known, np.broadcast_to(q[WHICH, PLACES][..., None], known.shape), atol=1e-3)
 
 
-@pytest.mark.slow
 def test_value_gradient_control_variate_removes_the_noise_of_a_single_draw():
     """With one move only terminal rewards follow, which are known."""
     pi = small_worlds.policy_table(TABLE.policy)
@@ -259,7 +256,6 @@ def along_paths():
     return drawn(7, 10 * MANY, LINEAR, SOFT, AROUND, WEIGHTS_AROUND, estimator="pathwise")
 
 
-@pytest.mark.slow
 def test_value_gradient_pathwise_in_linear_world_matches_closed_form(along_paths, closed_form):
     assert_agrees(along_paths, closed_form, precision=0.005)
 
@@ -268,7 +264,6 @@ def test_value_gradient_pathwise_error_falls_as_root_of_rollouts(along_paths, cl
     assert_falls_as_root(along_paths, closed_form)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("critic", [None, wrong_critic()], ids=["no critic", "a wrong critic"])
 def test_value_gradient_score_in_linear_world_matches_closed_form_with_more_noise(along_paths, closed_form, critic):
     scores = drawn(8, MANY, LINEAR, SOFT, AROUND, WEIGHTS_AROUND, critic=critic)
@@ -306,7 +301,6 @@ def value_by_all_paths(policy):
     return value
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("critic", [None, wrong_critic()], ids=["no critic", "a wrong critic"])
 def test_value_gradient_pathwise_over_finite_actions_matches_exact_sum(critic):
     world = choosing(noise=1e-3)
@@ -315,7 +309,6 @@ def test_value_gradient_pathwise_over_finite_actions_matches_exact_sum(critic):
     assert_agrees(sample, exact, precision=0.03)
 
 
-@pytest.mark.slow
 def test_value_gradient_pathwise_and_score_agree_over_finite_actions():
     world = choosing(noise=0.3)
     draw = partial(drawn, 10, MANY, world, SOFT, PUSHED, PARTS, horizon=MOVES)

@@ -143,7 +143,6 @@ def exact_figures(pi, optimal):
     return earned[WHICH, PLACES].mean(), jnp.linalg.norm(slope), entropy, gap
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("behavior", [SOFT, OPTIMAL], ids=["log-sum-exp", "hard max"])
 @pytest.mark.parametrize("policy", [UNIFORM, WORLD.policy], ids=["uniform", "another"])
 def test_progress_figures_match_dynamic_programming(policy, behavior, initial):

@@ -408,10 +408,9 @@ def fit_critic(
     learned, fixed = eqx.partition(critic, eqx.is_inexact_array)
 
     def loss(learned: Tree, features: Array, left: Array, returns: Array, acting: Array) -> Array:
-        """Return the mean squared error, in units of the critic's spread."""
-        critic = eqx.combine(learned, fixed)
-        squares = jnp.where(acting, (jax.vmap(critic)(features, left) - returns) ** 2, 0.0) / critic.spread**2
-        return squares.sum() / jnp.maximum(acting.sum(), 1)
+        """Return the mean squared error, in units of the critic's spread, which is not learned."""
+        errors = (jax.vmap(eqx.combine(learned, fixed))(features, left) - returns) / critic.spread
+        return jnp.where(acting, errors**2, 0.0).sum() / jnp.maximum(acting.sum(), 1)
 
     def step(carry: tuple[Tree, Tree], batch: tuple[Array, Array, Array, Array]) -> tuple[tuple, None]:
         learned, moments = carry
