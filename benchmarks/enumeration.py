@@ -20,7 +20,7 @@ import numpy as np
 
 import sidestep as ss
 from benchmarks import Record, groups, note, option, print_table
-from sidestep.inference.chains import PASSING, crossed_barriers
+from sidestep.inference.chain_evidence import PASSING, crossed_barriers
 from sidestep.inference.enumeration import enumerate_barriers
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.inference.sampler import sample_barriers

@@ -99,6 +99,7 @@ from .inference.criteria import (
 )
 from .inference.cross_validation import CrossValidation as CrossValidation, cross_validate as cross_validate
 from .inference.diagnostics import effective_sizes as effective_sizes, split_rhat as split_rhat
+from .inference.devices import tasks_mesh as tasks_mesh
 from .inference.enumeration import ExactPosterior as ExactPosterior, enumerate_barriers as enumerate_barriers
 from .inference.fit import Estimate as Estimate, Fit as Fit, fit as fit
 from .inference.maximize import Progress as Progress, Status as Status
@@ -110,7 +111,7 @@ from .inference.mean_field import MeanField as MeanField
 from .inference.hierarchical import HierarchicalMRF as HierarchicalMRF, hierarchical_mrf as hierarchical_mrf
 from .inference.mrf import BinaryMRF as BinaryMRF
 from .inference.nuts import Draws as Draws, sample as sample
-from .inference.objective import Parameters as Parameters, tasks_mesh as tasks_mesh
+from .inference.objective import Parameters as Parameters
 from .inference.optimizers import LBFGS as LBFGS, Adam as Adam, Optimizer as Optimizer, Rprop as Rprop
 from .inference.pointwise import (
     PointwiseLogLikelihood as PointwiseLogLikelihood,

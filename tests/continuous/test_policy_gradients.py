@@ -14,7 +14,7 @@ import sidestep as ss
 import sidestep.continuous as sc
 from helpers import small_worlds
 from helpers.small_worlds import ACTIONS, PLACES, STATES, TASKS, WHICH, entropies, exact_values, policy_table
-from sidestep.continuous.planner import minibatches
+from sidestep.continuous.policy_steps import minibatches
 
 WORLD, BETA = small_worlds.table(), 1.5
 SOFT, OPTIMAL = ss.Behavior(ss.LogSumExp(), BETA), ss.Behavior(ss.HardMax(), BETA)

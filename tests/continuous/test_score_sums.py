@@ -14,8 +14,8 @@ import sidestep.continuous as sc
 from helpers import small_worlds
 from helpers.small_worlds import ACTIONS, STATES, TASKS
 from sidestep.continuous.estimators import half_gradients, score_surrogate
-from sidestep.continuous.planner import fit_critic, minibatches, policy_gradient
 from sidestep.continuous.policies import ScaledNetwork
+from sidestep.continuous.policy_steps import fit_critic, minibatches, policy_gradient
 from sidestep.continuous.rollouts import Rollout
 
 WORLD, BETA, HORIZON, HALF = small_worlds.table(), 2.0, 3, 2

@@ -19,7 +19,7 @@ from sidestep.experiments.calibration_cases import (
     simulate_walks,
     world_of,
 )
-from sidestep.inference.chains import PASSING
+from sidestep.inference.chain_evidence import PASSING
 from sidestep.inference.prior_chains import sample_prior
 
 SMALL = CalibrationConfig(maps=30, rows=5, walks=8, moves=10, sweeps=60, draws=20)

@@ -13,7 +13,7 @@ import numpy as np
 
 from helpers.problems import TURNS
 from helpers.walled import follow
-from sidestep.inference.chains import PASSING
+from sidestep.inference.chain_evidence import PASSING
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.tabular.backups import Backup, Behavior, BoltzmannAverage
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather

@@ -13,8 +13,9 @@ from helpers.walled import BLANK, PATHS, follow
 from sidestep.errors import InputError
 from sidestep.inference.batching import MEMORY, BatchPlan, plan_batches
 from sidestep.inference.checkpoints import Checkpoint
+from sidestep.inference.devices import tasks_mesh
 from sidestep.inference.fit import fit
-from sidestep.inference.objective import Objective, Parameters, Problem, tasks_mesh
+from sidestep.inference.objective import Objective, Parameters, Problem
 from sidestep.inference.optimizers import LBFGS
 from sidestep.inference.priors import Normal
 from sidestep.tabular.backups import Behavior, BoltzmannAverage

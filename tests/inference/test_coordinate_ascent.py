@@ -11,7 +11,7 @@ from scipy.special import expit
 
 from helpers.barrier_worlds import COSTLY, DISCOUNTED, RIGHT, UP, BarrierWorld, all_maps, corridor, room, world
 from sidestep.errors import ImproperTask, InputError
-from sidestep.inference.chains import PASSING
+from sidestep.inference.chain_evidence import PASSING
 from sidestep.inference.checkpoints import Checkpoint
 from sidestep.inference.coordinate_ascent import BarrierMeanField, mean_field_barriers, prior_mean_field
 from sidestep.inference.enumeration import enumerate_barriers

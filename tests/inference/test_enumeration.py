@@ -8,7 +8,7 @@ import pytest
 from helpers.barrier_worlds import COSTLY, RIGHT, all_maps, corridor, exact_model, world
 from helpers.problems import dense_obstacles, plain_policy, plain_values
 from sidestep.errors import InputError, NotConverged
-from sidestep.inference.chains import PASSING
+from sidestep.inference.chain_evidence import PASSING
 from sidestep.inference.enumeration import ExactPosterior, enumerate_barriers
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.tabular.backups import Behavior, BoltzmannAverage

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sidestep.errors import InputError
-from sidestep.inference.chains import PASSING
+from sidestep.inference.chain_evidence import PASSING
 from sidestep.inference.checkpoints import Checkpoint, Saver
 from sidestep.inference.hierarchical import as_hierarchical, hierarchical_mrf
 from sidestep.inference.mrf import BinaryMRF

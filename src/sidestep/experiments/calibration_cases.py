@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 import sidestep as ss
 from sidestep.errors import InputError, check, check_count
 from sidestep.evaluation.metrics import shortest_lengths
-from sidestep.inference.chains import PASSING
+from sidestep.inference.chain_evidence import PASSING
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.inference.prior_chains import sample_prior
 from sidestep.maps.config import SHAPE_WEIGHTS, PosteriorConfig, PosteriorMethod, PriorConfig

@@ -1,10 +1,10 @@
 """A Metropolis chain over the barriers of a model: its state, its evidence, and its sweeps.
 
-`sampler` describes the chain, `chain_kernels` holds its native code. Values are solved from nothing before the first
-sweep, by the solver of `sidestep.tabular.solvers.values`, and followed by local value iteration from then on.
+`sampler` describes the chain, `chain_evidence` has what it reads of world and demonstrations, and `chain_kernels` its
+native code. Values are solved from nothing before the first sweep, by the solver of `sidestep.tabular.solvers.values`,
+and followed by local value iteration from then on.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from sidestep.errors import InputError, NotConverged, check, check_instance, to_count
 from sidestep.inference.arguments import check_evidence
+from sidestep.inference.chain_evidence import crossed_barriers, evidence_of, world_of
 from sidestep.inference.chain_kernels import Chain, ChainKernels, Evidence, Workspace, World, chain_kernels
 from sidestep.inference.hierarchical import HierarchicalMRF, as_hierarchical, evidence_normalizers
 from sidestep.inference.mrf import BinaryMRF
@@ -24,23 +25,18 @@ from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Cell
 from sidestep.tabular.likelihood import ALL_TERMS, Terms
 from sidestep.tabular.models import TransitionModel
-from sidestep.tabular.models.barriers import NO_BARRIER, Barriers, barriers_of
+from sidestep.tabular.models.barriers import Barriers, barriers_of
 from sidestep.tabular.proper import check_proper
 from sidestep.tabular.solvers.base import SolveResult, WarmStart
 from sidestep.tabular.solvers.bounds import MoveCosts
 from sidestep.tabular.solvers.gauss_seidel import KERNELS
 from sidestep.tabular.solvers.native import HostProcess, NativeBackup, NativeEquation
 from sidestep.tabular.solvers.values import solve_values
-from sidestep.tabular.tasks import Task
 
-PASSING = (0.997, 0.003)
-"""The probability that an open barrier, and a closed one, lets an agent pass."""
 _FRESH_SWEEPS = 10
 """The number of sweeps after which all states are solved again, from the values at hand."""
-_TOLERANCE = 7e-4
-"""The change of β V that is passed on (nats)."""
 _FINER = 0.01
-"""The factor of that tolerance where all states are solved again."""
+"""The factor of the evidence's tolerance where all states are solved again."""
 _EXACT, _MAX_SWEEPS = 1e-9, 5_000
 """The tolerance of values solved from nothing, and the most sweeps."""
 
@@ -295,8 +291,8 @@ def barrier_problem(
     hierarchical = as_hierarchical(prior)
     return BarrierProblem(
         barriers,
-        _world_of(barriers),
-        _evidence_of(barriers, demonstrations, tasks, behaviors, mask, weight, terms),
+        world_of(barriers),
+        evidence_of(barriers, demonstrations, tasks, behaviors, mask, weight, terms),
         hierarchical,
         evidence_normalizers(hierarchical, barriers.known, free, seed),
         free,
@@ -304,54 +300,6 @@ def barrier_problem(
         np.array(tasks.terminal),
         np.array(tasks.terminal_reward, np.float64),
         mask,
-    )
-
-
-def _world_of(barriers: Barriers) -> World:
-    """Return barriers with what depends on which."""
-    passing = np.where(
-        (barriers.known == Cell.UNKNOWN)[:, None], PASSING, np.where(barriers.known == Cell.FREE, 1.0, 0.0)[:, None]
-    )
-    states = np.arange(len(barriers.successors))
-    needed = barriers.needed
-    state = np.nonzero(needed != NO_BARRIER)[0]
-    gated_begin, gated = _grouped(needed[needed != NO_BARRIER], state, len(barriers.known))
-    leads = (barriers.attempts > 0) & (barriers.successors != states[:, None, None])
-    before_begin, before = _grouped(barriers.successors[leads], np.nonzero(leads)[0], len(states))
-    successors = np.where(_possible(barriers), barriers.successors, states[:, None, None])
-    return World(
-        successors.astype(np.int32), barriers.attempts, needed.astype(np.int32), passing,
-        gated_begin, gated, before_begin, before,
-    )  # fmt: skip
-
-
-def _evidence_of(
-    barriers: Barriers,
-    demonstrations: Demonstrations,
-    tasks: Task,
-    behaviors: Sequence[Behavior],
-    available: Bool[np.ndarray, "states actions"],
-    weight: float,
-    terms: Terms,
-) -> Evidence:
-    """Return the tasks, with the behavior of each, and the observed moves; `weight` is that of the actions."""
-    discount, reward = np.array(tasks.discount, np.float64), np.array(tasks.reward, np.float64)
-    moved, stayed = _transitions(barriers, demonstrations, terms)
-    choice_row, choices = _choices(demonstrations, barriers.successors.shape[1])
-    beta = np.array([float(each.beta) for each in behaviors])
-    return Evidence(
-        reward=reward if available.all() else np.where(available, reward, -np.inf),
-        choosable=available.sum(axis=1),
-        solved=_solvable(barriers, np.array(tasks.terminal), discount),
-        discount=discount,
-        beta=beta,
-        lapse=np.array([0.0 if each.lapse is None else float(each.lapse) for each in behaviors]),
-        tolerance=_TOLERANCE / beta,
-        choice_row=choice_row,
-        choices=weight * choices,
-        moved=moved,
-        stayed=stayed,
-        has_transitions=np.asarray(moved.any(axis=(1, 2)) | stayed.any(axis=1)),
     )
 
 
@@ -407,89 +355,3 @@ def _solved(equation: NativeEquation) -> Float[np.ndarray, " states"]:
     if not result.converged:
         raise NotConverged(f"the values of a task did not converge in {_MAX_SWEEPS} sweeps")
     return arrays[0]
-
-
-def _grouped(keys: np.ndarray, items: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distinct items of each key, one group after another, and where each group begins."""
-    pairs = np.unique(np.stack([keys, items], axis=1), axis=0)
-    begin = np.searchsorted(pairs[:, 0], np.arange(groups + 1))
-    return begin.astype(np.int64), pairs[:, 1].astype(np.int64)
-
-
-def _solvable(barriers: Barriers, terminal: np.ndarray, discount: np.ndarray) -> np.ndarray:
-    """Return whether each task goes on in each state and its value is finite, were all unknown barriers open.
-
-    At discount 1 this is where a task can end from, below 1 everywhere.
-    """
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import breadth_first_order
-
-    possible = _possible(barriers)
-    state = np.nonzero(possible)[0]
-    size = len(possible)
-    solvable = np.zeros(terminal.shape, bool)
-    for task, ends in enumerate(terminal):
-        # one more state leads to every end
-        rows = np.concatenate([barriers.successors[possible], np.full(ends.sum(), size)])
-        columns = np.concatenate([state, np.flatnonzero(ends)])
-        graph = csr_array((np.ones(len(rows)), (rows, columns)), shape=(size + 1, size + 1))
-        reached = breadth_first_order(graph, size, return_predecessors=False)
-        solvable[task, reached[reached < size]] = True
-    return (solvable | (discount < 1)[:, None]) & ~terminal
-
-
-def _possible(barriers: Barriers) -> Bool[np.ndarray, "states actions attempts"]:
-    """Return whether each attempt can succeed, were all unknown barriers open."""
-    closed = np.append(barriers.known == Cell.OCCUPIED, False)
-    return (barriers.attempts > 0) & ~closed[barriers.needed].any(axis=-1)
-
-
-def _transitions(barriers: Barriers, demonstrations: Demonstrations, terms: Terms) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights of observed transitions by each attempt, and of those that stayed."""
-    moved, stayed = np.zeros(barriers.successors.shape), np.zeros(barriers.successors.shape[:2])
-    if "transitions" not in terms:
-        return moved, stayed
-    s, a, after, weight = (
-        np.asarray(each)
-        for each in (demonstrations.states, demonstrations.actions, demonstrations.next_states, demonstrations.weights)
-    )
-    stays = s == after
-    np.add.at(stayed, (s[stays], a[stays]), weight[stays])
-    s, a, after, weight = (each[~stays] for each in (s, a, after, weight))
-    leads = (barriers.successors[s, a] == after[:, None]) & _possible(barriers)[s, a]
-    check(leads.any(axis=-1).all(), "expected transitions that the model allows", field="demonstrations")
-    np.add.at(moved, (s, a, leads.argmax(axis=-1)), weight)
-    return moved, stayed
-
-
-def crossed_barriers(barriers: Barriers, demonstrations: Demonstrations, terms: Terms) -> Bool[np.ndarray, " barriers"]:
-    """Return the barriers that agents crossed, and where these are cells, those that agents were in; they are open.
-
-    Args:
-        barriers: The barriers.
-        demonstrations: The moves; those of weight 0 do not count.
-        terms: The parts of the likelihood that count; without transitions nothing is crossed.
-    """
-    crossed = np.zeros(len(barriers.known) + 1, bool)
-    if "transitions" in terms:
-        crossed[barriers.needed[_transitions(barriers, demonstrations, terms)[0] > 0]] = True
-        if barriers.shape is not None:
-            counts = np.asarray(demonstrations.weights) > 0
-            for each in (demonstrations.states, demonstrations.next_states):
-                crossed[np.asarray(each)[counts]] = True
-    return crossed[:-1] & (barriers.known == Cell.UNKNOWN)
-
-
-def _choices(demonstrations: Demonstrations, actions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the row of each task and state in which actions were observed, and the weight of each action there."""
-    task, s, a, weight = (
-        np.asarray(each)
-        for each in (demonstrations.task, demonstrations.states, demonstrations.actions, demonstrations.weights)
-    )
-    shape = np.asarray(demonstrations.tasks.terminal).shape
-    row, flat = np.full(shape, -1, np.int32), task.astype(np.int64) * shape[1] + s
-    distinct, which = np.unique(flat, return_inverse=True)
-    row.reshape(-1)[distinct] = np.arange(len(distinct))
-    choices = np.zeros((len(distinct), actions))
-    np.add.at(choices, (which, a), weight)
-    return row, choices

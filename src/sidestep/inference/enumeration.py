@@ -11,7 +11,8 @@ from jaxtyping import Array, Float, Int
 from sidestep._repr import short_repr
 from sidestep.errors import NotConverged, check, to_count
 from sidestep.inference.arguments import check_evidence
-from sidestep.inference.chains import PASSING, check_possible, check_prior, crossed_barriers
+from sidestep.inference.chain_evidence import PASSING, crossed_barriers
+from sidestep.inference.chains import check_possible, check_prior
 from sidestep.inference.hierarchical import HierarchicalMRF, as_hierarchical, evidence_normalizers
 from sidestep.inference.mrf import BinaryMRF
 from sidestep.tabular.arrays import to_jax

@@ -16,7 +16,7 @@ states. These are estimates, so an evaluation that a result relies on must not u
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -28,9 +28,9 @@ from jaxtyping import Array, Bool, Float, Int
 from sidestep._programs import keep_program
 from sidestep._repr import short_repr
 from sidestep._typing import Tree
-from sidestep.errors import InputError, to_list
 from sidestep.inference.batching import Batch, BatchPlan, make_batches, plan_batches
 from sidestep.inference.checkpoints import fingerprint
+from sidestep.inference.devices import AXIS, replicate, shard
 from sidestep.inference.priors import Prior
 from sidestep.tabular.behavior_model import BehaviorModel, BehaviorParameters
 from sidestep.tabular.demonstrations import Demonstrations
@@ -40,9 +40,6 @@ from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.solvers.base import Solver, WarmStart, is_reachable
 
 Flag = Bool[Array | np.ndarray, ""]
-
-AXIS = "tasks"
-"""The name of a mesh's axis, over which tasks are spread."""
 
 
 @short_repr()
@@ -194,17 +191,17 @@ class Objective:
         terminal, uses_actions = problem.demonstrations.tasks.terminal, "actions" in problem.terms
         self.plan: BatchPlan = plan or plan_batches(problem.model, problem.solver, len(terminal))
         if jax.process_count() > 1:  # copies tell whether all processes have the same problem
-            _replicate(np.frombuffer(bytes.fromhex(fingerprint(problem)), np.uint8), mesh)
+            replicate(np.frombuffer(bytes.fromhex(fingerprint(problem)), np.uint8), mesh)
         rest = problem.behavior, self.plan.size
         deadline = problem.options.deadline
         batches = make_batches(problem.demonstrations, *rest, deadline=deadline) if uses_actions else []
-        self.batches: list[Batch] = [_shard(batch, mesh) for batch in batches]
+        self.batches: list[Batch] = [shard(batch, mesh) for batch in batches]
         self.arrivals: Arrivals | None = arrivals_of(problem.demonstrations) if "transitions" in problem.terms else None
         # batches and arrivals replace the demonstrations
         problem = eqx.tree_at(lambda each: each.demonstrations, problem, None)
         person, is_none = lambda each: each.behavior.person, lambda leaf: leaf is None
         self.constants: Problem = eqx.tree_at(person, problem, None, is_leaf=is_none)
-        self.replicated: Problem = _replicate(self.constants, mesh)
+        self.replicated: Problem = replicate(self.constants, mesh)
 
     @property
     def processes(self) -> list[int]:
@@ -229,7 +226,7 @@ class Objective:
         Args:
             starts: Of each batch.
         """
-        return [_shard(start, self.mesh) for start in starts]
+        return [shard(start, self.mesh) for start in starts]
 
     def evaluate(
         self,
@@ -259,7 +256,7 @@ class Objective:
         others = _transitions_and_prior(self.problem.prior, model, behavior, self.arrivals, parameters)
         gradient, (transitions, prior) = jax.tree.map(np.asarray, others)
         here = jax.tree.map(np.asarray, parameters)
-        parameters, tolerance = _replicate((parameters, tolerance), self.mesh)
+        parameters, tolerance = replicate((parameters, tolerance), self.mesh)
         problem = _with_tolerance(self.replicated, tolerance)
         contributions, next_starts = [], []
         for index, (batch, start) in enumerate(zip(self.batches, warm_starts, strict=True)):
@@ -314,23 +311,6 @@ class Objective:
         jax.block_until_ready(sums)
         (actions, gradient), solves = _add_devices(sums, result.solves, self.mesh)
         return BatchResult(actions, gradient, result.warm_starts, solves)
-
-
-def tasks_mesh(devices: Sequence[Any] | None = None) -> Mesh:
-    """Return a mesh that spreads tasks over devices.
-
-    Args:
-        devices: JAX devices; by default all devices of all processes.
-
-    Returns:
-        The mesh, with one axis.
-
-    Example:
-        >>> tasks_mesh(jax.devices()[:1]).size
-        1
-    """
-    own = jax.devices() if devices is None else to_list(devices, jax.Device, "devices")
-    return Mesh(np.asarray(own), (AXIS,))
 
 
 def transitions_and_prior(
@@ -433,34 +413,6 @@ def _add_devices(sums: Tree, solves: SolveSummary, mesh: Mesh) -> tuple[Tree, So
     """Add the devices' sums; return them and all solves on all devices."""
     added = jax.tree.map(lambda leaf: leaf.sum(axis=0), sums)
     return jax.lax.with_sharding_constraint((added, solves), NamedSharding(mesh, PartitionSpec()))
-
-
-def _replicate(tree: Tree, mesh: Mesh | None) -> Tree:
-    """Copy arrays and numbers to each device; raise `InputError` if processes have different ones."""
-    if mesh is None:
-        return tree
-    values, rest = eqx.partition(tree, lambda leaf: eqx.is_array(leaf) or isinstance(leaf, float))
-    try:
-        values = jax.device_put(jax.tree.map(np.asarray, values), NamedSharding(mesh, PartitionSpec()))
-    except AssertionError as error:  # JAX compares the processes' arrays
-        raise InputError(
-            "expected the same model, demonstrations, settings and checkpoint in all processes, found different ones "
-            "(machines that are not of the same kind may differ in the last bits)"
-        ) from error
-    return eqx.combine(values, rest)
-
-
-def _shard(tree: Tree, mesh: Mesh | None) -> Tree:
-    """Spread arrays over tasks over the devices; a process holds the parts of its own devices."""
-    if mesh is None:
-        return tree
-    sharding = NamedSharding(mesh, PartitionSpec(AXIS))
-
-    def put(leaf: Array) -> Array:
-        array = np.asarray(leaf)
-        return jax.make_array_from_callback(array.shape, sharding, lambda index: array[index])
-
-    return jax.tree.map(put, tree)
 
 
 def _with_tolerance(problem: Problem, tolerance: float | Array | None) -> Problem:
