@@ -194,20 +194,6 @@ def test_laplace_of_few_rollouts_raises():
         ss.laplace(few)
 
 
-@pytest.mark.slow
-def test_information_of_one_rollout_raises():
-    with pytest.raises(ss.InputError, match="'samples': expected at least 2, found 1"):
-        fitted(("actions",)).information(samples=1)
-
-
-def test_laplace_of_the_boltzmann_average_by_rollouts_raises():
-    """Its gradient with the policy held fixed is that of no function."""
-    average = ss.Behavior(ss.BoltzmannAverage(), BETA)
-    result = eqx.tree_at(lambda fit: fit.problem.agent.behavior, fitted(("actions",)), average)
-    with pytest.raises(ss.InputError, match="'behavior': expected another backup"):
-        ss.laplace(result)
-
-
 def test_fit_dynamics_of_agents_with_lapses_raises():
     with pytest.raises(ss.InputError, match="'lapse': expected an agent without lapses"):
         learn(("actions",), ss.Behavior(ss.HardMax(), BETA, 0.1))

@@ -1,7 +1,8 @@
-"""Verification of fits: tolerances at their boundaries, and figures beside those of the halves of rollouts."""
+"""Verification and information of fits: tolerances at their boundaries, and figures beside the halves of rollouts."""
 
 from functools import cache
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,8 +12,11 @@ import sidestep as ss
 import sidestep.continuous as sc
 from helpers.families import Drift, vector
 from sidestep.continuous.halves import gather_halves
+from sidestep.continuous.information import RolloutInformation
 from sidestep.continuous.likelihood import FitProblem
 from sidestep.continuous.verification import Verification, verify
+from sidestep.inference.decomposition import whole
+from sidestep.inference.normal_posterior import Laplace
 
 SCHEDULE = sc.Schedule(distance_tolerance=0.5, policy_gap_tolerance=0.125)
 GOOD = Verification(
@@ -132,3 +136,52 @@ def test_verify_takes_no_more_rollouts_than_the_noise_asks_for():
     assert verified(("actions",), 0.999 * first.noise, 32).samples > 8
     assert verified(("actions",), 0.0, 32).samples == 32
     assert verified(("actions",), 0.0, 31).samples == 24
+
+
+@cache
+def of_halves(terms):
+    """Halves of eight rollouts, and the information by the same rollouts."""
+    own, state = problem(terms), planner_state(terms)
+    (halves,) = gather_halves(own, own.agent.dynamics, state, 8, jax.random.key(5))
+    return halves, RolloutInformation(own, own.agent.dynamics, state, samples=8, seed=5, message="as it is")
+
+
+@pytest.mark.parametrize("terms", [("actions",), ("actions", "transitions")])
+def test_rollout_information_is_that_of_its_halves_and_of_what_is_exact(terms):
+    halves, found = of_halves(terms)
+    gradient, information = exact_parts(terms)
+    of_actions = np.einsum("mcp,mcq->pq", *halves.factors)
+    vectors = np.array([[1.0, 0.0], [0.3, -2.0], [0.0, 1.0]])
+    np.testing.assert_allclose(found.gradient, gradient + halves.scores.mean(axis=0).sum(axis=0), rtol=1e-9)
+    products = vectors @ (information + (of_actions + of_actions.T) / 2)
+    np.testing.assert_allclose(found.products(vectors), products, rtol=1e-9)
+    np.testing.assert_allclose(found.of_prior(vectors), vectors / 2, rtol=1e-9)
+    assert (found.message, found.size) == ("as it is", 2)
+
+
+def test_simulation_is_what_the_halves_differ_by():
+    halves, found = of_halves(("actions",))
+    normal = Laplace(found.parameters, *whole(found))
+    covariance = np.linalg.inv(found.dense())
+    first, second = (np.asarray(part) @ covariance for part in halves.factors)
+    change = np.sum(first**2 - second**2, axis=1) / 2
+    by_move = np.asarray(halves.scores[0] - halves.scores[1]) / 2
+    errors, squared = found.simulation(normal)
+    assert errors == pytest.approx(max(np.sqrt(np.sum(change**2, axis=0)) / np.diag(covariance) / 2), rel=1e-6)
+    assert squared == pytest.approx(np.sum(by_move * (by_move @ covariance)), rel=1e-6)
+
+
+def test_rollout_information_of_one_rollout_is_refused():
+    own = problem(("actions",))
+    with pytest.raises(ss.InputError, match="'samples': expected at least 2, found 1"):
+        RolloutInformation(own, own.agent.dynamics, planner_state(("actions",)), samples=1)
+
+
+def test_rollout_information_of_the_boltzmann_average_is_refused():
+    own, average = problem(("actions",)), ss.Behavior(ss.BoltzmannAverage(), 1.5)
+    other = eqx.tree_at(lambda own: own.agent.behavior, own, average)
+    with pytest.raises(ss.InputError, match="'behavior': expected another backup"):
+        RolloutInformation(other, own.agent.dynamics, planner_state(("actions",)), samples=8)
+    of_transitions = eqx.tree_at(lambda own: own.agent.behavior, problem(("transitions",)), average)
+    found = RolloutInformation(of_transitions, own.agent.dynamics, planner_state(("transitions",)), samples=8)
+    np.testing.assert_allclose(found.products(np.eye(2)), exact_parts(("transitions",))[1], rtol=1e-9)

@@ -1,7 +1,7 @@
 """A fit by rollouts beside values on a lattice, which are exact but for its spacing; for up to three dimensions.
 
 The lattice has the objective and its gradient without rollouts, policies or critics: values by value iteration, their
-derivatives by the implicit function theorem. An outcome leads to the points within three standard deviations of it, in
+derivatives by the implicit function theorem. An outcome leads to the points within four standard deviations of it, in
 proportion to its normal density there. A sum over equally spaced points is so close to the integral of a normal density
 that a spacing of 1.5 standard deviations has its mean and variance to three digits (Goodwin 1949).
 """
@@ -29,6 +29,8 @@ from sidestep.tabular.solve import check_proper, solve
 
 _DIMENSIONS = 3
 """The most dimensions of a lattice here."""
+_REACH = 4
+"""How many standard deviations the noise of an outcome reaches; with 3, gradients would be 3 % too small."""
 _Numbers = Float[np.ndarray, " parameters"]
 
 
@@ -114,7 +116,7 @@ def compare_with_lattice(fit: ContinuousFit[Any, Any], lattice: Lattice) -> Latt
     ratio = np.asarray(dynamics.noise / lattice.spacing, np.float64)
     message = f"expected a spacing of at most 1.5 times the noise {dynamics.noise}, found {lattice.spacing}"
     check((ratio >= 1 / 1.5).all(), message, field="lattice")
-    reach = tuple(int(count) for count in np.ceil(3 * ratio))
+    reach = tuple(int(count) for count in np.ceil(_REACH * ratio))
     planner = NoisyPlanner(dynamics, policy.actions, problem.agent.behavior, lattice, reach)
     world = planner.tabular_model().graph
     total, slope = 0.0, -rollout_free_slope(problem, dynamics.parameters)
