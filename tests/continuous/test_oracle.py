@@ -118,7 +118,7 @@ def test_compare_with_lattice_has_the_gradient_of_a_dense_reference():
 
 
 def test_compare_with_lattice_points_around_an_outcome_have_its_mean_and_variance():
-    planner = NoisyPlanner(Drift(vector(0.0), vector(NOISE)), vector(*WAYS)[:, None], SOFT, LATTICE, (6,))
+    planner = NoisyPlanner(Drift(vector(0.0), vector(NOISE)), vector(*WAYS)[:, None], SOFT, LATTICE, (8,))
     points, weights = planner.landing(vector(0.37))
     places = np.asarray(LATTICE.points())[np.asarray(points), 0]
     assert float(weights.sum()) == pytest.approx(1)
