@@ -110,6 +110,14 @@ def test_fit_in_32_bits_converges_to_their_precision_and_says_so():
     assert abs(result.final.objective - exact.final.objective) < 1e-4 * abs(exact.final.objective)
 
 
+def test_fit_in_32_bits_with_many_nats_to_gain_is_not_converged():
+    """The prior is 10⁸ standard deviations away, so that the objective has errors of millions of nats."""
+    with jax.enable_x64(False):
+        start = ObstacleGrid(BLANK, jnp.full(25, -2.0))
+        result = fit(start, walks(BLANK), Behavior(BoltzmannAverage()), prior=Normal(-1.0, 1e-16))
+    assert result.converged == bool(np.abs(result.model.parameters + 1).max() < 1e-3)
+
+
 @pytest.mark.parametrize(("backup", "optimizer", "status", "advice"), [
     (BoltzmannAverage(), LBFGS(), Status.CONVERGED, ""),
     (BoltzmannAverage(), Adam(max_iterations=3), Status.MAX_ITERATIONS, "a larger max_iterations"),

@@ -195,3 +195,16 @@ def test_log_policies_of_one_row_of_available_actions_are_those_of_every_state()
         for row in rows
     )
     np.testing.assert_allclose(one, every)
+
+
+def test_log_likelihood_of_impossible_moves_that_do_not_count_is_that_of_the_others():
+    """Action 1 leads into a trap: it has the probability 0 at discount 1."""
+    world = graph(np.array([[[1], [2]], [[1], [1]], [[2], [2]]]))
+    wanted = task(-np.ones((3, 2)), 1.0, np.arange(3) == 1)
+    model, behavior = TabularModel(world, jnp.zeros((3, 2, 1))), Behavior(BoltzmannAverage(), BETA)
+    good, bad = (Trajectory(np.array([0, end]), np.array([end - 1]), 0) for end in (1, 2))
+    both = gather([good, bad], [wanted])
+    assert float(log_likelihood(model, gather([bad], [wanted]), behavior).actions) == -np.inf
+    assert float(log_likelihood(model, both, behavior).actions) == -np.inf
+    assert float(log_likelihood(model, both.with_only([True, False]), behavior).actions) == 0
+    assert float(log_likelihood(model, both.with_only([False, True]), behavior).actions) == -np.inf

@@ -1,13 +1,16 @@
 """Which tasks at discount 1 have values: at the boundary of what actions may cost, and where a task has ended."""
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sidestep.errors import ImproperTask
 from sidestep.tabular.backups import Behavior
+from sidestep.tabular.behavior_model import behavior_model
 from sidestep.tabular.graph import graph
 from sidestep.tabular.proper import check_proper
-from sidestep.tabular.tasks import Task, task, with_outcome_reward
+from sidestep.tabular.tasks import Task, stack_tasks, task, with_outcome_reward
 
 WORLD = graph(np.array([[[0, 1], [1, 2]], [[2, 2], [0, 2]], [[2, 2], [0, 1]]]))
 """Action 0 of state 1 surely leads to state 2; what may lead there as well may also go on."""
@@ -67,3 +70,16 @@ def test_check_proper_of_rewards_that_end_or_follow_the_end_accepts(behavior):
         for outcome in ((0, 1, 1), (1, 0, 0), (1, 0, 1), (1, 1, 1), (2, 0, 0), (2, 1, 0), (2, 1, 1)):
             check_proper(paying_outcomes(outcome, reward), behavior, WORLD)
     check_proper(task(np.array([-1.0, -1.0, 5.0]), 1.0, ENDS), behavior, WORLD)
+
+
+def test_check_proper_of_persons_checks_the_beta_of_each():
+    """A move costs .5: the entropy bonus log(2)/β of the second person is larger."""
+    tasks = stack_tasks([paying(np.full((3, 2), -0.5))] * 2)
+    agents = behavior_model(Behavior("logsumexp", 2.0), person=np.array([0, 1]))
+    for betas, proper in (([8.0, 0.5], False), ([0.5, 8.0], False), ([8.0, 1.5], True)):
+        own = eqx.tree_at(lambda each: each.parameters.log_beta, agents, jnp.log(jnp.asarray(betas)))
+        if proper:
+            check_proper(tasks, own, WORLD)
+        else:
+            with pytest.raises(ImproperTask, match=r"a log-sum-exp agent with β = 0\.5 gains"):
+                check_proper(tasks, own, WORLD)

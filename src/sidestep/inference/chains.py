@@ -247,7 +247,7 @@ def problem_of(
     agents = behavior if isinstance(behavior, BehaviorModel) else behavior_model(behavior)
     barriers = barriers_of(model)
     check_prior(barriers, prior)
-    check_proper(agents.tasks_of(demonstrations.tasks), agents.behavior_of(), model.graph)
+    check_proper(demonstrations.tasks, agents, model.graph)
     run: Any = {"seed": seed, "tempering": tempering, "terms": terms}
     return barrier_problem(barriers, demonstrations, agents, prior, available=model.graph.available, **run), agents
 

@@ -99,7 +99,7 @@ def enumerate_barriers(
     agents, barriers = as_behavior_model(behavior), barriers_of(model)
     check_prior(barriers, prior)
     tasks = agents.tasks_of(demonstrations.tasks)
-    check_proper(tasks, agents.behavior_of(), model.graph)
+    check_proper(demonstrations.tasks, agents, model.graph)
     crossed = crossed_barriers(barriers, demonstrations, terms)
     free = np.flatnonzero((barriers.known == Cell.UNKNOWN) & ~crossed)
     message = f"expected at most {MAX_BARRIERS} unknown barriers to enumerate, found {len(free)}"

@@ -304,4 +304,4 @@ def _check_problem(problem: Problem, optimizer: Optimizer) -> None:
     message += f", found {type(optimizer).__name__}"
     check(has_objective or isinstance(optimizer, Adam), message, field="gradient")
     check_deadline(demos, options)
-    check_proper(behavior.tasks_of(demos.tasks), behavior.behavior_of(), graph, options.horizon)
+    check_proper(demos.tasks, behavior, graph, options.horizon)

@@ -117,6 +117,8 @@ class Maximum(NamedTuple):
 _REUSE = 2e-5
 """The largest change of all contributions together that an approximate evaluation reuses (a fraction of the objective).
 """
+_MOST_LEFT = 1.0
+"""The most nats that may be left to gain where a fit has converged, whatever its numbers resolve."""
 _ROUNDING = 64
 """The error of the objective by rounding, in units of its last digit."""
 _PARTIAL = 0.01
@@ -192,6 +194,7 @@ def maximize(
             )
             if status is None and not evaluator.nearest.usable:
                 status = Status.NO_VALUES
+            limit = min(limit, _MOST_LEFT)
             if status is None and optimizer.expected_gain(x, point.gradient, state) <= limit:
                 status = Status.CONVERGED
                 measure += f", and no more than {limit:.1g} nats are left to gain, the precision of the objective"

@@ -30,12 +30,27 @@ def check_model(model: TransitionModel) -> None:
             missing = np.isnan(np.asarray(leaf))
             places = np.argwhere(missing)[:1].tolist()
             check(not missing.any(), f"expected numbers as parameters, found nan at {places}", field="model")
+    if not type(model).__module__.startswith("sidestep."):
+        _check_probabilities(model)
     if isinstance(model.graph, Graph) and not is_traced(model.graph.successors):
         check_states(np.asarray(model.graph.successors), model.graph.states, "successors")
         for name in ("available", "lengths"):
             _check_axes(
                 getattr(model.graph, name).shape, model.graph.successors.shape[:2], f"a table `{name}`", "graph"
             )
+
+
+def _check_probabilities(model: TransitionModel) -> None:
+    """Raise `InputError` unless a model has a distribution over the outcomes of each available action.
+
+    Args:
+        model: Of a class that is not the library's, as those have distributions by design.
+    """
+    expected, shape = model.graph.successors.shape, jax.eval_shape(model.probabilities).shape
+    check(shape == expected, f"expected probabilities of shape {expected}, found {shape}", field="model")
+    if not is_traced(model):
+        counts = np.broadcast_to(np.asarray(model.graph.available), shape[:2])
+        check_distributions(np.asarray(model.probabilities()), ("state", "action"), counts=counts, field="model")
 
 
 def check_persons(behavior: Behavior | BehaviorModel | None, tasks: int) -> None:

@@ -136,11 +136,10 @@ def check_likelihood(
     check_model(model)
     check_behavior(behavior, model.graph)
     check_demonstrations(demonstrations, model.graph)
-    agents = as_behavior_model(behavior)
     check_persons(behavior, len(demonstrations.tasks.terminal))
     check_deadline(demonstrations, options)
     if not is_traced(model, demonstrations, behavior):
-        check_proper(agents.tasks_of(demonstrations.tasks), agents.behavior_of(), model.graph, options.horizon)
+        check_proper(demonstrations.tasks, behavior, model.graph, options.horizon)
 
 
 def check_deadline(demonstrations: Demonstrations, options: SolveOptions) -> None:
@@ -182,7 +181,9 @@ def _log_likelihood(
     actions = transitions = jnp.zeros((), model.probabilities().dtype)
     if "actions" in terms:
         each = _log_policies(model, demonstrations, agents, options)
-        actions = jnp.sum(each * demonstrations.weights.astype(each.dtype))
+        counts = demonstrations.weights.astype(each.dtype)
+        # moves that do not count may be impossible
+        actions = jnp.sum(jnp.where((counts > 0) | jnp.isnan(each), counts * each, 0))
     if "transitions" in terms:
         transitions = arrival_log_likelihood(model, _arrivals(demonstrations))
     return LogLikelihood(actions, transitions)

@@ -9,14 +9,15 @@ is sufficient, not necessary, and the entropy bonus of a log-sum-exp agent count
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sidestep.errors import ImproperTask, check_instance
+from sidestep.errors import ImproperTask
 from sidestep.tabular.backups import Behavior, LogSumExp
-from sidestep.tabular.checks import check_task
+from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
+from sidestep.tabular.checks import check_behavior, check_persons, check_task
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.tasks import Task
 
 
-def check_proper(task: Task, behavior: Behavior, world: Graph, horizon: int | None = None) -> None:
+def check_proper(task: Task, behavior: Behavior | BehaviorModel, world: Graph, horizon: int | None = None) -> None:
     """Check that the values of every task are finite and unique.
 
     Tasks with a finite horizon or a discount below 1 are proper. At discount 1 a task needs a terminal state, and every
@@ -25,7 +26,7 @@ def check_proper(task: Task, behavior: Behavior, world: Graph, horizon: int | No
 
     Args:
         task: One task or a stack.
-        behavior: Of the agents.
+        behavior: Of the agents; each task is checked with the β of its person.
         world: The graph of the model.
         horizon: As in `SolveOptions`.
 
@@ -42,7 +43,11 @@ def check_proper(task: Task, behavior: Behavior, world: Graph, horizon: int | No
         >>> check_proper(goal, Behavior("logsumexp", beta=10.0), grid_graph(grid))
     """
     check_task(task, world)
-    check_instance(behavior, Behavior, "behavior")
+    check_behavior(behavior, world)
+    agents = as_behavior_model(behavior)
+    task, tasks = agents.tasks_of(task), len(np.atleast_1d(np.asarray(task.discount)))
+    if task.terminal.ndim == 2:
+        check_persons(behavior, tasks)
     endless = np.atleast_1d(np.asarray(task.discount)) == 1
     if horizon is not None or not endless.any():
         return
@@ -50,10 +55,12 @@ def check_proper(task: Task, behavior: Behavior, world: Graph, horizon: int | No
     if not terminal.any(axis=-1).all():
         raise ImproperTask("a task with discount 1 needs a terminal state: expected one, or a discount below 1")
     available = np.broadcast_to(np.asarray(world.available), (world.states, world.actions))
-    # a bonus for each number of available actions
-    has_bonus, beta = isinstance(behavior.backup, LogSumExp), float(behavior.beta)
-    bonus = np.log(available.sum(axis=1)) / beta if has_bonus else np.zeros(world.states)
+    has_bonus = isinstance(agents.behavior.backup, LogSumExp)
+    betas = np.asarray(agents.betas(tasks)) if task.terminal.ndim == 2 else [agents.behavior_of().beta]
     for index, ends in zip(np.flatnonzero(endless), terminal, strict=True):
+        # a bonus for each number of available actions
+        beta = float(betas[index])
+        bonus = np.log(available.sum(axis=1)) / beta if has_bonus else np.zeros(world.states)
         gains = _largest_rewards(task, int(index), world, available, ends, bonus)
         if (gains >= 0).any():
             raise ImproperTask(

@@ -12,16 +12,19 @@ values. This differs from the textbook method in two points:
 `sidestep.tabular.solvers.base` has the equations that solvers solve.
 """
 
-from typing import cast
+from collections.abc import Sequence
+from typing import Any, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
+from sidestep._arguments import to_integers, to_mask
 from sidestep._repr import short_repr
 from sidestep.errors import check, check_choice, check_instance, to_count
-from sidestep.tabular.arrays import is_traced
+from sidestep.tabular.arrays import is_traced, to_jax
 from sidestep.tabular.backups import Backup, Behavior, Gradient, finite_or_zero
 from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
 from sidestep.tabular.checks import check_behavior, check_model, check_persons, check_task
@@ -141,9 +144,9 @@ def solve(
     *,
     options: SolveOptions | None = None,
     start: base.WarmStart | None = None,
-    visited: Int[Array, "*tasks visited"] | None = None,
-    times: Int[Array, "*tasks visited"] | None = None,
-    region: Bool[Array, "*tasks states"] | None = None,
+    visited: Shaped[ArrayLike, "..."] | Sequence[Any] | None = None,
+    times: Shaped[ArrayLike, "..."] | Sequence[Any] | None = None,
+    region: Shaped[ArrayLike, "..."] | Sequence[Any] | None = None,
 ) -> Solution:
     """Return the values of one task, or of a stack of tasks, for agents that behave as `behavior` describes.
 
@@ -175,7 +178,7 @@ def solve(
         The solution. Check `converged` before use.
 
     Raises:
-        InputError: For a task of another world, and parameters that are not finite.
+        InputError: For a task of another world, parameters that are NaN, and states or times that do not exist.
         ImproperTask: For a task without values (see `check_proper`). Under `jit` this is not checked.
 
     Example:
@@ -200,12 +203,29 @@ def solve(
     agents = as_behavior_model(behavior)
     if task.terminal.ndim == 2:
         check_persons(behavior, len(task.terminal))
+    check_instance(start, (base.WarmStart, type(None)), "start")
+    visited, times, region = _checked_states(task, options, visited, times, region)
     if not is_traced(model, task, behavior):
-        check_proper(agents.tasks_of(task), agents.behavior_of(), model.graph, options.horizon)
+        check_proper(task, behavior, model.graph, options.horizon)
     solution = _solve(model, task, agents, options, start, visited, times, region)
     if options.horizon is None and region is None and not is_traced(model, task, behavior, solution.values):
         warn_of_wandering(model, task, agents, solution.values, solution.converged)
     return solution
+
+
+def _checked_states(
+    task: Task, options: SolveOptions, visited: object | None, times: object | None, region: object | None
+) -> tuple[Array | None, Array | None, Array | None]:
+    """Return the states to look at, their times and the region as arrays; refuse those that do not exist."""
+    *tasks, states = task.terminal.shape
+    if visited is not None:
+        axes = (*tasks, "visited")
+        visited = to_jax(to_integers(visited, "visited", axes, least=0, most=states - 1, what="states"))
+    if times is not None:
+        message = "expected none without visited states and a deadline (`SolveOptions(horizon=…, deadline=True)`)"
+        check(visited is not None and options.deadline, message, field="times")
+        times = to_jax(to_integers(times, "times", np.shape(visited), least=0, most=(options.horizon or 1) - 1))
+    return visited, times, None if region is None else to_jax(to_mask(region, "region", (*tasks, states)))
 
 
 # Compiled as a whole: otherwise every call would compile the loops of a solver again.
