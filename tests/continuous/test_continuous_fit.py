@@ -159,6 +159,21 @@ def test_fit_dynamics_batches_of_a_laplace_family_give_the_median():
     assert scaled == pytest.approx(-learned.sum() - MOVES * np.log(2), rel=0.02)
 
 
+def test_fit_dynamics_of_some_walks_ends_where_the_fit_of_these_alone_does():
+    """A move of weight 0 may even be impossible."""
+    some = np.arange(MOVES) % 3 == 0
+    alone = demonstrations_of(STATES[some], CHOICES[some], FOLLOWING[some])
+    far = demonstrations_of(STATES, CHOICES, np.where(some, FOLLOWING, 1e200)).with_only(some)
+    fits = [
+        sc.fit_dynamics(INITIAL, demos, *AGENTS, prior=PRIOR, terms=("transitions",), schedule=SHORT)
+        for demos in (alone, DEMONSTRATIONS.with_only(some), far)
+    ]
+    for each in fits[1:]:
+        assert each.converged
+        np.testing.assert_allclose(each.dynamics.parameters, fits[0].dynamics.parameters, rtol=1e-6)
+        np.testing.assert_allclose(each.verification.covariance, fits[0].verification.covariance, rtol=1e-6)
+
+
 # Diagnostics
 
 
@@ -458,8 +473,9 @@ def test_schedule_refuses_settings_out_of_range(setting, expected):
 def test_fit_dynamics_no_moves_are_refused():
     nothing = jax.tree.map(lambda leaf: leaf[:0], eqx.tree_at(lambda demos: demos.tasks, DEMONSTRATIONS, None))
     nothing = eqx.tree_at(lambda demos: demos.tasks, nothing, DEMONSTRATIONS.tasks, is_leaf=lambda leaf: leaf is None)
-    with pytest.raises(ss.InputError, match="'states': expected one or more starts, found shape"):
-        sc.fit_dynamics(INITIAL, nothing, *AGENTS)
+    for demos, count in ((nothing, 0), (DEMONSTRATIONS.with_only(np.zeros(MOVES, bool)), MOVES)):
+        with pytest.raises(ss.InputError, match=f"expected moves with a weight above 0, found none of {count}"):
+            sc.fit_dynamics(INITIAL, demos, *AGENTS)
 
 
 def test_fit_dynamics_infinite_rewards_raise():

@@ -137,6 +137,23 @@ def test_gather_halves_of_some_moves_at_a_time_has_each_move_once():
         assert {part.shape[1] for part in each} == {each.scores.shape[1]}
 
 
+WEIGHTS = np.array([0.0, 1.0, 2.0, 0.5, 1.0, 3.0, 0.0])
+
+
+def weighed(problem):
+    return eqx.tree_at(lambda own: own.demonstrations.weights, problem, jnp.asarray(WEIGHTS))
+
+
+def test_gather_halves_of_moves_with_weights_counts_them_as_often():
+    own, state = finite()
+    (halves,) = gather_halves(weighed(own), own.agent.dynamics, state, 4, jax.random.key(2))
+    plain = finite_halves()
+    np.testing.assert_allclose(halves.scores, WEIGHTS[:, None] * plain.scores)
+    information = np.sum(halves.factors[0] * halves.factors[1], axis=(1, 2))
+    np.testing.assert_allclose(information, WEIGHTS * np.sum(plain.factors[0] * plain.factors[1], axis=(1, 2)))
+    np.testing.assert_allclose(halves.policy_gaps, WEIGHTS * plain.policy_gaps)
+
+
 # The gradient of a batch
 
 
@@ -167,6 +184,19 @@ def test_objective_gradient_without_noise_is_exact(terms):
         np.testing.assert_allclose(figures.expected_return, Q[2].mean(), rtol=1e-4)
     else:
         assert (figures.entropy, figures.policy_gap, figures.expected_return) == (0, 0, 0)
+
+
+def test_objective_gradient_of_moves_with_weights_counts_them_as_often():
+    """All moves are the same, and the batch has four of them: their mean weight is 1.5."""
+    own, state = finite(("actions", "transitions"), (2,) * 7)
+    plain, other = (
+        gradient(each, state, jax.random.key(3), own.agent.dynamics.parameters)
+        for each in (own, eqx.tree_at(lambda own: own.demonstrations.weights, own, jnp.full(7, 1.5)))
+    )
+    assert other[2].actions == pytest.approx(1.5 * float(plain[2].actions))
+    assert other[2].transitions == pytest.approx(1.5 * float(plain[2].transitions))
+    of_prior = DRIFT / VARIANCE
+    np.testing.assert_allclose(other[1] - of_prior, 1.5 * (plain[1] - of_prior), rtol=1e-9)
 
 
 def test_improve_policy_leads_towards_the_agent():

@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -117,6 +118,14 @@ def test_compare_with_lattice_has_the_gradient_of_a_dense_reference():
     assert found.distance < 1
 
 
+def test_compare_with_lattice_counts_moves_by_their_weights():
+    plain, fit = sc.compare_with_lattice(made(), LATTICE), made()
+    twice = eqx.tree_at(lambda fit: fit.problem.demonstrations.weights, fit, jnp.full(60, 2.0))
+    found, of_prior = sc.compare_with_lattice(twice, LATTICE), -0.45 / VARIANCE
+    assert found.log_likelihood == pytest.approx(2 * plain.log_likelihood)
+    assert found.gradient[0] - of_prior == pytest.approx(2 * (plain.gradient[0] - of_prior))
+
+
 def test_compare_with_lattice_points_around_an_outcome_have_its_mean_and_variance():
     planner = NoisyPlanner(Drift(vector(0.0), vector(NOISE)), vector(*WAYS)[:, None], SOFT, LATTICE, (8,))
     points, weights = planner.landing(vector(0.37))
@@ -128,6 +137,7 @@ def test_compare_with_lattice_points_around_an_outcome_have_its_mean_and_varianc
 
 @pytest.mark.parametrize(("lattice", "match"), [
     (sc.Lattice(vector(-8), vector(8), (11,)), "'lattice': expected a spacing of at most 1.5 times the noise"),
+    (sc.Lattice(vector(-1), vector(8), (81,)), r"'lattice': expected places on the lattice from \[-1.0\] to"),
     (sc.Lattice(vector(-8, -8), vector(8, 8), (9, 9)), "'lattice': expected 1 dimensions, at most 3, found 2"),
 ])  # fmt: skip
 def test_compare_with_lattice_that_does_not_fit_is_refused(lattice, match):

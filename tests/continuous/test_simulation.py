@@ -138,6 +138,10 @@ def test_simulate_trajectories_bad_starts_are_refused():
         simulate(ROOM, SHARP, starts=[np.array([[1.0, np.nan]])])
     with pytest.raises(ss.InputError, match=r"starts\[0\]': expected numbers of shape \(agents, 2\)"):
         simulate(ROOM, SHARP, starts=[np.ones((2, 3))])
+    with pytest.raises(
+        ss.InputError, match=r"starts\[1\]': expected places on the lattice from .*, found \[50.0, 1.0\]"
+    ):
+        simulate(ROOM, SHARP, tasks=2, starts=[np.ones((1, 2)), np.array([[50.0, 1.0]])])
     with pytest.raises(ss.InputError, match="'starts': expected at least 1, found 0"):
         simulate(ROOM, SHARP, starts=[])
 

@@ -28,6 +28,7 @@ from sidestep._arguments import to_finite, to_integers
 from sidestep._repr import short_repr
 from sidestep._typing import ArrayTree, FloatTree, Tree
 from sidestep.errors import InputError, check, check_instance
+from sidestep.tabular.arrays import is_traced
 from sidestep.tabular.models import TransitionModel
 
 State = Shaped[Array, "*state"]
@@ -302,12 +303,17 @@ class TableDynamics(Dynamics):
 
     Attributes:
         model: Any `TransitionModel`; its parameters are those of the dynamics.
+
+    Raises:
+        InputError: For a model with actions that are not available everywhere.
     """
 
     model: TransitionModel
 
     def __init__(self, model: TransitionModel):
         check_instance(model, TransitionModel, "model")
+        message = "expected a model with all actions available: policies of continuous worlds have no masks"
+        check(is_traced(model.graph.available) or np.all(model.graph.available), message, field="model")
         self.model = model
 
     @property

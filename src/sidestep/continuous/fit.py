@@ -31,9 +31,10 @@ from sidestep.continuous.policies import Agent, SomePolicy
 from sidestep.continuous.refinement import Visit, refine
 from sidestep.continuous.tasks import task_at
 from sidestep.continuous.verification import Verification, verify
-from sidestep.errors import NotConverged, check, check_function, to_count
+from sidestep.errors import NotConverged, check, check_function, check_instance, to_count
 from sidestep.inference.checkpoints import Checkpoint, Saver, fingerprint
 from sidestep.inference.priors import Normal, Prior
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.likelihood import ALL_TERMS, Term
@@ -119,7 +120,7 @@ def fit_dynamics(
 
     Args:
         dynamics: The family at the initial parameters.
-        demonstrations: From `gather_trajectories`.
+        demonstrations: From `gather_trajectories`; moves of weight 0 are left out.
         behavior: The agent's backup and β.
         policy: The initial policy of the agent.
         planner: Settings of rollouts and of the policy's optimizers.
@@ -146,9 +147,8 @@ def fit_dynamics(
     seed = to_count(seed, "seed", 0)
     if report is not None:
         check_function(report, "report")
-    problem = FitProblem(
-        agent, demonstrations, Normal() if prior is None else prior, planner, schedule, terms, estimator
-    )
+    demonstrations, prior = moves_that_count(demonstrations), Normal() if prior is None else prior
+    problem = FitProblem(agent, demonstrations, prior, planner, schedule, terms, estimator)
     saver = Saver(checkpoint, problem_fingerprint((problem, seed)) if checkpoint is not None else "")
     warmup_key, key = jax.random.split(jax.random.key(seed))
     initial_key, warmup_key = jax.random.split(warmup_key)
@@ -173,6 +173,26 @@ def fit_dynamics(
         if report:
             report(history[-1], dynamics.with_parameters(state.parameters))
     return _refined(problem, state, history, jax.random.fold_in(key, schedule.iterations))
+
+
+def moves_that_count(demonstrations: Demonstrations) -> Demonstrations:
+    """Return the moves with a weight above 0: the others may be impossible.
+
+    Args:
+        demonstrations: The moves.
+
+    Raises:
+        InputError: For anything else, and for no such move.
+    """
+    check_instance(demonstrations, Demonstrations, "demonstrations")
+    counts = np.asarray(demonstrations.weights) > 0
+    if counts.all() and len(counts):
+        return demonstrations
+    check(counts.any(), f"expected moves with a weight above 0, found none of {len(counts)}", field="demonstrations")
+    of_moves = ("states", "actions", "next_states", "task", "trajectory", "weights", "truncated")
+    return replace(
+        demonstrations, **{name: to_jax(np.asarray(getattr(demonstrations, name))[counts]) for name in of_moves}
+    )
 
 
 def problem_fingerprint(problem: Tree) -> str:

@@ -28,7 +28,7 @@ _ROLLOUTS = 2**13
 
 
 class Halves(NamedTuple):
-    """What both halves of the rollouts say of some moves.
+    """What both halves of the rollouts say of some moves, each by its weight.
 
     Attributes:
         factors: √π β (∇Q − Σ π ∇Q) of every candidate.
@@ -72,7 +72,14 @@ def gather_halves(
     for index, batch in enumerate(moves):
         drawing = jax.random.fold_in(key, index)
         parts = _batch_halves(problem, agent, planner_state, drawing, jnp.asarray(batch), samples)
-        yield Halves(*(np.asarray(part, np.float64)[:, : count - index * size] for part in parts))
+        halves = Halves(*(np.asarray(part, np.float64)[:, : count - index * size] for part in parts))
+        yield _weighed(halves, np.asarray(problem.demonstrations.weights, np.float64)[batch[: count - index * size]])
+
+
+def _weighed(halves: Halves, weights: np.ndarray) -> Halves:
+    """Return the halves of moves that count as often as their weights say."""
+    factors = np.sqrt(weights)[:, None, None] * halves.factors
+    return Halves(factors, weights[:, None] * halves.scores, *(weights * figures for figures in halves[2:]))
 
 
 @eqx.filter_jit

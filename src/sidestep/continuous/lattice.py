@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from sidestep._arguments import to_finite, to_mask
 from sidestep.continuous.dynamics import GaussianDynamics, Vector, check_corners, checked_counts
 from sidestep.continuous.tasks import ContinuousTask
-from sidestep.errors import check_instance
+from sidestep.errors import InputError, check_instance
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.models import TabularModel
@@ -63,6 +63,19 @@ class Lattice(eqx.Module):
     def size(self) -> int:
         """The number of points."""
         return int(np.prod(self.counts))
+
+    def check_inside(self, places: Float[Array | np.ndarray, "places dimensions"], field: str) -> None:
+        """Raise `InputError` for a place beyond the border of the lattice; sides that close have none.
+
+        Args:
+            places: The places.
+            field: The argument, for the error.
+        """
+        low, high, numbers = np.asarray(self.low), np.asarray(self.high), np.asarray(places)
+        inside = (np.asarray(self.periodic) | ((low <= numbers) & (numbers <= high))).all(axis=1)
+        for place in numbers[~inside][:1].tolist():
+            message = f"expected places on the lattice from {low.tolist()} to {high.tolist()}, found {place}"
+            raise InputError(message, field=field)
 
     @property
     def spacing(self) -> Vector:

@@ -228,8 +228,13 @@ class FitProblem(eqx.Module):
         dynamics, prior = agent.dynamics.with_parameters(parameters), self.prior.log_density(parameters)
         transitions = jnp.zeros_like(prior)
         if "transitions" in self.terms:
-            transitions = len(demos) / len(moves) * _log_densities(dynamics, agent.policy, demos, moves).sum()
+            each = _log_densities(dynamics, agent.policy, demos, moves)
+            transitions = len(demos) / len(moves) * self._counted(each, moves)
         return -(transitions + prior), (transitions, prior)
+
+    def _counted(self, each: Float[Array, " batch"], moves: _Moves) -> Array:
+        """Return the sum of a number of each of some moves, by their weights."""
+        return jnp.sum(self.demonstrations.weights[moves].astype(each.dtype) * each)
 
     def _action_terms(
         self, parameters: Tree, state: PlannerState[Any], moves: _Moves, key: PRNGKeyArray, fraction: Array
@@ -249,11 +254,16 @@ class FitProblem(eqx.Module):
         starts, probabilities = likelihood.candidates(probabilities)
         size = {"horizon": planner.horizon, "samples": planner.samples}
         method = {"critic": state.critic, "estimator": self.estimator}
-        gradient, rollouts = value_gradient(agent, starts, rollout_key, likelihood.weights, **size, **method)
+        counts = demos.weights[moves]
+
+        def weights(q: PerCandidate) -> PerCandidate:
+            return counts.astype(q.dtype)[:, None] * likelihood.weights(q)
+
+        gradient, rollouts = value_gradient(agent, starts, rollout_key, weights, **size, **method)
         improved, progress = planner.update(state, agent.behavior, rollouts, probabilities, fraction)
         q, scale = q_estimates(rollouts)[..., 0].mean(axis=-1), len(demos) / len(moves)
         slope = jax.tree.map(lambda leaf: -scale * leaf, gradient)
-        return improved, slope, scale * likelihood.log_probs(q).sum(), progress
+        return improved, slope, scale * self._counted(likelihood.log_probs(q), moves), progress
 
 
 @eqx.filter_jit

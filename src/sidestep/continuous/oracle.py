@@ -113,6 +113,7 @@ def compare_with_lattice(fit: ContinuousFit[Any, Any], lattice: Lattice) -> Latt
     dimensions = len(lattice.counts)
     message = f"expected {demos.states.shape[-1]} dimensions, at most {_DIMENSIONS}, found {dimensions}"
     check(dimensions == demos.states.shape[-1] and dimensions <= _DIMENSIONS, message, field="lattice")
+    lattice.check_inside(demos.states, "lattice")
     ratio = np.asarray(dynamics.noise / lattice.spacing, np.float64)
     message = f"expected a spacing of at most 1.5 times the noise {dynamics.noise}, found {lattice.spacing}"
     check((ratio >= 1 / 1.5).all(), message, field="lattice")
@@ -125,7 +126,7 @@ def compare_with_lattice(fit: ContinuousFit[Any, Any], lattice: Lattice) -> Latt
         task = task_at(demos.tasks, int(index))
         check_proper(planner.tabular_task(task), planner.behavior, world)
         value, gradient, converged = _log_likelihood(
-            dynamics.parameters, planner, task, demos.states[own], demos.actions[own]
+            dynamics.parameters, planner, task, demos.states[own], demos.actions[own], demos.weights[own]
         )
         if not converged:
             raise NotConverged(f"values on the lattice did not converge for task {index}")
@@ -138,7 +139,7 @@ def compare_with_lattice(fit: ContinuousFit[Any, Any], lattice: Lattice) -> Latt
 
 @eqx.filter_jit
 def _log_likelihood(
-    parameters: FloatTree, planner: LatticePlanner, task: ContinuousTask, states: Array, actions: Array
+    parameters: FloatTree, planner: LatticePlanner, task: ContinuousTask, states: Array, actions: Array, weights: Array
 ) -> tuple[Array, FloatTree, Array]:
     """Return the log-likelihood of some actions, its gradient, and whether the values converged."""
 
@@ -146,8 +147,8 @@ def _log_likelihood(
         moved = replace(planner, dynamics=planner.dynamics.with_parameters(parameters))
         solution = solve(moved.tabular_model(), moved.tabular_task(task), moved.behavior)
         q = jax.vmap(lambda state: moved.action_values(task, solution.values, state))(states)
-        log_probs = jnp.take_along_axis(moved.behavior.log_policy(q), actions[:, None], axis=1)
-        return log_probs.sum(), solution.converged
+        log_probs = jnp.take_along_axis(moved.behavior.log_policy(q), actions[:, None], axis=1)[:, 0]
+        return jnp.sum(weights.astype(log_probs.dtype) * log_probs), solution.converged
 
     (value, converged), gradient = jax.value_and_grad(total, has_aux=True)(parameters)
     return value, gradient, converged

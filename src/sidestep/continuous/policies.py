@@ -318,9 +318,10 @@ def finite_policy(
         >>> jnp.exp(policy.log_probs(jnp.zeros(3))).round(1).tolist()
         [0.5, 0.5]
     """
-    actions = to_finite(actions, "actions")
-    check(actions.ndim and len(actions) >= 2, f"expected two or more, found shape {actions.shape}", field="actions")
-    return FinitePolicy(scaled_network(key, examples, len(actions), width, depth), jnp.asarray(actions))
+    finite, whole = to_finite(actions, "actions"), np.asarray(actions)
+    check(whole.ndim and len(whole) >= 2, f"expected two or more, found shape {whole.shape}", field="actions")
+    own = jnp.asarray(whole if whole.dtype.kind in "iu" else finite)
+    return FinitePolicy(scaled_network(key, examples, len(own), width, depth), own)
 
 
 def gaussian_policy(

@@ -19,10 +19,10 @@ from sidestep.continuous.likelihood import Schedule
 from sidestep.continuous.planner import PlannerState
 from sidestep.continuous.verification import Verification
 
-_STEPS = 16
+_STEPS = 24
 """The most steps."""
-_FIRST = 4
-"""The steps before those of which a mean counts: they are biased by where they start."""
+_FIRST = 12
+"""The steps before those of which a mean counts: they lead along a shoulder, and away from where they start."""
 _FARTHER = 3.0
 """By how many standard deviations the squared distance may grow with a step that is not taken back."""
 _VERIFICATIONS = 2

@@ -48,8 +48,8 @@ def simulate_trajectories(
         The trajectories in the order of tasks and starts.
 
     Raises:
-        InputError: For starts or actions that are not finite or do not have the dynamics' width, different numbers of
-            tasks and starts, or `moves` below 1.
+        InputError: For starts or actions that are not finite or do not have the dynamics' width, starts beyond the
+            lattice, different numbers of tasks and starts, or `moves` below 1.
         ImproperTask: For a task with infinite values.
         NotConverged: For values that did not converge.
 
@@ -74,6 +74,8 @@ def simulate_trajectories(
     check(np.isfinite(actions).all() and actions.shape[1:] == width, message, field="actions")
     model, trajectories = agent.tabular_model(), []
     first_states = [to_finite(own, f"starts[{i}]", ("agents", len(real.noise))) for i, own in enumerate(starts)]
+    for index, own in enumerate(first_states):
+        agent.lattice.check_inside(own, f"starts[{index}]")
     for index, (task, own) in enumerate(zip(tasks, first_states, strict=True)):
         table = agent.tabular_task(task)
         check_proper(table, agent.behavior, model.graph)

@@ -110,6 +110,7 @@ def verify(
     known = rollout_free_products(problem, dynamics.parameters, np.eye(len(exact)))
     if "actions" not in problem.terms:
         return _verification(exact, known, known, np.zeros((0, len(exact))), np.zeros(3), 0)
+    total_weight = np.sum(problem.demonstrations.weights, dtype=np.float64)
     total, scores, figures, rounds = np.zeros_like(known), np.zeros_like(exact), np.zeros(3), 0
     differences: list[np.ndarray] = []
     while True:
@@ -118,7 +119,7 @@ def verify(
             total += (first.T @ second + second.T @ first) / 2
             scores += halves.scores.mean(axis=0).sum(axis=0)
             differences.append(np.asarray(halves.scores[0] - halves.scores[1]) / 2)
-            figures += np.concatenate(halves[2:]).sum(axis=1) / len(problem.demonstrations)
+            figures += np.concatenate(halves[2:]).sum(axis=1) / total_weight
         rounds += 1
         by_rollouts = exact + scores / rounds, known + total / rounds, known, np.concatenate(differences) / rounds
         result = _verification(*by_rollouts, figures / rounds, rounds * SAMPLES)

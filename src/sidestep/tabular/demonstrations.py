@@ -58,7 +58,7 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         task: The index (into `tasks`) of the task of each move.
         trajectory: The index of the trajectory of each move; 0, 1, … in order.
         tasks: All tasks, stacked.
-        weights: How much each move counts in the likelihood of discrete worlds; 1 by default.
+        weights: How much each move counts in the likelihood; 1 by default.
         person: The person of each move; None where persons are not told apart.
         truncated: Whether the trajectory of each move was stopped by a limit of moves (see `Trajectory`); by default
             none was.
