@@ -218,12 +218,12 @@ def _stepper(states: _States, key: Key, first_action: int) -> Callable[[Hashable
     """Return the function from a key, an environment in its state and an action to what follows."""
 
     def step(label: Hashable, env: Any, action: int) -> _Step:
-        observation, reward, *ends = environments.step(env, action + first_action)
+        observation, reward, ends, truncated = environments.step(env, action + first_action)
         number = _as_number(reward)
         if not isfinite(number):
             message = f"expected a finite number, found {describe(reward)}"
             raise InputError(message, source=_place(label, action + first_action), field="reward")
-        return _Step(key_of(key, env, observation), number, *ends, states.take(env))
+        return _Step(key_of(key, env, observation), number, ends, truncated, states.take(env))
 
     return step
 

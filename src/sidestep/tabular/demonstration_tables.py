@@ -183,7 +183,7 @@ class _Rows:
         for row in np.flatnonzero(~missing & ((numbers < 0) | (numbers >= (np.inf if count is None else count))))[:1]:
             expected, name = f"a whole number in {span}", ""
             if len(labels):
-                expected, name = f"a label of one of {span}", f"{describe(labels[numbers[row]])}, label "
+                expected, name = f"a label of one of {span}", f"{describe(labels[int(numbers[row])])}, label "
             message = f"expected {expected}, found {name}{numbers[row]}"
             raise InputError(message, source="table", row=int(row) + 1, field=self.name(kind))
         return np.where(missing, _NONE, numbers)

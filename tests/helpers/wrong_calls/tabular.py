@@ -138,6 +138,7 @@ CASES = [
         ("log_likelihood, trajectories from 1", lambda: ss.log_likelihood(MODEL, changed(trajectory=DEMOS.trajectory + 1), BEHAVIOR), "trajectory"),
         ("log_likelihood, persons of trajectories", lambda: ss.log_likelihood(MODEL, changed(person=jnp.array([0, 1])), BEHAVIOR), "person"),
         ("solve, successors that are no states", lambda: ss.solve(ss.TabularModel(ss.Graph(GRAPH.successors + 1, GRAPH.lengths), jnp.zeros((2, 1, 2))), ss.task(np.zeros(2), 0.9, [False, True]), BEHAVIOR), "successors"),
+        ("solve, available actions as 1", lambda: ss.solve(ss.TabularModel(ss.Graph(GRAPH.successors, GRAPH.lengths, jnp.ones((2, 1), int)), jnp.zeros((2, 1, 2))), ss.task(np.zeros(2), 0.9, [False, True]), BEHAVIOR), "available"),
         ("check_proper, actions", lambda: ss.check_proper(TASK, BEHAVIOR, 4), "world"),
         ("log_likelihood, options of text", lambda: ss.log_likelihood(MODEL, DEMOS, BEHAVIOR, options="exact"), "options"),
         ("log_policies, options of a number", lambda: ss.log_policies(MODEL, DEMOS, BEHAVIOR, options=3), "options"),
