@@ -184,6 +184,19 @@ def test_enumerate_env_sees_generators_that_the_environment_holds(generator):
     assert 0 < right[0] < 1
 
 
+@pytest.mark.parametrize(("reward", "found"), [(None, "None"), ("1.5", "'1.5'"), ([0.0, 1.0], r"\[0.0, 1.0\]")])
+def test_enumerate_env_of_a_reward_that_is_no_number_raises_with_state_and_action(reward, found):
+    with pytest.raises(
+        InputError, match=rf"^state 19, action 0, field 'reward': expected a finite number, found {found}"
+    ):
+        enumerate_env(Ladder(lambda _: reward))
+
+
+def test_enumerate_env_of_a_reward_that_is_a_truth_value_pays_1():
+    world = enumerate_env(Ladder(lambda _: np.True_), 0.9)
+    assert plan(world.model, world.task).solution.values[0] == pytest.approx(0.9**19)
+
+
 def test_enumerate_env_with_a_key_that_leaves_something_out_raises():
     message = "expected a key that tells all that decides what follows, found"
     with pytest.raises(InputError, match=rf"state 0, action 0: {message} \(1, -0.1, False\) and then \(1, 1.0, True\)"):
@@ -233,7 +246,7 @@ def test_enumerate_env_pays_what_wrappers_pay():
         (gymnasium.make("Pendulum-v1"), {}, "'action_space': expected Discrete actions, found Box"),
         (Corridor(), {"samples": 0}, "'samples': expected at least 1, found 0"),
         (Corridor(), {"limit": 0}, "'limit': expected at least 1, found 0"),
-        (Corridor(), {"seeds": ()}, "'seeds': expected at least one, found none"),
+        (Corridor(), {"seeds": ()}, "'seeds': expected at least 1, found 0"),
         (Corridor(), {"discount": 0.0}, "'discount': expected a finite number above 0"),
         (gymnasium.make("Blackjack-v1"), {}, r"action 1, field 'samples': the action draws random numbers"),
     ],

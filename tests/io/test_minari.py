@@ -28,7 +28,7 @@ from sidestep.io.episodes import collect
 from sidestep.io.gymnasium import from_gymnasium, slippery
 from sidestep.io.minari.demonstrations import read_demonstrations, write_demonstrations
 from sidestep.tabular.backups import Behavior, BoltzmannAverage
-from sidestep.tabular.demonstrations import Trajectory, gather
+from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
 from sidestep.tabular.graph import Graph, graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.planning import plan
@@ -74,6 +74,9 @@ def pursuits(states, actions, tasks, walks, seed):
     gathered = gather(walked, wanted)
     if random.integers(2):
         gathered = replace(gathered, weights=jnp.asarray(random.uniform(size=len(gathered))))
+    if random.integers(2):
+        person = random.integers(3, size=walks)[np.asarray(gathered.trajectory)]
+        gathered = replace(gathered, person=jnp.asarray(person, jnp.int32))
     return complete(states, actions), gathered
 
 
@@ -397,6 +400,45 @@ def test_read_demonstrations_of_bad_weights_raises(weights, message):
     refused(dataset, f", episode 0, field 'move_weight': {message}", task=reach(GRID, 2))
 
 
+def two_persons():
+    """Two walks in a table, of persons 1 and 0."""
+    table = {"walk": [0, 0, 1, 1], "state": [0, 1, 1, 2], "action": [3, None, 3, None], "who": [1, 1, 0, 0]}
+    return Demonstrations.from_table(table, reach(GRID, 2), subject="who")
+
+
+def test_write_demonstrations_keeps_persons():
+    dataset, demonstrations = fresh("ours/persons"), two_persons()
+    write_demonstrations(dataset, demonstrations, GRID)
+    read = read_demonstrations(dataset, GRID)
+    assert read.persons is not None
+    assert read.persons.tolist() == [1, 0]
+    assert eqx.tree_equal(read, demonstrations)
+
+
+def test_write_demonstrations_of_a_walk_of_two_persons_raises():
+    walk = gather([Trajectory(np.array([0, 1, 2]), np.array([3, 3]), 0)], [reach(GRID, 2)])
+    message = "trajectory, row 1: expected moves that .*, of one task and one person"
+    with pytest.raises(InputError, match=message):
+        write_demonstrations(fresh("ours/persons"), replace(walk, person=jnp.array([0, 1])), GRID)
+
+
+@pytest.mark.parametrize(
+    ("persons", "message"),
+    [
+        ([{"walk_person": 0}, {}], "episode 1, field 'walk_person': expected a person in all episodes or in none"),
+        ([{"walk_person": 0}, {"walk_person": -1}], "episode 1, field 'walk_person': expected at least 0, found -1"),
+        ([{"walk_person": 0.5}, {"walk_person": 1}], "episode 0, field 'walk_person': expected a whole number"),
+        (
+            [{"walk_person": "ann"}, {"walk_person": 1}],
+            "episode 0, field 'walk_person': expected a number, found 'ann'",
+        ),
+    ],
+)
+def test_read_demonstrations_of_bad_persons_raises(persons, message):
+    dataset = store(SPACES, *[buffer([0, 1, 2], [3, 3])] * 2, metadata=persons)
+    refused(dataset, f", {message}", task=reach(GRID, 2))
+
+
 def test_write_demonstrations_of_several_outcomes_has_their_mean():
     """Action 0 leads from state 0 to 1 with reward 2 or 6, or stays with reward 1."""
     world = graph([[[1, 0, 1]], [[1, 1, 1]]])
@@ -503,7 +545,7 @@ def test_write_demonstrations_with_gaps_raises_and_leaves_nothing(datasets):
     walks = towards(2, 5)
     gap = eqx.tree_at(lambda each: each.next_states, walks, jnp.asarray([1, 2, 4, 2]))
     turn = eqx.tree_at(lambda each: each.task, walks, jnp.asarray([0, 0, 0, 1]))
-    message = "trajectory, row 2: expected moves that each start where the one before ended, and one task"
+    message = "trajectory, row 2: expected moves that each start where the one before ended, of one task and one person"
     for broken in (gap, turn):
         with pytest.raises(InputError, match=message):
             write_demonstrations(fresh("gaps/gap"), broken, GRID)

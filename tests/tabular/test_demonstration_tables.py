@@ -1,5 +1,6 @@
 """Demonstrations from tables of several libraries, back to tables, sliced and joined."""
 
+from decimal import Decimal
 from typing import Any
 
 import jax
@@ -163,6 +164,26 @@ def changed(**columns):
     (rows_of_states(), {"state": "walk"}, r"field 'walk': expected whole numbers \(or labels.*found string"),
     (rows_of_states(), {"labels": ss.Labels(states=(0, 1, 2))}, r"row 4, field 'state': .*labels 0, 1, 2, found 3"),
     (rows_of_states(), {"labels": ss.Labels(actions=(3, 3))}, r"labels, field 'action': .* appear once"),
+    (
+        changed(state={1: 6}),
+        {"labels": ss.Labels(states=range(7))},
+        r"row 2, field 'state': expected a label of one of 0…3, found 6, label 6",
+    ),
+    (
+        changed(to={3: 9}, action={3: 3}),
+        {"next_state": "to", "labels": ss.Labels(states=(*range(4), 9))},
+        r"row 4, field 'to': expected a label of one of 0…3, found 9, label 4",
+    ),
+    (
+        changed(task={1: 2}),
+        {"labels": ss.Labels(tasks=range(3))},
+        r"row 2, field 'task': expected a label of one of 0…1, found 2, label 2",
+    ),
+    (
+        changed(state={row: [0] for row in range(8)}),
+        {"labels": ss.Labels(states=range(4))},
+        r"field 'state': expected texts or whole numbers, found list",
+    ),
     ({name: [] for name in rows_of_states()}, {}, "table: expected at least one row"),
     (3, {}, "table: expected a table of pandas"),
 ])  # fmt: skip
@@ -265,6 +286,25 @@ def test_from_table_with_a_step_left_out_raises_unless_the_next_state_is_known()
     assert known.next_states.tolist() == [2, 3]
     in_seconds = table | {"time": [2.5, 0.0, 3.0]}
     assert ss.Demonstrations.from_table(in_seconds, task, step="time").next_states.tolist() == [2, 3]
+
+
+@pytest.mark.parametrize("kind", [int, float, np.float32, np.uint8, Decimal], ids=lambda kind: kind.__name__)
+def test_from_table_with_whole_steps_of_any_type_and_a_gap_raises(kind):
+    task = ss.reach(ss.Grid.unknown(1, 4), 3)
+    table = {"walk": [0, 0, 0], "state": [1, 2, 3], "action": [3, 3, None]}
+    with pytest.raises(InputError, match=r"row 2, field 'time': expected the next step .*, found a gap"):
+        ss.Demonstrations.from_table(table | {"time": [kind(each) for each in (0, 1, 3)]}, task, step="time")
+    table["time"] = [kind(each) for each in (0, 1, 2)]
+    assert ss.Demonstrations.from_table(table, task, step="time").next_states.tolist() == [2, 3]
+
+
+@pytest.mark.parametrize(
+    "times", [[0.0, 1.5, 3.0], pd.to_datetime(["2020-01-01", "2020-01-02", "2020-01-05"])], ids=["seconds", "dates"]
+)
+def test_from_table_with_times_takes_gaps(times):
+    task = ss.reach(ss.Grid.unknown(1, 4), 3)
+    table = {"walk": [0, 0, 0], "state": [1, 2, 3], "action": [3, 3, None], "time": times}
+    assert ss.Demonstrations.from_table(table, task, step="time").next_states.tolist() == [2, 3]
 
 
 def test_from_table_of_walks_with_steps_that_begin_anywhere_takes_them():

@@ -1,8 +1,9 @@
 """States of a Gymnasium environment without a table, found by trying every action in each.
 
 The search is breadth first, from the states that `reset` gives. Every state is a copy of the environment that can be
-stepped, and a *key*, which tells states apart. An action that draws no random numbers has one outcome. One that draws
-some is tried many times, each time with other random numbers; the fractions estimate the probabilities of its outcomes.
+stepped, and a *key*, which tells states apart. Without `samples`, every action must have one outcome, and one that
+draws random numbers is refused. With `samples`, every action is tried that many times, each time with other random
+numbers; the fractions estimate the probabilities of its outcomes.
 
 A key must tell all that decides what follows. Where it leaves something out (how many steps were taken, what is out of
 sight), the same state may have different outcomes. So in environments without randomness each state that is reached
@@ -10,19 +11,31 @@ again is tried again, once, and must do the same; and so must all states along a
 """
 
 import copy
+import gc
 import pickle
 import random
 import reprlib
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from functools import partial
-from math import isfinite
+from math import isfinite, nan
+from types import FunctionType, ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sidestep.errors import InputError, check, check_count, input_errors
-from sidestep.io.environments import Environment, Outcome, check_single, environment_of, numbers_of
+from sidestep.errors import (
+    InputError,
+    check,
+    check_count,
+    check_function,
+    describe,
+    input_errors,
+    to_count,
+    to_list,
+)
+from sidestep.io import environments
+from sidestep.io.environments import Environment, Outcome, check_runs, environment_of, numbers_of
 from sidestep.io.keys import Key, key_of, observation_key
 from sidestep.tabular.tasks import check_discount
 
@@ -33,6 +46,8 @@ SetState = Callable[[Any, Any], object]
 _WALK = 2_000
 """The smallest number of steps of the random walk that is checked."""
 _GENERATORS = np.random.Generator, np.random.RandomState, random.Random
+_ENDS = *_GENERATORS, type, ModuleType, FunctionType
+"""What the search for generators does not look into as it does into objects and containers."""
 
 
 def enumerate_env(
@@ -56,9 +71,9 @@ def enumerate_env(
             follows.
         get_state: Returns the state of the environment; by default `copy.deepcopy` of all of it stands for its state.
         set_state: Sets it.
-        samples: The number of tries of each action that draws random numbers, at least 1; the probabilities are then
-            estimates, with a standard error of √(p(1 − p)/samples), and outcomes that no try had are missing. None
-            refuses such actions.
+        samples: The number of tries of each action, at least 1; probabilities are the fractions of tries, with a
+            standard error of √(p(1 − p)/samples), and outcomes that no try had are missing. None refuses actions that
+            draw random numbers, and tries the others once or twice.
         seeds: Of the resets that give the first states.
         limit: The largest number of states.
 
@@ -68,12 +83,13 @@ def enumerate_env(
 
     Raises:
         InputError: For an environment of several agents or with other actions, more states than `limit`, an action
-            that draws random numbers (without `samples`), a reward that is not finite, and a key that leaves out what
-            decides what follows.
+            that draws random numbers (without `samples`), a reward that is not finite, a key that leaves out what
+            decides what follows, and seeds or functions that are none.
 
     Notes:
-        Random numbers are looked for in NumPy's and Python's generators that the environment holds; those of the whole
-        process (`np.random.seed`) are not seen.
+        Random numbers are looked for in NumPy's and Python's generators that the environment and its wrappers hold, in
+        attributes, containers and closures. Each try gives them other seeds, so that results are the same in each run.
+        Those of the whole process (`np.random.seed`) are not seen: they go on from try to try.
 
     Example:
         >>> import gymnasium
@@ -87,11 +103,15 @@ def enumerate_env(
         ((0, 4, 1, 8, 5), 16)
     """
     check_discount(discount)
-    check_single(env)
+    check_runs(env)
     check_count(limit, 1, "limit")
     if samples is not None:
         check_count(samples, 1, "samples")
-    check(len(seeds), "expected at least one, found none", field="seeds")
+    own_seeds = [to_count(seed, f"seeds[{place}]", 0) for place, seed in enumerate(to_list(seeds, object, "seeds"))]
+    check_function(key, "key")
+    for function, field in ((get_state, "get_state"), (set_state, "set_state")):
+        if function is not None:
+            check_function(function, field)
     both = (get_state is None) == (set_state is None)
     check(both, "expected both of get_state and set_state, or neither", field="get_state, set_state")
     actions = numbers_of(getattr(env, "action_space", None))
@@ -99,14 +119,14 @@ def enumerate_env(
     if actions is None:
         raise InputError(message, source=env, field="action_space")
     states = _copies() if get_state is None or set_state is None else _settings(env, get_state, set_state)
-    starts = [_start(states, states.begin(env), key, int(seed)) for seed in seeds]
+    starts = [_start(states, states.begin(env), key, seed) for seed in own_seeds]
     step = _stepper(states, key, actions[0])
     attempt = _attempts(states, step, actions[0], samples)
     rows, numbers = _explore(starts, attempt, actions[1], 2 if samples is None else 1, limit)
     if samples is None:
         walker = states.begin(env)
-        begin = [partial(_start, states, walker, key, int(seed)) for seed in seeds]
-        _check_walk(begin, lambda state, action: step(states.proceed(state), action), rows, numbers)
+        begin = [partial(_start, states, walker, key, seed) for seed in own_seeds]
+        _check_walk(begin, lambda label, state, action: step(label, states.proceed(state), action), rows, numbers)
     first = {numbers[label] for label, _ in starts}
     return environment_of(rows, actions[1], discount, first)._replace(labels=tuple(numbers), samples=samples)
 
@@ -144,8 +164,9 @@ def _copies() -> _States:
         # after `deepcopy`, the values of the memo are the copies of all objects that the environment holds
         copies: dict[int, Any] = {}
         advice = "the environment cannot be copied; pass get_state and set_state"
-        with input_errors(advice, TypeError, copy.Error, source=env):
-            return copy.deepcopy(env, copies), _generators(copies.values())
+        with input_errors(advice, TypeError, NotImplementedError, copy.Error, source=env):
+            made = copy.deepcopy(env, copies)
+        return made, [*_generators_held_by(made), *_generators(copies.values())]
 
     return _States(lambda env: copied(env)[0], lambda env: env, copied, lambda env: env)
 
@@ -155,63 +176,94 @@ def _settings(env: Any, get_state: GetState, set_state: SetState) -> _States:
 
     def resume(state: Any) -> tuple[Any, list[Any]]:
         set_state(env, state)
-        return env, _generators(vars(getattr(env, "unwrapped", env)).values())
+        return env, _generators_held_by(env)
 
     return _States(lambda env: env, get_state, resume, lambda state: resume(state)[0])
 
 
 def _generators(values: Iterable[Any]) -> list[Any]:
-    return [each for each in values if isinstance(each, _GENERATORS)]
+    # the operating system's numbers have no state to compare or to set
+    own = (each for each in values if isinstance(each, _GENERATORS))
+    return [each for each in own if not isinstance(each, random.SystemRandom)]
+
+
+def _generators_held_by(env: Any) -> list[Any]:
+    """Return the generators that an environment holds, however deep in attributes, containers and closures."""
+    seen: dict[int, Any] = {}
+    generators: list[Any] = []
+    waiting = [env]
+    while waiting:
+        fresh = {key: each for key, each in zip(map(id, waiting), waiting, strict=True) if key not in seen}
+        seen |= fresh
+        # by type, as there may be thousands of objects, and every try looks at each
+        ends = {kind for kind in set(map(type, fresh.values())) if issubclass(kind, _ENDS)}
+        last = [each for each in fresh.values() if type(each) in ends]
+        generators += _generators(last)
+        inner = [each for each in fresh.values() if type(each) not in ends]
+        # of a function its closure and defaults only: its globals hold all of its module
+        functions = [each for each in last if isinstance(each, FunctionType)]
+        inner += [part for each in functions for part in (each.__closure__, each.__defaults__, each.__kwdefaults__)]
+        # what the garbage collector does not track, such as numbers and texts, holds nothing
+        waiting = list(filter(gc.is_tracked, gc.get_referents(*inner)))
+    return generators
 
 
 def _start(states: _States, env: Any, key: Key, seed: int) -> tuple[Hashable, Any]:
     """Return the key and the state after a reset."""
-    observation, _ = env.reset(seed=seed)
+    observation = environments.reset(env, seed)
     return key_of(key, env, observation), states.take(env)
 
 
-def _stepper(states: _States, key: Key, first_action: int) -> Callable[[Any, int], _Step]:
-    """Return the function from an environment and an action to what follows."""
+def _stepper(states: _States, key: Key, first_action: int) -> Callable[[Hashable, Any, int], _Step]:
+    """Return the function from a key, an environment in its state and an action to what follows."""
 
-    def step(env: Any, action: int) -> _Step:
-        observation, reward, terminated, truncated, _ = env.step(action + first_action)
-        ends = bool(terminated), bool(truncated)
-        return _Step(key_of(key, env, observation), float(reward), *ends, states.take(env))
+    def step(label: Hashable, env: Any, action: int) -> _Step:
+        observation, reward, ends, truncated = environments.step(env, action + first_action)
+        number = _as_number(reward)
+        if not isfinite(number):
+            message = f"expected a finite number, found {describe(reward)}"
+            raise InputError(message, source=_place(label, action + first_action), field="reward")
+        return _Step(key_of(key, env, observation), number, ends, truncated, states.take(env))
 
     return step
 
 
 def _attempts(
-    states: _States, step: Callable[[Any, int], _Step], first_action: int, samples: int | None
+    states: _States, step: Callable[[Hashable, Any, int], _Step], first_action: int, samples: int | None
 ) -> Callable[[Hashable, Any, int], list[_Step]]:
     """Return the function from a key, a state and an action to what follows, once or in every sample."""
     seeds = np.random.default_rng(0)
 
     def attempt(label: Hashable, state: Any, action: int) -> list[_Step]:
-        env, generators = states.resume(state)
-        before = pickle.dumps(generators)
-        only = step(env, action)
-        source = f"state {reprlib.repr(label)}, action {action + first_action}"
-        if pickle.dumps(generators) == before:
-            return _with_finite_rewards([only], source)
-        message = "the action draws random numbers: expected a number of tries to estimate probabilities from"
-        check(samples is not None, message, source=source, field="samples")
+        if samples is None:
+            env, generators = states.resume(state)
+            before = pickle.dumps(generators)
+            only = step(label, env, action)
+            message = "the action draws random numbers: expected a number of tries to estimate probabilities from"
+            source = _place(label, action + first_action)
+            check(pickle.dumps(generators) == before, f"{message}, found none", source=source, field="samples")
+            return [only]
         steps = []
-        for _ in range(samples or 0):
+        for _ in range(samples):
             env, generators = states.resume(state)
             for generator in generators:
                 _seed(generator, int(seeds.integers(2**32)))
-            steps.append(step(env, action))
-        return _with_finite_rewards(steps, source)
+            steps.append(step(label, env, action))
+        return steps
 
     return attempt
 
 
-def _with_finite_rewards(steps: list[_Step], source: str) -> list[_Step]:
-    """Return what followed an action; raise `InputError` for a reward that is not finite."""
-    for each in steps:
-        check(isfinite(each.reward), f"expected a finite number, found {each.reward}", source=source, field="reward")
-    return steps
+def _place(label: Hashable, action: int) -> str:
+    return f"state {reprlib.repr(label)}, action {action}"
+
+
+def _as_number(reward: Any) -> float:
+    """Return a reward, or a truth value as 0 or 1; NaN for what is not a number."""
+    try:
+        return nan if isinstance(reward, str | bytes) else float(reward)
+    except (TypeError, ValueError):
+        return nan
 
 
 def _seed(generator: Any, seed: int) -> None:
@@ -266,7 +318,7 @@ def _explore(
 
 def _check_walk(
     begin: Sequence[Callable[[], tuple[Hashable, Any]]],
-    step: Callable[[Any, int], _Step],
+    step: Callable[[Hashable, Any, int], _Step],
     rows: Sequence[dict[int, list[Outcome]]],
     numbers: dict[Hashable, int],
 ) -> None:
@@ -276,7 +328,7 @@ def _check_walk(
         label, state = begin[int(draws.integers(len(begin)))]() if place is None else place
         row = rows[numbers[label]]
         action = int(draws.integers(len(row)))
-        done = step(state, action)
+        done = step(label, state, action)
         _check_same(label, action, row[action][0], Outcome(1.0, numbers.get(done.label, -1), done.reward, done.ends))
         place = None if done.ends or done.truncated else (done.label, done.state)
 
@@ -285,5 +337,4 @@ def _check_same(label: Hashable, action: int, one: Outcome, other: Outcome) -> N
     """Raise `InputError` unless an action did the same when it was tried again."""
     same = one[1::2] == other[1::2] and np.isclose(one.reward, other.reward)
     message = f"expected a key that tells all that decides what follows, found {one[1:]} and then {other[1:]}"
-    source = f"state {reprlib.repr(label)}, action {action}"
-    check(same, f"{message} (state, reward, whether it ends)", source=source)
+    check(same, f"{message} (state, reward, whether it ends)", source=_place(label, action))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sidestep.errors import InputError, check
+from sidestep.errors import InputError, check, describe
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.distributions import check_distribution
 from sidestep.tabular.graph import graph
@@ -140,6 +140,53 @@ def check_single(env: Any) -> None:
     check(not several, f"{message}; pass what one of them sees, with the others' actions fixed", field="env")
     message = "expected one environment, found a vector of them"
     check(not hasattr(env, "num_envs"), f"{message}; pass one, as `gymnasium.make` returns it", field="env")
+
+
+def check_runs(env: Any) -> None:
+    """Raise `InputError` for something else than one environment of one agent with `reset` and `step`.
+
+    Args:
+        env: The environment.
+    """
+    check_single(env)
+    runs = all(callable(getattr(env, name, None)) for name in ("reset", "step"))
+    check(runs, f"expected a Gymnasium environment with `reset` and `step`, found {describe(env)}", field="env")
+
+
+def reset(env: Any, seed: int | None) -> Any:
+    """Return the first observation of a new episode.
+
+    Args:
+        env: The environment.
+        seed: Of its random numbers; None to go on with those it has.
+
+    Raises:
+        InputError: For an environment that does not return an observation and a dictionary.
+    """
+    return _parts(env.reset(seed=seed), ("observation", "info"), "reset")[0]
+
+
+def step(env: Any, action: int) -> tuple[Any, Any, bool, bool]:
+    """Return the observation and the reward after an action, and whether the episode has ended or is truncated.
+
+    Args:
+        env: The environment.
+        action: As the environment numbers it.
+
+    Raises:
+        InputError: For an environment that returns something else, as the older ones of Gym do.
+    """
+    names = "observation", "reward", "terminated", "truncated", "info"
+    observation, reward, terminated, truncated, _ = _parts(env.step(action), names, "step")
+    return observation, reward, bool(terminated), bool(truncated)
+
+
+def _parts(results: Any, names: tuple[str, ...], function: str) -> tuple[Any, ...]:
+    """Return what a function of an environment has returned; raise `InputError` unless it has as many parts."""
+    size = len(results) if isinstance(results, tuple) else 1
+    message = f"expected ({', '.join(names)}) of `{function}`, found {size} of them"
+    check(isinstance(results, tuple) and size == len(names), message, field="env")
+    return results
 
 
 def check_whole(value: Any, message: str, source: object) -> int:

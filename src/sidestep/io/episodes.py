@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from sidestep.errors import check, check_count
-from sidestep.io.environments import Environment, check_single, check_whole, numbers_of
+from sidestep.errors import check, check_count, check_function, check_instance, to_count
+from sidestep.io import environments
+from sidestep.io.environments import Environment, check_runs, check_whole, numbers_of
 from sidestep.io.keys import Key, key_of, observation_key
 from sidestep.tabular.demonstrations import Trajectory
 
@@ -38,9 +39,9 @@ def collect(
         key: As in `enumerate_env`; only for an enumerated environment.
 
     Raises:
-        InputError: For a number of episodes below 1, an environment of several agents or with other spaces than
-            `world`, and, with episode and move, for an observation that is not a state of `world` and an action that
-            is not a whole number or not available.
+        InputError: For a number of episodes below 1, a seed or a task below 0, an environment of several agents or
+            with other spaces than `world`, and, with episode and move, for an observation that is not a state of
+            `world` and an action that is not a whole number or not available.
 
     Example:
         >>> import gymnasium
@@ -50,12 +51,16 @@ def collect(
         3
     """
     check_count(episodes, 1, "episodes")
-    check_single(env)
+    check_runs(env)
+    check_instance(world, Environment, "world")
+    check_function(act, "act")
+    check_function(key, "key")
+    seed, task = to_count(seed, "seed", 0), to_count(task, "task", 0)
     state_of, first_action = _state_reader(env, world, key), _first_action(env, world)
     available = np.broadcast_to(np.asarray(world.model.graph.available), world.model.graph.successors.shape[:2])
     random, trajectories = np.random.default_rng(seed), []
     for episode in range(episodes):
-        observation, _ = env.reset(seed=seed if episode == 0 else None)
+        observation = environments.reset(env, seed if episode == 0 else None)
         states, actions, terminated, truncated = [state_of(observation, f"episode {episode}, move 0")], [], False, False
         while not (terminated or truncated):
             place = f"episode {episode}, move {len(actions)}"
@@ -64,10 +69,10 @@ def collect(
             options = np.flatnonzero(available[states[-1]]).tolist()
             check(can, f"expected one of the actions {options} of state {states[-1]}, found {action}", source=place)
             actions.append(action)
-            observation, _, terminated, truncated, _ = env.step(action + first_action)
+            observation, _, terminated, truncated = environments.step(env, action + first_action)
             state = state_of(observation, place)
             states.append(world.ends.get(state, state) if terminated else state)
-        stopped = bool(truncated) and not terminated
+        stopped = truncated and not terminated
         trajectories.append(Trajectory(np.asarray(states), np.asarray(actions), task, stopped))
     return trajectories
 

@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from sidestep.errors import InputError, check, describe
+from sidestep.errors import InputError, check, check_instance, describe
 from sidestep.io.environments import Environment, Outcome, check_single, check_whole, environment_of, numbers_of
 from sidestep.tabular.models import FIXED, IMPOSSIBLE, TiedModel
 from sidestep.tabular.tasks import check_discount
@@ -145,13 +145,14 @@ def slippery(environment: Environment, logit: float = 0.0) -> TiedModel:
         logit: θ, the one parameter of the model; P(slip) = 2 e^θ / (1 + 2 e^θ), see `slip_of`.
 
     Raises:
-        InputError: For an environment with another number of outcomes.
+        InputError: For something else than an environment, and one with another number of outcomes.
 
     Example:
         >>> import gymnasium
         >>> slip_of(slippery(from_gymnasium(gymnasium.make("FrozenLake-v1"))))  # doctest: +ELLIPSIS
         0.6666...
     """
+    check_instance(environment, Environment, "environment")
     possible = np.asarray(environment.model.possible)
     message = f"expected three outcomes an action, found {possible.shape[-1]}"
     check(possible.shape[-1] == 3, message, field="environment")
@@ -169,10 +170,16 @@ def slip_of(model: TiedModel) -> float:
     Args:
         model: A model from `slippery`.
 
+    Raises:
+        InputError: For another model.
+
     Example:
         >>> import gymnasium
         >>> slip_of(slippery(from_gymnasium(gymnasium.make("FrozenLake-v1")), logit=0.0))  # doctest: +ELLIPSIS
         0.6666...
     """
+    check_instance(model, TiedModel, "model")
+    count = len(model.parameters)
+    check(count == 1, f"expected a model from `slippery`, with one parameter, found {count}", field="model")
     odds = 2 * float(jnp.exp(model.parameters[0]))
     return odds / (1 + odds)

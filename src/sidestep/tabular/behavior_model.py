@@ -26,7 +26,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, Shaped
 from sidestep._arguments import to_finite, to_integers, to_states
 from sidestep._repr import short_repr
 from sidestep.errors import check, check_choice, check_instance, describe, to_list, to_number
-from sidestep.tabular.arrays import to_jax
+from sidestep.tabular.arrays import is_traced, to_jax
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.tasks import Task, with_state_costs
 
@@ -110,17 +110,18 @@ class BehaviorModel(eqx.Module):
             The behavior, with the learned β and lapse.
 
         Raises:
-            InputError: For a person that does not exist.
+            InputError: For a person that does not exist; one that JAX is tracing is not looked at.
         """
         log_beta, logit_lapse = self.parameters.log_beta, self.parameters.logit_lapse
         beta, lapse = self.behavior.beta, self.behavior.lapse
         if log_beta is None:
             message = f"expected none without persons, found {person!r}"
-            check(person is None or isinstance(person, jax.Array), message, field="person")
+            check(person is None or is_traced(person), message, field="person")
+        elif person is None:
+            beta = jnp.exp(log_beta.mean())
         else:
-            exists = person is None or isinstance(person, jax.Array) or person in range(len(log_beta))
-            check(exists, f"expected a person in 0…{len(log_beta) - 1}, found {person!r}", field="person")
-            beta = jnp.exp(log_beta.mean() if person is None else log_beta[person])
+            own = to_integers(person, "person", (), least=0, most=len(log_beta) - 1, what="a person")
+            beta = jnp.exp(log_beta[own])
         if logit_lapse is not None:
             lapse = jax.nn.sigmoid(logit_lapse)
         return Behavior(self.behavior.backup, beta, lapse)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
+from sidestep._arguments import to_mask
 from sidestep.errors import InputError, check, check_instance
 from sidestep.tabular.arrays import is_traced
 from sidestep.tabular.backups import Behavior
@@ -34,6 +35,7 @@ def check_model(model: TransitionModel) -> None:
         _check_probabilities(model)
     if isinstance(model.graph, Graph) and not is_traced(model.graph.successors):
         check_states(np.asarray(model.graph.successors), model.graph.states, "successors")
+        to_mask(model.graph.available, "available")
         for name in ("available", "lengths"):
             _check_axes(
                 getattr(model.graph, name).shape, model.graph.successors.shape[:2], f"a table `{name}`", "graph"

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Bool, Float, Int, Shaped
 
-from sidestep.errors import InputError, check, input_errors
+from sidestep.errors import InputError, check, check_instance, describe, input_errors, to_list
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.demonstrations import Demonstrations, flat_moves
 from sidestep.tabular.tasks import Task, stack_tasks
@@ -70,6 +70,7 @@ def read_moves(table: Any, tasks: Task | Sequence[Task], columns: Columns, label
         columns: The names of its columns.
         labels: The names of states, actions, tasks and persons.
     """
+    labels = _checked(labels)
     rows = _Rows(_as_arrow(table), columns)
     stacked = _stacked(tasks)
     states = stacked.terminal.shape[-1]
@@ -114,7 +115,7 @@ def write_moves(demonstrations: Demonstrations[Task], labels: Labels) -> pa.Tabl
         demonstrations: The moves.
         labels: The names of states, actions, tasks and persons.
     """
-    walk = np.asarray(demonstrations.trajectory)
+    labels, walk = _checked(labels), np.asarray(demonstrations.trajectory)
     step = np.arange(len(walk)) - demonstrations.first_moves()[walk]
     names = labels.states, labels.actions, labels.states, labels.tasks
     fields = "state", "action", "next_state", "task"
@@ -126,7 +127,8 @@ def write_moves(demonstrations: Demonstrations[Task], labels: Labels) -> pa.Tabl
         columns["subject"] = _labeled(np.asarray(demonstrations.person), labels.persons, "subject")
     columns["weight"] = np.asarray(demonstrations.weights)
     columns["truncated"] = np.asarray(demonstrations.truncated)
-    return pa.table({name: pa.array(values) for name, values in columns.items()})
+    with input_errors("expected names of one type", pa.ArrowException, source="labels"):
+        return pa.table({name: pa.array(values) for name, values in columns.items()})
 
 
 class _Rows:
@@ -176,18 +178,21 @@ class _Rows:
         missing = np.asarray(column.is_null())
         if not empty:
             self.check(~missing, self.number, "expected a value, found an empty cell", kind)
-        if len(labels):
-            numbers = self._places(column, labels, kind)
-        else:
-            numbers = self._whole(column, kind)
-            most = "" if count is None else f"…{count - 1}"
-            for row in np.flatnonzero(~missing & ((numbers < 0) | (numbers >= (count or np.inf))))[:1]:
-                message = f"expected a whole number in 0{most or ' and above'}, found {numbers[row]}"
-                raise InputError(message, source="table", row=int(row) + 1, field=self.name(kind))
+        numbers = self._places(column, labels, kind) if len(labels) else self._whole(column, kind)
+        span = "0 and above" if count is None else f"0…{count - 1}"
+        for row in np.flatnonzero(~missing & ((numbers < 0) | (numbers >= (np.inf if count is None else count))))[:1]:
+            expected, name = f"a whole number in {span}", ""
+            if len(labels):
+                expected, name = f"a label of one of {span}", f"{describe(labels[int(numbers[row])])}, label "
+            message = f"expected {expected}, found {name}{numbers[row]}"
+            raise InputError(message, source="table", row=int(row) + 1, field=self.name(kind))
         return np.where(missing, _NONE, numbers)
 
     def _places(self, column: pa.Array, labels: Sequence[Hashable], kind: str) -> Int[np.ndarray, " rows"]:
         """Return the place of each cell among labels."""
+        nested = pa.types.is_nested(column.type)
+        message = f"expected texts or whole numbers, found {column.type}"
+        check(not nested, message, source="table", field=self.name(kind))
         known = {label: place for place, label in enumerate(labels)}
         check(len(known) == len(labels), "expected labels that appear once", source="labels", field=kind)
         places = {None: _NONE, **known}
@@ -203,7 +208,7 @@ class _Rows:
         message = f"expected whole numbers (or labels=Labels(…) that name them), found {column.type}"
         check(of_type, message, source="table", field=self.name(kind))
         filled = np.asarray(pc.fill_null(column, 0) if not pa.types.is_null(column.type) else np.zeros(len(self)))
-        whole = np.isfinite(filled) & (filled == np.round(filled)) & (np.abs(filled) < 2.0**31)
+        whole = _is_whole(filled) & (np.abs(filled) < 2.0**31)
         for row in np.flatnonzero(~whole)[:1]:
             message = f"expected a whole number, found {filled[row]}"
             raise InputError(message, source="table", row=int(row) + 1, field=self.name(kind))
@@ -237,6 +242,22 @@ def _as_arrow(table: Any) -> pa.Table:
     message = "expected a table of pandas, polars, pyarrow or another library with Arrow's PyCapsule interface"
     with input_errors(message, Exception, source="table"):  # other libraries raise errors of many kinds
         return pa.table(table)
+
+
+def _checked(labels: Labels) -> Labels:
+    """Return labels as lists; raise `InputError` for other classes, and for a label that no cell can hold."""
+    check_instance(labels, Labels, "labels")
+    fields = {name: to_list(own, object, f"labels.{name}", 0) for name, own in labels._asdict().items()}
+    for name, own in fields.items():
+        for place, label in enumerate(own):
+            message = f"expected a text or a whole number, found {describe(label)}"
+            single = isinstance(label, Hashable) and not isinstance(label, tuple)
+            check(single, message, field=f"labels.{name}[{place}]")
+    return Labels(**fields)
+
+
+def _is_whole(numbers: Shaped[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
+    return np.isfinite(numbers) & (numbers == np.round(numbers))
 
 
 def _stacked(tasks: Task | Sequence[Task]) -> Task:
@@ -282,10 +303,13 @@ def _order(rows: _Rows, walk: Int[np.ndarray, " rows"]) -> Int[np.ndarray, " row
 
 
 def _check_steps(rows: _Rows, order: Int[np.ndarray, " rows"], known: Bool[np.ndarray, " rows"]) -> None:
-    """Raise `InputError` where steps are whole numbers, one is left out and the next state is not known without it."""
+    """Raise `InputError` where steps are whole numbers, one is left out and the next state is not known without it.
+
+    Whole numbers may be stored as floats or decimals, as pandas does beside an empty cell; times are no numbers.
+    """
     column = rows.column("step")
-    if pa.types.is_integer(column.type):
-        step = np.asarray(column)[order]
+    step = np.asarray(column)[order]
+    if not pa.types.is_temporal(column.type) and _is_whole(step.astype(np.float64)).all():
         follows = np.append(step[1:] == step[:-1] + 1, True)
         message = "expected the next step in the walk's next row, found a gap (give `next_state`)"
         rows.check(known | follows, rows.number[order], message, "step")

@@ -89,7 +89,8 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
 
     def __check_init__(self) -> None:
         moves = getattr(self.states, "shape", ())[:1]
-        for name in ("states", "actions", "next_states", "task", "trajectory", "weights", "truncated"):
+        names = ["states", "actions", "next_states", "task", "trajectory", "weights", "truncated"]
+        for name in names if self.person is None else [*names, "person"]:
             value = getattr(self, name)
             fits = isinstance(value, jax.Array | np.ndarray) and value.shape[:1] == moves != ()
             check(fits, f"expected an array with a row for each move, found {describe(value)}", field=name)
@@ -154,7 +155,7 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
                 where each person's walks begin anew (`["subject", "walk"]`); None for a single walk. Walks are numbered
                 as they appear.
             step: The column by which the rows of a walk are ordered; by default they are in order. Where the next state
-                is that of the next row, whole numbers must be followed by the next one.
+                is that of the next row, whole numbers (also those stored as floats) must be followed by the next one.
             task: The column with the task of each walk.
             subject: The column with the person of each walk.
             weight: The column with how much each move counts.
@@ -166,9 +167,10 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
 
         Raises:
             InputError: With row and column, for a column that is missing or of another kind, an empty cell, a state,
-                action or task that does not exist, a label that is not known, moves that do not follow each other, a
-                step that is left out, a walk without a move or that goes on after a terminal state, and two tasks or
-                persons in one walk, or one that is truncated in some of its rows only.
+                action or task that does not exist, a label that is not known or beyond the world's states or the
+                tasks, moves that do not follow each other, a step that is left out, a walk without a move or that goes
+                on after a terminal state, and two tasks or persons in one walk, or one that is truncated in some of its
+                rows only.
 
         Example:
             >>> from sidestep.tabular.grid import Grid
@@ -182,7 +184,10 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
 
         of_walk = [] if walk is None else [walk] if isinstance(walk, str) else to_list(walk, str, "walk")
         columns = Columns(state, action, next_state, tuple(of_walk), step, task, subject, weight, truncated)
-        return read_moves(table, tasks, columns, labels or Labels())
+        for field, name in columns._asdict().items():
+            optional = () if field in ("state", "action") else (type(None),)
+            check_instance(name, (tuple if field == "walk" else str, *optional), field)
+        return read_moves(table, tasks, columns, Labels() if labels is None else labels)
 
     def to_table(self: "Demonstrations[Task]", labels: "Labels | None" = None) -> "pyarrow.Table":
         """Return the moves as a `pyarrow.Table`, which `to_pandas()` and `polars.from_arrow` convert.
@@ -195,7 +200,7 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
             where there are persons, `weight` and `truncated`.
 
         Raises:
-            InputError: Where there are too few labels.
+            InputError: Where there are too few labels, and for labels that are no `Labels`.
 
         Example:
             >>> from sidestep.tabular.grid import Grid
@@ -207,7 +212,7 @@ class Demonstrations(eqx.Module, Generic[Tasks]):
         """
         from sidestep.tabular.demonstration_tables import Labels, write_moves
 
-        return write_moves(self, labels or Labels())
+        return write_moves(self, Labels() if labels is None else labels)
 
     def __getitem__(self, chosen: Any) -> "Demonstrations[Tasks]":
         """Return some trajectories, numbered anew; all tasks stay, so that their numbers do.

@@ -16,7 +16,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.errors import check
+from sidestep.errors import check, check_instance
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import Solution, SolveOptions, decision_process, solve
@@ -81,6 +81,7 @@ def forward_gradient(
     References:
         "Towards Behavior-Aware Model Learning from Human-Generated Trajectories", eqs. 7 to 10.
     """
+    check_instance(options, (SolveOptions, type(None)), "options")
     options = options or SolveOptions()
     check(options.horizon is None, f"expected no horizon, found {options.horizon}", field="options")
     solver = options.solver_for(behavior.backup, model.graph.states)

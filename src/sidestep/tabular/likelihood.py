@@ -16,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from sidestep.errors import check
+from sidestep.errors import check, check_instance
 from sidestep.tabular.arrays import is_traced, to_jax
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.behavior_model import BehaviorModel, as_behavior_model
@@ -133,6 +133,7 @@ def check_likelihood(
         InputError: For arguments of another kind, or of different worlds.
         ImproperTask: For tasks without values.
     """
+    check_instance(options, SolveOptions, "options")
     check_model(model)
     check_behavior(behavior, model.graph)
     check_demonstrations(demonstrations, model.graph)

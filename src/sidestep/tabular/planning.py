@@ -1,13 +1,15 @@
 """Planning under a model: policies, and the paths that they intend."""
 
+from collections.abc import Sequence
 from itertools import takewhile
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
+from sidestep._arguments import to_integers, to_states
 from sidestep._programs import keep_program
 from sidestep._repr import short_repr
 from sidestep.errors import NotConverged, check, check_instance
@@ -63,19 +65,22 @@ class Plan(eqx.Module):
         Raises:
             InputError: For a start that is not a state or, at discount 1, from which no terminal state can be reached.
         """
-        is_state = isinstance(start, (int, np.integer)) and 0 <= start < len(self.terminal)
-        check(is_state, f"expected a state in 0…{len(self.terminal) - 1}, found {start}", field="start")
-        reaches = is_reachable(self.solution.values[start])
-        check(reaches, f"the goal cannot be reached from state {start}", field="start")
-        return self.follow(np.array([start]))[0]
+        state = int(to_integers(start, "start", (), least=0, most=len(self.terminal) - 1, what="a state"))
+        reaches = is_reachable(self.solution.values[state])
+        check(reaches, f"the goal cannot be reached from state {state}", field="start")
+        return self.follow([state])[0]
 
-    def follow(self, starts: Int[np.ndarray, " starts"]) -> list[Int[np.ndarray, " _"]]:
-        """Return `path_from` of each start, without its checks.
+    def follow(self, starts: Shaped[ArrayLike, "..."] | Sequence[int]) -> list[Int[np.ndarray, " _"]]:
+        """Return `path_from` of each start, also where no terminal state can be reached.
 
         Args:
             starts: The first state of each path.
+
+        Raises:
+            InputError: For a start that is not a state.
         """
-        return followed(np.asarray(self.intended), np.asarray(self.terminal), starts)
+        states = to_states(starts, len(self.terminal), "starts")
+        return followed(np.asarray(self.intended), np.asarray(self.terminal), states)
 
 
 def followed(

@@ -5,7 +5,7 @@ the model did not know: the move fails, and an optimal plan repeats it forever. 
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, Shaped
 
-from sidestep._arguments import to_key, to_states
+from sidestep._arguments import to_floats, to_key, to_mask, to_states
 from sidestep._repr import short_repr
 from sidestep.errors import to_count
 from sidestep.tabular.arrays import to_jax
@@ -61,8 +61,8 @@ class RollOuts(NamedTuple):
 def roll_out(
     key: PRNGKeyArray,
     world: TransitionModel,
-    policy: Float[Array, "*moves states actions"],
-    terminal: Bool[Array, " states"],
+    policy: Shaped[ArrayLike, "..."] | Sequence[Any],
+    terminal: Shaped[ArrayLike, "..."] | Sequence[bool],
     starts: Shaped[ArrayLike, "..."] | Sequence[int],
     max_moves: int,
 ) -> RollOuts:
@@ -72,7 +72,7 @@ def roll_out(
         key: Of the random choices; the trajectory of agent i does not depend on how many agents come after it.
         world: The transition model that moves follow; the policy may have been made for another one.
         policy: The probability of each action in every state; with an axis of moves before these, of each move.
-        terminal: Where agents stop.
+        terminal: Whether agents stop, in each state.
         starts: The state that each agent starts in.
         max_moves: The number of moves after which an agent stops anyway.
 
@@ -80,9 +80,9 @@ def roll_out(
         The trajectories, one for each start.
 
     Raises:
-        InputError: For a start that is not a state, a number of moves below 1, a policy of another shape, and, with
-            state and action, one that is no distribution or gives probability to an action that is not available, in a
-            state that is not terminal.
+        InputError: For a start that is not a state, a number of moves below 1, terminal states that are not booleans, a
+            policy of another shape, and, with state and action, one that is no distribution or gives probability to an
+            action that is not available, in a state that is not terminal.
 
     Example:
         >>> from sidestep.tabular.grid import Grid
@@ -98,6 +98,7 @@ def roll_out(
     """
     max_moves = to_count(max_moves, "max_moves")
     check_model(world)
+    policy, terminal = to_jax(to_floats(policy, "policy")), to_jax(to_mask(terminal, "terminal"))
     check_policy(policy, terminal, world.graph, max_moves)
     states = to_jax(to_states(starts, world.graph.states, "starts"), np.int32)
     return _roll_out(to_key(key), world, policy, terminal, states, max_moves)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from sidestep._arguments import to_key, to_states
-from sidestep.errors import InputError, check, to_count, to_list
+from sidestep.errors import InputError, check, check_instance, to_count, to_list
 from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.behavior_model import BehaviorModel
@@ -74,6 +74,7 @@ def simulate(
     check(len(starts) == len(tasks), f"expected as many as tasks, {len(tasks)}, found {len(starts)}", field="starts")
     limit = max(1000, 2 * world.graph.states) if max_moves is None else to_count(max_moves, "max_moves")
     check_persons(behavior, len(tasks))
+    check_instance(options, (SolveOptions, type(None)), "options")
     options = options or SolveOptions()
     if options.deadline and options.horizon is not None:
         limit = min(limit, options.horizon)

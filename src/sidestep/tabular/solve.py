@@ -197,6 +197,7 @@ def solve(
     """
     options = options or SolveOptions()
     check_instance(options, SolveOptions, "options")
+    check_instance(start, (base.WarmStart, type(None)), "start")
     check_model(model)
     check_task(task, model.graph)
     check_behavior(behavior, model.graph)

@@ -27,6 +27,7 @@ from sidestep.io.walks import walks_from_table
 
 GRAPH = ss.grid_graph(GRID)
 ARROW = pa.table({"walk": [0]})
+MOVES = {"walk": [0, 0], "state": [0, 1], "action": [3, None]}
 CASES = [
     *labeled("Grid", [
         ("three axes", lambda: ss.ObstacleGrid(ss.Grid(np.zeros((2, 2, 2), int))), "known"),
@@ -98,11 +99,25 @@ CASES = [
     ]),
     *labeled("from_table", [
         ("walks by a number", lambda: ss.Demonstrations.from_table({"walk": [0]}, TASK, walk=3), "walk"),
+        ("labels of a dictionary", lambda: ss.Demonstrations.from_table(MOVES, TASK, labels={"states": ("a", "b")}), "Labels"),
+        ("labels of an empty list", lambda: ss.Demonstrations.from_table(MOVES, TASK, labels=[]), "Labels"),
+        ("labels of a number", lambda: ss.Demonstrations.from_table(MOVES, TASK, labels=ss.Labels(states=5)), "labels.states"),
+        ("labels of one text", lambda: ss.Demonstrations.from_table(MOVES, TASK, labels=ss.Labels(actions="nswe")), "labels.actions"),
+        ("labels of lists", lambda: ss.Demonstrations.from_table(MOVES, TASK, labels=ss.Labels(states=[["a"]])), "labels.states[0]"),
+        ("labels of pairs", lambda: ss.Demonstrations.from_table(MOVES, TASK, labels=ss.Labels(states=[(0, 0)])), "labels.states[0]"),
+        ("states by a number", lambda: ss.Demonstrations.from_table(MOVES, TASK, state=1), "state"),
+        ("actions without a column", lambda: ss.Demonstrations.from_table(MOVES, TASK, action=None), "action"),
+        ("steps by True", lambda: ss.Demonstrations.from_table(MOVES, TASK, step=True), "step"),
+        ("tasks of a number", lambda: ss.Demonstrations.from_table(MOVES, 3), "tasks"),
+        ("to_table, labels of a dictionary", lambda: DEMOS.to_table({"states": ("a", "b")}), "Labels"),
+        ("to_table, labels of one text", lambda: DEMOS.to_table(ss.Labels(actions="nswe")), "labels.actions"),
         ("walks by numbers", lambda: ss.Demonstrations.from_table({"walk": [0]}, TASK, walk=["walk", 3]), "walk[1]"),
     ]),
     *labeled("Demonstrations", [
         ("lists", lambda: ss.Demonstrations([0], [0], [1], [0], [0], TASK), "states"),
         ("weights of another length", lambda: ss.Demonstrations(DEMOS.states, DEMOS.actions, DEMOS.next_states, DEMOS.task, DEMOS.trajectory, TASK, np.ones(2)), "weights"),
+        ("persons of another length", lambda: replace(DEMOS, person=np.zeros(2, int)), "person"),
+        ("persons in a list", lambda: replace(DEMOS, person=[0] * 6), "person"),
         ("with_only, numbers", lambda: DEMOS.with_only(np.array([0, 1])), "trajectories"),
         ("with_only, too short", lambda: DEMOS.with_only(np.array([True])), "trajectories"),
         ("with_only, None", lambda: DEMOS.with_only(None), "trajectories"),

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
+from gymnasium.spaces import Discrete
 
 import sidestep as ss
 from helpers.wrong_calls.small import (
@@ -24,6 +25,7 @@ from helpers.wrong_calls.small import (
     WALKS,
     labeled,
 )
+from sidestep.tabular.forward_gradients import forward_gradient
 
 GRAPH = ss.graph(np.array([[[0, 1]], [[1, 0]]]))
 POLICY = jnp.full((20, 4), 0.25)
@@ -42,6 +44,16 @@ def table(transitions):
 
 
 LOOP = {0: [(1.0, 1, 0.0, True)]}
+WORLD = ss.from_gymnasium(table({0: LOOP, 1: LOOP}))
+ENV = SimpleNamespace(
+    reset=lambda **_: (0, {}),
+    step=lambda _: (1, 0.0, True, False, {}),
+    action_space=Discrete(1),
+    observation_space=None,
+)
+ACT = lambda *_: 0  # noqa: E731
+PLAN = ss.plan(MODEL, TASK)
+PERSONS = ss.behavior_model(BEHAVIOR, person=[0, 1])
 CASES = [
     *labeled("backups", [
         ("beta of text", lambda: ss.Behavior(ss.BoltzmannAverage(), beta="7"), "beta"),
@@ -126,7 +138,13 @@ CASES = [
         ("log_likelihood, trajectories from 1", lambda: ss.log_likelihood(MODEL, changed(trajectory=DEMOS.trajectory + 1), BEHAVIOR), "trajectory"),
         ("log_likelihood, persons of trajectories", lambda: ss.log_likelihood(MODEL, changed(person=jnp.array([0, 1])), BEHAVIOR), "person"),
         ("solve, successors that are no states", lambda: ss.solve(ss.TabularModel(ss.Graph(GRAPH.successors + 1, GRAPH.lengths), jnp.zeros((2, 1, 2))), ss.task(np.zeros(2), 0.9, [False, True]), BEHAVIOR), "successors"),
+        ("solve, available actions as 1", lambda: ss.solve(ss.TabularModel(ss.Graph(GRAPH.successors, GRAPH.lengths, jnp.ones((2, 1), int)), jnp.zeros((2, 1, 2))), ss.task(np.zeros(2), 0.9, [False, True]), BEHAVIOR), "available"),
         ("check_proper, actions", lambda: ss.check_proper(TASK, BEHAVIOR, 4), "world"),
+        ("log_likelihood, options of text", lambda: ss.log_likelihood(MODEL, DEMOS, BEHAVIOR, options="exact"), "options"),
+        ("log_policies, options of a number", lambda: ss.log_policies(MODEL, DEMOS, BEHAVIOR, options=3), "options"),
+        ("forward_gradient, options of text", lambda: forward_gradient(MODEL, TASK, BEHAVIOR, options="exact"), "options"),
+        ("solve, a start of a number", lambda: ss.solve(MODEL, TASK, BEHAVIOR, start=3), "start"),
+        ("solve, a start of values", lambda: ss.solve(MODEL, TASK, BEHAVIOR, start=jnp.zeros(20)), "start"),
         ("log_likelihood of another world", lambda: ss.log_likelihood(OTHER_MODEL, DEMOS, BEHAVIOR), "demonstrations"),
         ("log_likelihood of walks", lambda: ss.log_likelihood(MODEL, WALKS, BEHAVIOR), "demonstrations"),
         ("log_likelihood of a misspelled term", lambda: ss.log_likelihood(MODEL, DEMOS, BEHAVIOR, terms=("action",)), "terms"),
@@ -139,6 +157,24 @@ CASES = [
         ("plan with a backup", lambda: ss.plan(MODEL, TASK, ss.HardMax()), "behavior"),
         ("roll_out, another policy", lambda: ss.roll_out(KEY, MODEL, jnp.ones((3, 4)), TASK.terminal, jnp.array([0]), 3), "policy"),
         ("roll_out, no distribution", lambda: ss.roll_out(KEY, MODEL, 2 * POLICY, TASK.terminal, jnp.array([0]), 3), "policy"),
+        ("roll_out, a text for a policy", lambda: ss.roll_out(KEY, MODEL, "uniform", TASK.terminal, [0], 3), "policy"),
+        ("roll_out, lists of unequal lengths", lambda: ss.roll_out(KEY, MODEL, [[1.0], [0.5, 0.5]], TASK.terminal, [0], 3), "policy"),
+        ("roll_out, terminal states as 0 and 1", lambda: ss.roll_out(KEY, MODEL, POLICY, np.zeros(20, int), [0], 3), "booleans"),
+        ("roll_out, terminal states as floats", lambda: ss.roll_out(KEY, MODEL, POLICY, jnp.zeros(20), [0], 3), "booleans"),
+        ("roll_out, a terminal state by number", lambda: ss.roll_out(KEY, MODEL, POLICY, [3], [0], 3), "terminal"),
+        ("roll_out, terminal states of another world", lambda: ss.roll_out(KEY, MODEL, POLICY, [True], [0], 3), "terminal"),
+        ("path_from True", lambda: PLAN.path_from(True), "start"),
+        ("path_from NumPy's True", lambda: PLAN.path_from(np.True_), "start"),
+        ("path_from 1.0", lambda: PLAN.path_from(1.0), "start"),
+        ("path_from text", lambda: PLAN.path_from("door"), "start"),
+        ("path_from several states", lambda: PLAN.path_from([0, 1]), "start"),
+        ("follow from a state that is not there", lambda: PLAN.follow([77]), "starts"),
+        ("follow from -1", lambda: PLAN.follow(np.array([-1])), "starts"),
+        ("follow from fractions", lambda: PLAN.follow([0.5]), "starts"),
+        ("follow from one state", lambda: PLAN.follow(3), "starts"),
+        ("plan, options of text", lambda: ss.plan(MODEL, TASK, options="exact"), "options"),
+        ("simulate, options of text", lambda: ss.simulate(KEY, MODEL, [TASK], [[0]], options="exact"), "options"),
+        ("simulate, no options", lambda: ss.simulate(KEY, MODEL, [TASK], [[0]], options={}), "options"),
         ("roll_out, a state that is not there", lambda: ss.roll_out(KEY, MODEL, POLICY, TASK.terminal, jnp.array([99]), 3), "starts"),
         ("roll_out, moves", lambda: ss.roll_out(KEY, MODEL, POLICY, TASK.terminal, jnp.array([0]), 2.5), "max_moves"),
         ("roll_out, a seed", lambda: ss.roll_out(0, MODEL, POLICY, TASK.terminal, jnp.array([0]), 3), "key"),
@@ -155,9 +191,47 @@ CASES = [
         ("features of other states", lambda: ss.fit(MODEL, DEMOS, ss.behavior_model(BEHAVIOR, features=np.zeros((7, 4, 1))), optimizer=ss.LBFGS(max_iterations=2)), "features"),
         ("features of two axes", lambda: ss.behavior_model(BEHAVIOR, features=np.zeros((7, 4))), "features"),
         ("weights of other features", lambda: ss.behavior_model(BEHAVIOR, features=np.zeros((1, 4, 1)), reward_weights=[1.0, 2.0]), "reward_weights"),
+        ("behavior_of a float", lambda: PERSONS.behavior_of(1.0), "a person"),
+        ("behavior_of True", lambda: PERSONS.behavior_of(True), "a person"),
+        ("behavior_of a name", lambda: PERSONS.behavior_of("anna"), "a person"),
+        ("behavior_of JAX's 7", lambda: PERSONS.behavior_of(jnp.asarray(7)), "0…1, found 7"),
+        ("behavior_of NumPy's -1", lambda: PERSONS.behavior_of(np.int64(-1)), "0…1, found -1"),
+        ("behavior_of two persons", lambda: PERSONS.behavior_of(jnp.array([0, 1])), "a person"),
+        ("behavior_of a person without persons", lambda: ss.behavior_model(BEHAVIOR).behavior_of(jnp.asarray(0)), "person"),
+        ("plan, a person of text", lambda: ss.plan(MODEL, TASK, PERSONS, person="0"), "a person"),
         ("one name without a tuple", lambda: ss.behavior_model(BEHAVIOR, "beta"), "learn"),
         ("a discount of text", lambda: ss.behavior_model(BEHAVIOR, ("discount",), discount="0.9"), "discount"),
         ("a backup", lambda: ss.behavior_model(ss.HardMax()), "behavior"),
+    ]),
+    *labeled("enumerate_env", [
+        ("seeds of a number", lambda: ss.enumerate_env(ENV, seeds=5), "seeds"),
+        ("seeds of text", lambda: ss.enumerate_env(ENV, seeds="0"), "seeds"),
+        ("a fraction as a seed", lambda: ss.enumerate_env(ENV, seeds=[0, 1.9]), "seeds[1]"),
+        ("a seed below 0", lambda: ss.enumerate_env(ENV, seeds=[-1]), "seeds[0]"),
+        ("no seed of an iterator", lambda: ss.enumerate_env(ENV, seeds=iter(())), "seeds"),
+        ("a key of text", lambda: ss.enumerate_env(ENV, key="obs"), "key"),
+        ("a key None", lambda: ss.enumerate_env(ENV, key=None), "key"),
+        ("get_state of text", lambda: ss.enumerate_env(ENV, get_state="a", set_state=print), "get_state"),
+        ("set_state of a number", lambda: ss.enumerate_env(ENV, get_state=str, set_state=3), "set_state"),
+        ("samples of a fraction", lambda: ss.enumerate_env(ENV, samples=1.5), "samples"),
+        ("limit of text", lambda: ss.enumerate_env(ENV, limit="9"), "limit"),
+        ("None", lambda: ss.enumerate_env(None), "env"),
+    ]),
+    *labeled("collect", [
+        ("a seed below 0", lambda: ss.collect(ENV, WORLD, ACT, 1, seed=-1), "seed"),
+        ("a seed of a fraction", lambda: ss.collect(ENV, WORLD, ACT, 1, seed=1.5), "seed"),
+        ("a seed None", lambda: ss.collect(ENV, WORLD, ACT, 1, seed=None), "seed"),
+        ("a task of a fraction", lambda: ss.collect(ENV, WORLD, ACT, 1, task=1.5), "task"),
+        ("a task below 0", lambda: ss.collect(ENV, WORLD, ACT, 1, task=-1), "task"),
+        ("act of a number", lambda: ss.collect(ENV, WORLD, 3, 1), "act"),
+        ("a key of text", lambda: ss.collect(ENV, WORLD, ACT, 1, key="obs"), "key"),
+        ("a model for a world", lambda: ss.collect(ENV, WORLD.model, ACT, 1), "world"),
+        ("an environment None", lambda: ss.collect(None, WORLD, ACT, 1), "env"),
+        ("slippery of None", lambda: ss.slippery(None), "environment"),
+        ("slippery of an environment of Gymnasium", lambda: ss.slippery(ENV), "environment"),
+        ("slip_of a number", lambda: ss.slip_of(3), "model"),
+        ("slip_of a model of 20 parameters", lambda: ss.slip_of(MODEL), "model"),
+        ("slip_of a model of two parameters", lambda: ss.slip_of(ss.TiedModel(GRAPH, [[[-1, 0]], [[-1, 1]]])), "one parameter"),
     ]),
     *labeled("from_gymnasium", [
         ("no state", lambda: ss.from_gymnasium(table({})), "state"),
@@ -184,6 +258,19 @@ RIGHT = {
     "task of lists": lambda: ss.task([0, 1], 1, [False, True]).terminal.tolist() == [False, True],
     "reach of NumPy's numbers": lambda: ss.reach(GRID, np.int8(3), discount=1, step_cost=np.int64(1)).discount == 1,
     "simulate from a list": lambda: len(ss.simulate(KEY, MODEL, (TASK,), [[0]], BEHAVIOR)) == 1,
+    "roll_out of lists": lambda: (
+        ss.roll_out(KEY, MODEL, POLICY.tolist(), [True] * 20, [0], 3).arrived.tolist() == [True]
+    ),
+    "roll_out of a policy of integers": lambda: (
+        ss.roll_out(KEY, MODEL, np.eye(4, dtype=int)[[3] * 20], np.zeros(20, bool), [0], 2).states.shape == (1, 3)
+    ),
+    "follow from a list": lambda: PLAN.follow([3])[0].tolist() == [3],
+    "path_from JAX's number": lambda: PLAN.path_from(jnp.asarray(3)).tolist() == [3],
+    "behavior_of JAX's number": lambda: PERSONS.behavior_of(jnp.asarray(1)).beta > 0,
+    "enumerate_env with seeds of an iterator": lambda: ss.enumerate_env(ENV, seeds=iter([0, 1])).labels == (0, 1),
+    "collect with NumPy's numbers": lambda: (
+        ss.collect(ENV, WORLD, ACT, 1, seed=np.int64(1), task=np.int8(2))[0].task == 2
+    ),
     "behavior_model of a list": lambda: len(ss.behavior_model(BEHAVIOR, person=[0, 1]).person) == 2,
 }
 """Unusual calls that work."""

@@ -10,7 +10,8 @@ one entry per task (`task_entries`). The metadata of each episode have `goal` (t
 arrival, or a list of several), `discount`, and `task`, the number of its entry. In a dataset without `tasks`, the task
 of each episode is to reach its `goal` at its `discount`, as in `reach`. Weights other than 1 are in `infos`, as
 `move_weight`, beside the observation after each move. Minari calls every episode truncated that is not terminated;
-`walk_truncated` in the metadata of an episode says whether a limit of moves stopped the agent.
+`walk_truncated` in the metadata of an episode says whether a limit of moves stopped the agent, and `walk_person`, where
+persons are told apart, the number of its person.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,13 +21,13 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from sidestep.errors import InputError, check, check_instance, describe, to_number
 from sidestep.io.minari import task_entries
 from sidestep.io.minari.datasets import Episode, read_dataset, require_minari, write_dataset
 from sidestep.tabular.arrays import to_jax
-from sidestep.tabular.demonstrations import Demonstrations, Trajectory, gather
+from sidestep.tabular.demonstrations import Demonstrations, Trajectory, flat_moves, gather
 from sidestep.tabular.graph import Graph
 from sidestep.tabular.grid import Grid
 from sidestep.tabular.tasks import Task, reach
@@ -34,7 +35,7 @@ from sidestep.tabular.tasks import Task, reach
 StateOf = Callable[[Any], int]
 """Returns the state of an observation."""
 _NO_ENDS: Mapping[int, int] = {}
-_WEIGHT, _TRUNCATED = "move_weight", "walk_truncated"
+_WEIGHT, _TRUNCATED, _PERSON = "move_weight", "walk_truncated", "walk_person"
 
 
 def write_demonstrations(
@@ -51,7 +52,7 @@ def write_demonstrations(
 
     Raises:
         InputError: For an id that is malformed or exists already, demonstrations in another world, and for moves of a
-            trajectory that do not start where the move before has ended.
+            trajectory that do not start where the move before has ended, or are of several tasks or persons.
 
     Example:
         >>> write_demonstrations("office/walks-v0", demonstrations, grid)  # doctest: +SKIP
@@ -97,7 +98,8 @@ def read_demonstrations(
     Raises:
         InputError: For a dataset that does not exist, is broken or empty, or has other spaces than the world, and,
             naming the episode and the field, for lengths that do not fit, states and actions outside the spaces, an
-            episode that continues after a terminal state, and a task that is missing or not of this world.
+            episode that continues after a terminal state, a task that is missing or not of this world, and persons of
+            some episodes only.
 
     Example:
         >>> demonstrations = read_demonstrations("office/walks-v0", grid)  # doctest: +SKIP
@@ -143,7 +145,8 @@ def read_demonstrations(
         gathered = gather(trajectories, tasks)
     except InputError as error:
         raise error.of(dataset if error.row is None else episodes[error.row - 1].source) from error
-    return replace(gathered, weights=to_jax(np.concatenate([_weights(episode) for episode in episodes])))
+    weights = to_jax(np.concatenate([_weights(episode) for episode in episodes]))
+    return replace(gathered, weights=weights, person=_persons(episodes))
 
 
 class _Numbers(NamedTuple):
@@ -163,8 +166,9 @@ def _episodes(
     goals = [task_entries.best_terminal_states(task, world) for task in tasks]
     for row, own in enumerate(np.split(np.arange(len(moves)), moves.first_moves()[1:]), start=1):
         before, after, task = moves.states[own], moves.next_states[own], moves.task[own]
-        connected = (after[:-1] == before[1:]).all() and (task == task[0]).all()
-        message = "expected moves that each start where the one before ended, and one task"
+        person = np.zeros(len(own), np.int64) if moves.person is None else moves.person[own]
+        connected = (after[:-1] == before[1:]).all() and (task == task[0]).all() and (person == person[0]).all()
+        message = "expected moves that each start where the one before ended, of one task and one person"
         check(connected, message, source="trajectory", row=row)
         index, last = int(task[0]), int(after[-1])
         path = np.append(before, origin.get(last, last)).astype(np.int64)
@@ -172,6 +176,7 @@ def _episodes(
         metadata = {"task": index, "discount": tasks[index]["discount"], _TRUNCATED: bool(moves.truncated[own[0]])}
         best = goals[index]
         metadata |= {"goal": best[0] if len(best) == 1 else best} if best else {}
+        metadata |= {} if moves.person is None else {_PERSON: int(person[0])}
         infos = {_WEIGHT: np.append(0.0, moves.weights[own])} if weighted else {}
         yield Episode(path, acted, rewards[own], last in tasks[index]["terminal"], infos, metadata)
 
@@ -237,6 +242,20 @@ def _weights(episode: Episode) -> Float[np.ndarray, " moves"]:
     valid = (np.isfinite(weights) & (weights >= 0)).all()
     check(valid, "expected finite numbers of at least 0", source=episode.source, field=_WEIGHT)
     return weights[1:].astype(np.float64)
+
+
+def _persons(episodes: Sequence[Episode]) -> Int[Array, " moves"] | None:
+    """Return the person of each move; None where no episode has one."""
+    if not any(_PERSON in episode.metadata for episode in episodes):
+        return None
+    persons = []
+    for episode in episodes:
+        message = "expected a person in all episodes or in none, found none"
+        check(_PERSON in episode.metadata, message, source=episode.source, field=_PERSON)
+        person = task_entries.whole_number_in(episode.metadata, _PERSON, episode.source)
+        check(person >= 0, f"expected at least 0, found {person}", source=episode.source, field=_PERSON)
+        persons.append(np.full(len(episode.rewards), person))
+    return flat_moves(persons)
 
 
 def _tasks_of_goals(
