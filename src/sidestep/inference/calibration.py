@@ -89,7 +89,7 @@ def score_statistics(
         (2,)
     """
     check_instance(options, (SolveOptions, type(None)), "options")
-    check_likelihood(model, demonstrations, behavior, options or SolveOptions())
+    check_likelihood(model, demonstrations, behavior, SolveOptions() if options is None else options)
     deadline = options is not None and options.deadline
     check(not deadline, "expected options without a deadline, found one", field="options")
     padded, agents = padded_for(demonstrations, behavior)

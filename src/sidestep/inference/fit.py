@@ -226,7 +226,8 @@ def fit(
         Equations 1 and 6 of the behavior-aware modeling paper.
     """
     check_evidence(model, demonstrations, behavior, tempering, terms)
-    optimizer, options, prior = optimizer or LBFGS(), options or SolveOptions(), prior or Normal()
+    optimizer, prior = LBFGS() if optimizer is None else optimizer, Normal() if prior is None else prior
+    options = SolveOptions() if options is None else options
     _check_settings(optimizer, options, prior, memory, mesh, large_map, report)
     behavior = as_behavior_model(behavior)
     solver = options.solver_for(behavior.behavior.backup, model.graph.states)

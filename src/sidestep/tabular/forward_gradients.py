@@ -82,7 +82,7 @@ def forward_gradient(
         "Towards Behavior-Aware Model Learning from Human-Generated Trajectories", eqs. 7 to 10.
     """
     check_instance(options, (SolveOptions, type(None)), "options")
-    options = options or SolveOptions()
+    options = SolveOptions() if options is None else options
     check(options.horizon is None, f"expected no horizon, found {options.horizon}", field="options")
     solver = options.solver_for(behavior.backup, model.graph.states)
     solution = solve(model, task, behavior, options=SolveOptions(solver=solver))

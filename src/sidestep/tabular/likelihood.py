@@ -101,7 +101,7 @@ def log_likelihood(
     References:
         Equations 1 and 6 of the behavior-aware modeling paper.
     """
-    options = options or SolveOptions()
+    options = SolveOptions() if options is None else options
     check_terms(terms)
     check_likelihood(model, demonstrations, behavior, options)
     padded, agents = padded_for(demonstrations, behavior)
@@ -219,7 +219,7 @@ def log_policies(
         >>> log_policies(true_model(grid), shown, Behavior(HardMax(), 50.0)).shape
         (2,)
     """
-    options = options or SolveOptions()
+    options = SolveOptions() if options is None else options
     check_likelihood(model, demonstrations, behavior, options)
     padded, agents = padded_for(demonstrations, behavior)
     return _first(_log_policies(model, padded, agents, options), len(demonstrations))

@@ -148,7 +148,7 @@ def plan(
         >>> plan(ObstacleGrid(grid), reach(grid, 3)).path_from(0).tolist()
         [0, 1, 2, 3]
     """
-    options = options or SolveOptions()
+    options = SolveOptions() if options is None else options
     check_instance(options, SolveOptions, "options")
     check_model(model)
     check_task(task, model.graph)

@@ -75,7 +75,7 @@ def simulate(
     limit = max(1000, 2 * world.graph.states) if max_moves is None else to_count(max_moves, "max_moves")
     check_persons(behavior, len(tasks))
     check_instance(options, (SolveOptions, type(None)), "options")
-    options = options or SolveOptions()
+    options = SolveOptions() if options is None else options
     if options.deadline and options.horizon is not None:
         limit = min(limit, options.horizon)
     key, trajectories = to_key(key), []

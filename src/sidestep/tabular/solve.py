@@ -195,7 +195,7 @@ def solve(
         Equations 2-5 (values) and 7-10 (gradients) of the behavior-aware modeling paper. The adjoint method for fixed
         points: Christianson, "Reverse accumulation and attractive fixed points" (1994).
     """
-    options = options or SolveOptions()
+    options = SolveOptions() if options is None else options
     check_instance(options, SolveOptions, "options")
     check_instance(start, (base.WarmStart, type(None)), "start")
     check_model(model)
