@@ -5,11 +5,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 import sidestep as ss
 import sidestep.continuous as sc
 from helpers import small_worlds
-from helpers.small_worlds import ACTIONS, PLACES, STATES, TASKS, WHICH
+from helpers.small_worlds import ACTIONS, PLACES, SPREAD, STATES, TASKS, WHICH
 from sidestep.continuous.estimators import with_control_variates
 from sidestep.continuous.likelihood import ActionLikelihood
 from sidestep.continuous.policies import ScaledNetwork
@@ -40,6 +41,15 @@ def test_log_probs_over_finite_actions_are_those_of_a_softmax():
     odds = np.exp(BETA * q)
     expected = np.log(odds / odds.sum(axis=1, keepdims=True))[np.arange(len(q)), np.asarray(likelihood.observed)]
     np.testing.assert_allclose(likelihood.log_probs(jnp.asarray(q)), expected, rtol=1e-12)
+
+
+def test_log_probs_over_vectors_are_those_of_importance_sampling():
+    """The density is exp βQ over its integral, the mean of exp βQ/π_λ of the choices that the policy drew."""
+    likelihood, q = drawn_likelihood(), np.random.default_rng(1).normal(size=(2, 4))
+    means = np.asarray(jax.vmap(LINEAR.policy.network)(likelihood.drawn.states - LINEAR.tasks.goal))
+    drawn = np.asarray(likelihood.drawn.choices)[..., 0]
+    integral = np.mean(np.exp(BETA * q[:, 1:]) / norm.pdf(drawn, means, SPREAD), axis=1)
+    np.testing.assert_allclose(likelihood.log_probs(jnp.asarray(q)), BETA * q[:, 0] - np.log(integral), rtol=1e-10)
 
 
 @pytest.mark.parametrize("likelihood", [finite_likelihood(), drawn_likelihood()], ids=["finite", "vectors"])
