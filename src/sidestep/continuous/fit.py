@@ -149,6 +149,7 @@ def fit_dynamics(
     problem = FitProblem(
         agent, demonstrations, Normal() if prior is None else prior, planner, schedule, terms, estimator
     )
+    problem.prior.check_parameters(dynamics.parameters)
     saver = Saver(checkpoint, problem_fingerprint((problem, seed)) if checkpoint is not None else "")
     warmup_key, key = jax.random.split(jax.random.key(seed))
     initial_key, warmup_key = jax.random.split(warmup_key)
