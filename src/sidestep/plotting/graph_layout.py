@@ -132,8 +132,8 @@ def places_of(network: "DiGraph", positions: Positions | None) -> Places:
     """
     if positions is None:
         return _turned(_apart(_chosen(network)))
-    given = isinstance(positions, Mapping)
-    places = positions if given else dict(enumerate(to_finite(positions, "positions", ("states", 2))))
+    is_mapping = isinstance(positions, Mapping)
+    places = positions if is_mapping else dict(enumerate(to_finite(positions, "positions", ("states", 2))))
     missing = [state for state in network if state not in places]
     check(not missing, f"expected a place of each state, found none of {missing[:5]}", field="positions")
     result = np.asarray(to_finite([places[state] for state in network], "positions", ("states", 2)), np.float64)
