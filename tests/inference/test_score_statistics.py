@@ -80,8 +80,8 @@ def ratio_of(*weights):
 
 
 def test_effective_sample_ratio_of_a_walk_of_weight_two_is_that_of_the_walk_twice():
-    twice = [[*part, *part[3:]] for part in NUMBERS]
-    expected = effective_sample_ratio([statistics(*twice, [*OF, 3, 3])])
+    score, information = ([*part, *part[3:]] for part in NUMBERS)
+    expected = effective_sample_ratio([statistics(score, information, [*OF, 3, 3])])
     assert ratio_of(1, 1, 1, 2, 2) == pytest.approx(expected, rel=1e-12)
 
 

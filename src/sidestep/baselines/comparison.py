@@ -15,7 +15,7 @@ from sidestep.io.gridding import Moves, grid_walks
 from sidestep.io.walks import Walks
 from sidestep.maps.annotations import NO_ANNOTATIONS, WalkAnnotations, persons_of
 from sidestep.maps.config import MapConfig
-from sidestep.maps.fit import demonstrations_of
+from sidestep.maps.fit import behavior_of, demonstrations_of
 from sidestep.maps.learn import Learning, learn_map, sample_walks, with_annotations
 from sidestep.maps.learned_map import LearnedMap
 from sidestep.tabular.demonstrations import Demonstrations
@@ -170,15 +170,8 @@ def _with_probable_goals(moves: Moves, learned: LearnedMap | None) -> Moves:
         return moves
     posterior, config = learning.goals, learning.config
     tasks = [config.reward.reach(learned.grid, int(state)) for state in posterior.candidates]
-    result, walks = posterior.fit.fit, moves.trajectories()
-    probability, _ = goal_posterior(
-        learned.model,
-        walks,
-        tasks,
-        result.behavior,
-        posterior.fit.goal_probabilities,
-        options=result.problem.options,
-    )
+    behavior, walks = behavior_of(config), moves.trajectories()
+    probability, _ = goal_posterior(learned.model, walks, tasks, behavior, posterior.fit.goal_probabilities)
     goals = moves.goals.copy()
     goals[np.unique(moves.walk)] = posterior.candidates[probability.argmax(axis=1)]
     return replace(moves, goals=goals)

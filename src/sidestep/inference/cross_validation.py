@@ -151,9 +151,9 @@ def _folds(
 ) -> Int[np.ndarray, " trajectories"]:
     """Return the fold of each trajectory: −1 for those without a move in `counted`."""
     what = f"a whole number for each of the {trajectories} trajectories,"
-    groups = np.arange(trajectories) if groups is None else to_integers(groups, "groups", (trajectories,), what=what)
+    own = np.arange(trajectories) if groups is None else to_integers(groups, "groups", (trajectories,), what=what)
     some = np.unique(counted)
-    distinct, which = np.unique(groups[some], return_inverse=True)
+    distinct, which = np.unique(own[some], return_inverse=True)
     check(
         len(distinct) >= folds, f"expected at most {len(distinct)}, the number of groups, found {folds}", field="folds"
     )

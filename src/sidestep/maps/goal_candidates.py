@@ -16,7 +16,7 @@ from sidestep.inference.maximize import Progress
 from sidestep.io.demonstrations import connected_regions
 from sidestep.io.gridding import Moves
 from sidestep.maps.config import MapConfig
-from sidestep.maps.fit import behavior_model_of, fit_map, solve_options_of
+from sidestep.maps.fit import behavior_of, fit_map
 from sidestep.maps.sensors import SensorMap
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Cell, Grid
@@ -170,8 +170,7 @@ def fit_with_unknown_goals(
         first = current is model
         return fit_map(current, demonstrations, config, sensor=sensor, initialize=first, callback=callback)
 
-    agents, options = behavior_model_of(config), solve_options_of(config)
-    result = fit_goals(model, moves.trajectories(), tasks, agents, learn, options=options)
+    result = fit_goals(model, moves.trajectories(), tasks, behavior_of(config), learn)
     goals = moves.goals.copy()
     goals[walks] = states[result.posterior.argmax(axis=1)]
     return GoalPosterior(result, walks, states, replace(moves, goals=goals), [labels[walk] for walk in walks.tolist()])
