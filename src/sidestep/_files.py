@@ -12,13 +12,14 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from sidestep.errors import InputError, input_errors
+from sidestep.errors import InputError, input_errors, to_path
 
 
 def read_whole(path: str | Path) -> bytes:
     """Return the bytes of a file; raise `InputError` for one that is missing, a folder, unreadable or empty."""
+    path = to_path(path)
     try:
-        content = Path(path).read_bytes()
+        content = path.read_bytes()
     except (OSError, ValueError) as error:
         raise InputError(f"cannot be read: {_reason(error)}", source=path) from error
     if not content.strip():
@@ -39,7 +40,7 @@ def write_whole(path: str | Path, write: Callable[[BinaryIO], object]) -> None:
     Raises:
         InputError: if the file system refuses.
     """
-    path = Path(path)
+    path = to_path(path)
     partial = _beside(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -68,7 +69,7 @@ def write_whole_folder(path: str | Path, fill: Callable[[Path], object]) -> None
     Raises:
         InputError: for a folder that exists already, or if the file system refuses.
     """
-    path = Path(path)
+    path = to_path(path)
     partial = _beside(path)
     try:
         if path.exists():

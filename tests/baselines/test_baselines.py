@@ -1,5 +1,6 @@
 """Baselines on small maps where the correct result is known."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -228,3 +229,30 @@ def test_with_normal_prior_keeps_the_agents():
     config = with_normal_prior(MapConfig())
     assert config.prior.kind == "normal"
     assert config.agents == MapConfig().agents
+
+
+def test_mean_log_likelihood_is_that_of_the_moves_that_count(walks):
+    result, weights = model_result(true_model(TRUTH), walks, MapConfig()), np.arange(len(walks)) % 3
+    weighted = with_weights(walks, weights)
+    repeated = np.repeat(np.asarray(result.log_policies(walks)), weights)
+    assert mean_log_likelihood(result, weighted) == pytest.approx(repeated.mean(), rel=1e-9)
+
+
+def with_weights(shown, weights):
+    return eqx.tree_at(lambda each: each.weights, shown, jnp.asarray(weights, float))
+
+
+@pytest.mark.parametrize("method", [behavior_cloning, constraint_inference])
+def test_method_of_weighted_walks_is_that_of_copies(method):
+    """With nine walks, each copy is in the fold of its walk."""
+    shown, ends = [walk(0, 1, 2, 7), walk(0, 5, 6, 7), walk(2, 1, 6, 7)] * 3, [reach(BLANK, 7)]
+    once, counts = gather(shown, ends), [2] * 3 + [1] * 6
+    weighted = method(BLANK, with_weights(once, np.repeat(counts, 3)), MapConfig())
+    copies = method(BLANK, gather([*shown, *shown[:3]], ends), MapConfig())
+    np.testing.assert_allclose(weighted.log_policies(once), copies.log_policies(once), rtol=1e-3)
+
+
+def test_constraint_inference_of_agents_with_a_horizon_has_the_policies_of_their_horizon(walks):
+    """Agents who look one move ahead see no wall that their goal is behind, so that none explains their walks."""
+    learned = [constraint_inference(BLANK, walks, MapConfig(behavior=BehaviorConfig(horizon=far))) for far in (None, 1)]
+    assert [int((np.asarray(each.model.blocked) > 0.5).sum()) for each in learned] == [4, 0]

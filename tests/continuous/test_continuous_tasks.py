@@ -149,6 +149,26 @@ def test_reach_region_settings_out_of_range_are_refused(settings, match):
     (0.0, 1.5, "'discount': expected a finite number above 0 and at most 1, found 1.5"),
 ])  # fmt: skip
 def test_check_tasks_refuses_bad_numbers(goal, discount, match):
+    tasks = sc.batch_tasks([pendulum_task(0.0)] * 2)
+    numbers = vector(0.0, goal), vector(0.9, discount)
     with pytest.raises(ss.InputError, match=match):
-        check_tasks(sc.batch_tasks([pendulum_task(0.0), pendulum_task(goal, discount)]))
+        check_tasks(eqx.tree_at(lambda each: (each.goal, each.discount), tasks, numbers))
     check_tasks(sc.batch_tasks([pendulum_task(0.0), pendulum_task(1.0, 1.0)]))
+
+
+def test_tasks_of_lists_and_numbers_are_those_of_arrays():
+    made = sc.QuadraticTask([1, -1], [[2, 0], [0, 1]], [[0.5]], 0.9)
+    expected = sc.QuadraticTask(vector(1, -1), jnp.diag(vector(2, 1)), jnp.asarray([[0.5]]), jnp.asarray(0.9))
+    assert eqx.tree_equal(made, expected)
+
+
+def test_tasks_made_under_jit_and_vmap_are_checked_by_shape():
+    def reward(goal, discount):
+        task = sc.QuadraticTask(goal, jnp.eye(2), jnp.eye(1), discount)
+        return task.reward(jnp.zeros(2), jnp.ones(1))
+
+    goals = jnp.asarray([[1.0, 2.0], [0.0, 3.0]])
+    # costs of a goal g seen from 0, and of an action of 1
+    assert jax.jit(jax.vmap(reward))(goals, jnp.full(2, 0.9)).tolist() == [-6.0, -10.0]
+    with pytest.raises(ss.InputError, match=r"'state_cost': expected numbers of shape \(1, 1\), found shape \(2, 2\)"):
+        jax.eval_shape(reward, jnp.zeros(1), jnp.asarray(0.9))

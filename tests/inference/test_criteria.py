@@ -3,6 +3,7 @@
 import warnings
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -116,10 +117,14 @@ def coin() -> ss.TiedModel:
     return ss.TiedModel(ss.graph(np.array([[[1, 0]], [[1, 1]]])), np.array([[[0, ss.FIXED]], [[0, ss.FIXED]]]))
 
 
-def fit_of_coin(variance=1e4) -> ss.Fit:
+def walks_of_coin() -> ss.Demonstrations:
     """Walks with 0, 2 and 3 failures before success."""
     walks = [ss.Trajectory(np.repeat([0, 1], [n + 1, 1]), np.zeros(n + 1, int), 0) for n in (0, 2, 3)]
-    shown = ss.gather(walks, [ss.task(np.array([-1.0, 0.0]), 0.9, np.array([False, True]))])
+    return ss.gather(walks, [ss.task(np.array([-1.0, 0.0]), 0.9, np.array([False, True]))])
+
+
+def fit_of_coin(variance=1e4, shown=None) -> ss.Fit:
+    shown = walks_of_coin() if shown is None else shown
     return ss.fit(coin(), shown, ss.Behavior(ss.BoltzmannAverage()), prior=ss.Normal(0.0, variance))
 
 
@@ -132,6 +137,25 @@ def test_information_criteria_of_a_coin_are_those_of_a_geometric_distribution(un
     np.testing.assert_allclose(criteria.aic, 2 - 2 * expected, rtol=1e-6)
     np.testing.assert_allclose(criteria.bic, np.log(n) - 2 * expected, rtol=1e-6)
     assert ss.information_criteria(fit_of_coin(), parameters=7).parameters == 7
+
+
+@pytest.mark.parametrize("unit", ["walk", "move"])
+def test_information_criteria_of_weight_two_are_those_of_all_walks_twice(unit):
+    shown = walks_of_coin()
+    double = eqx.tree_at(lambda each: each.weights, shown, 2 * shown.weights)
+    weighted, joined = (
+        ss.information_criteria(fit_of_coin(shown=each), unit=unit) for each in (double, ss.join([shown, shown]))
+    )
+    assert weighted.observations == joined.observations == {"walk": 6, "move": 16}[unit]
+    np.testing.assert_allclose(weighted, joined, rtol=1e-6)
+
+
+def test_weights_of_units_are_those_of_their_moves():
+    weights = np.array([2.0, 2.0, 0.0, 0.5, 0.0, 1.0, 3.0])
+    zeros = np.zeros(7)
+    each = ss.PointwiseLogLikelihood(zeros, zeros, np.array([0, 0, 1, 2, 2, 3, 3]), weights)
+    np.testing.assert_allclose(each.weights_of("walk"), [2.0, 0.5, (1 + 9) / (1 + 3)], rtol=1e-12)
+    np.testing.assert_allclose(each.weights_of("move"), weights[weights > 0])
 
 
 def test_information_criteria_without_a_full_likelihood_or_convergence_raise():

@@ -48,13 +48,18 @@ def test_check_parameters_accepts_vectors_of_its_length(prior):
 
 
 @pytest.mark.parametrize(("prior", "parameters", "found"), [
-    (TIGHT, jnp.zeros(3), "found another"),
+    (TIGHT, jnp.zeros(3), r"found shape \(4,\)"),
     (Vector(), jnp.zeros(3), r"found shape \(3,\)"),
     (GaussianMRF(Normal(), PAIRS, 0.3), jnp.zeros(3), "found a pair with 3"),
     (GaussianMRF(Normal(), PAIRS, 0.3), jnp.zeros((2, 2)), "found a pair"),
     (GaussianMRF(Normal(), PAIRS, 0.3), {"a": jnp.zeros(4)}, "found a pair"),
-    (GaussianMRF(TIGHT, PAIRS, 0.3), jnp.zeros(5), "found another"),
+    (GaussianMRF(TIGHT, PAIRS, 0.3), jnp.zeros(5), r"found shape \(4,\)"),
     (FreeCellEvidence(Normal(), jnp.ones(4)), jnp.zeros(5), "found another"),
+    (Normal(jnp.zeros((4, 1))), jnp.zeros(4), r"found shape \(4, 1\)"),
+    (Normal(jnp.zeros((3, 4))), jnp.zeros(4), r"found shape \(3, 4\)"),
+    (Normal(0.0, jnp.ones((4, 1))), jnp.zeros(4), r"variance.*found shape \(4, 1\)"),
+    (Normal(jnp.zeros(4)), {"cells": jnp.zeros(4), "slip": jnp.zeros(())}, r"shape \(\), found shape \(4,\)"),
+    (FreeCellEvidence(Normal(jnp.zeros((3, 4))), jnp.ones(4)), jnp.zeros(4), r"found shape \(3, 4\)"),
 ])  # fmt: skip
 def test_check_parameters_of_other_shapes_raises(prior, parameters, found):
     with pytest.raises(InputError, match=f"prior.*{found}"):

@@ -1,5 +1,9 @@
 """κ and the scores of a small room, beside central differences and sums written out."""
 
+from itertools import product
+
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -39,7 +43,7 @@ def test_score_statistics_of_a_room_equal_differences_of_the_dense_policy():
         scores = (up - down) / (2 * width)
         for state, action in zip(walk.states[:-1], walk.actions, strict=True):
             information = (np.exp(middle[state]) * scores[state] ** 2).sum()
-            expected.append((scores[state, action], information, middle[state, action], number))
+            expected.append((scores[state, action], information, middle[state, action], number, 1.0))
     np.testing.assert_allclose(np.transpose(list(statistics)), expected, rtol=1e-5, atol=1e-9)
 
 
@@ -54,8 +58,9 @@ def test_score_statistics_of_values_that_do_not_converge_raises():
         score_statistics(WORLD, SHOWN, AGENTS, options=SolveOptions(solver=Jacobi(max_sweeps=1)))
 
 
-def statistics(score, information, trajectory):
-    return ScoreStatistics(*map(np.asarray, (score, information, np.zeros(len(score)), trajectory)))
+def statistics(score, information, trajectory, weight=None):
+    weight = np.ones(len(score)) if weight is None else weight
+    return ScoreStatistics(*map(np.asarray, (score, information, np.zeros(len(score)), trajectory, weight)))
 
 
 def test_effective_sample_ratio_sums_scores_within_trajectories():
@@ -64,6 +69,51 @@ def test_effective_sample_ratio_sums_scores_within_trajectories():
     mean = 2.5 / 5
     sums = np.array([3.0 - 2 * mean, -4.0 - mean, 3.5 - 2 * mean])
     assert effective_sample_ratio([first, second]) == pytest.approx(4.5 / (sums**2).sum(), rel=1e-12)
+
+
+NUMBERS = [1.0, 2.0, -4.0, 3.0, 0.5], [0.5, 0.25, 1.0, 0.75, 2.0]
+OF = [0, 0, 1, 2, 2]
+
+
+def ratio_of(*weights):
+    return effective_sample_ratio([statistics(*NUMBERS, OF, np.array(weights, float))])
+
+
+def test_effective_sample_ratio_of_a_walk_of_weight_two_is_that_of_the_walk_twice():
+    score, information = ([*part, *part[3:]] for part in NUMBERS)
+    expected = effective_sample_ratio([statistics(score, information, [*OF, 3, 3])])
+    assert ratio_of(1, 1, 1, 2, 2) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("weight", [0.01, 3.0])
+def test_effective_sample_ratio_of_equal_weights_is_that_of_weight_one(weight):
+    assert ratio_of(*[weight] * 5) == pytest.approx(ratio_of(1, 1, 1, 1, 1), rel=1e-12)
+
+
+def test_effective_sample_ratio_of_weights_0_and_1_is_that_of_the_moves_that_count():
+    some = [0, 2, 3, 4]
+    without = statistics(*(np.array(part)[some] for part in (*NUMBERS, OF)))
+    assert ratio_of(1, 0, 1, 1, 1) == pytest.approx(effective_sample_ratio([without]), rel=1e-12)
+    assert ratio_of(1, 1e-9, 1, 1, 1) == pytest.approx(effective_sample_ratio([without]), rel=1e-6)
+
+
+def test_effective_sample_ratio_of_independent_steps_is_one_whatever_the_weights():
+    """Two walks of two steps, each a fair coin of score ±1: the mean of J over all of them is I, with ū = 0."""
+    signs = np.array(list(product((-1.0, 1.0), repeat=3)))
+    weights = np.array([1.0, 0.2, 3.0])
+    pairs = [(sign, -sign) for sign in signs]  # whose mean score is 0
+    scores = np.array([np.concatenate(pair) for pair in pairs])
+    walks, weight = np.arange(len(scores))[:, None] * 2 + np.repeat([0, 1], 3), np.tile(weights, (len(scores), 2))
+    every = statistics(scores.ravel(), np.ones(scores.size), walks.ravel(), weight.ravel())
+    assert effective_sample_ratio([every]) == pytest.approx(1, rel=1e-12)
+
+
+def test_score_statistics_have_the_weight_of_each_move():
+    weights = np.array([1.0, 1.0, 0.01, 0.01, 0.0, 2.0])
+    weighted = eqx.tree_at(lambda each: each.weights, SHOWN, jnp.asarray(weights))
+    every, some = score_statistics(WORLD, SHOWN, AGENTS), score_statistics(WORLD, weighted, AGENTS)
+    assert some.weight.tolist() == weights[weights > 0].tolist()
+    np.testing.assert_allclose(some.score, every.score[weights > 0], rtol=1e-12)
 
 
 def test_effective_sample_ratio_of_constant_scores_is_infinite_and_of_none_raises():

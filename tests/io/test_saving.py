@@ -177,6 +177,22 @@ def test_save_of_an_object_that_is_no_record_raises_and_writes_nothing(value, tm
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("value", ["\ud800", 10**5000], ids=["half a pair of surrogates", "5001 digits"])
+def test_save_of_what_has_no_text_raises_and_writes_nothing(value, tmp_path):
+    for result, place in (([value], r"result\[0\]"), ({value: 1}, "result")):
+        with pytest.raises(InputError, match=rf"save, field '{place}': expected texts and numbers that a file can"):
+            ss.save(tmp_path / "result", result)
+    assert not list(tmp_path.iterdir())
+
+
+def test_save_of_a_list_in_itself_raises_and_writes_nothing(tmp_path):
+    result: list[object] = []
+    result.append(result)
+    with pytest.raises(InputError, match="save: expected a result that does not hold itself"):
+        ss.save(tmp_path / "result", result)
+    assert not list(tmp_path.iterdir())
+
+
 def test_load_of_a_damaged_file_raises(tmp_path):
     path = tmp_path / "result"
     ss.save(path, ss.reach(GRID, 2))

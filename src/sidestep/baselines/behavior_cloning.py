@@ -107,14 +107,14 @@ def behavior_cloning(
     """
     check_arguments(grid, demonstrations, config)
     max_iterations = to_count(max_iterations, "max_iterations")
-    walks = np.asarray(demonstrations.trajectory)
+    walks, weights = np.asarray(demonstrations.trajectory), np.asarray(demonstrations.weights)
     fold, everything = walks % _FOLDS, np.ones(len(walks), dtype=bool)
 
     learn = partial(_fit_policy, grid, demonstrations, max_iterations)
 
     def heldout_log_likelihood(variance: float) -> float:
         each = (learn(fold != own, variance).log_policies(demonstrations)[fold == own] for own in range(_FOLDS))
-        return sum(float(own.sum()) for own in each)
+        return sum(float(weights[fold == own] @ nats) for own, nats in enumerate(each))
 
     enough = walks[-1] + 1 >= _FOLDS
     return learn(everything, max(_VARIANCES, key=heldout_log_likelihood) if enough else _VARIANCES[1])
@@ -128,11 +128,16 @@ def _fit_policy(
     from sklearn.linear_model import LogisticRegression
 
     states, actions, goals = (part[used] for part in _moves(demonstrations))
+    weights = np.asarray(demonstrations.weights)[used]
     features, all_actions = _features(grid, states, goals), np.arange(grid.connectivity)
     no_features = csr_array((len(all_actions), _DIRECTION + (1 + _COMPASS) * grid.size))
     regression = LogisticRegression(C=variance, max_iter=max_iterations)
     with warnings.catch_warnings(action="ignore", category=ConvergenceWarning):
-        regression.fit(vstack([features, no_features], format="csr"), np.append(actions, all_actions))
+        regression.fit(
+            vstack([features, no_features], format="csr"),
+            np.append(actions, all_actions),
+            np.append(weights, np.ones(len(all_actions))),
+        )
     converged = bool((regression.n_iter_ < max_iterations).all())
     return ClonedPolicy(grid, regression.coef_, np.asarray(regression.intercept_), converged)
 

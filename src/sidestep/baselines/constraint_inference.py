@@ -20,8 +20,7 @@ from jaxtyping import Bool, Float
 
 from sidestep.baselines.interface import ModelResult, check_arguments, model_result
 from sidestep.maps.config import MapConfig
-from sidestep.maps.fit import behavior_of
-from sidestep.tabular.backups import Behavior
+from sidestep.maps.fit import behavior_of, solve_options_of
 from sidestep.tabular.demonstrations import Demonstrations
 from sidestep.tabular.grid import Cell, Grid
 from sidestep.tabular.models import ObstacleGrid, true_model
@@ -48,13 +47,13 @@ def constraint_inference(grid: Grid, demonstrations: Demonstrations, config: Map
     visited = np.zeros(grid.size, dtype=bool)
     visited[np.concatenate(demonstrations.paths())] = True
     candidates = ~visited & (grid.known.ravel() == Cell.UNKNOWN)
-    behavior, forbidden = behavior_of(config), []
-    visits, log_likelihood = _predict(grid, forbidden, demonstrations, behavior)
+    forbidden: list[int] = []
+    visits, log_likelihood = _predict(grid, forbidden, demonstrations, config)
     while len(forbidden) < candidates.sum():
         ranking = np.where(candidates, visits, -np.inf)
         ranking[forbidden] = -np.inf
         cell = int(ranking.argmax())
-        new_visits, new_log_likelihood = _predict(grid, [*forbidden, cell], demonstrations, behavior)
+        new_visits, new_log_likelihood = _predict(grid, [*forbidden, cell], demonstrations, config)
         if new_log_likelihood - log_likelihood < np.log(candidates.sum()):
             break
         forbidden.append(cell)
@@ -72,21 +71,22 @@ def _logits(candidates: Bool[np.ndarray, " cells"], forbidden: list[int], visits
 
 
 def _predict(
-    grid: Grid, forbidden: list[int], demonstrations: Demonstrations, behavior: Behavior
+    grid: Grid, forbidden: list[int], demonstrations: Demonstrations, config: MapConfig
 ) -> tuple[_Visits, float]:
     """Return the expected visits of each cell, and the log-likelihood of the observed actions."""
     known = grid.passable().known
     known.flat[forbidden] = Cell.OCCUPIED
-    model = true_model(replace(grid, known=known))
+    model, behavior, options = true_model(replace(grid, known=known)), behavior_of(config), solve_options_of(config)
     visits, total = np.zeros(grid.size), 0.0
     states, actions, task = (np.asarray(getattr(demonstrations, name)) for name in ("states", "actions", "task"))
-    first = demonstrations.first_moves()
+    weights, first = np.asarray(demonstrations.weights, np.float64), demonstrations.first_moves()
     for index in range(len(demonstrations.tasks.terminal)):
         own_task = task_at(demonstrations.tasks, index)
-        agents = plan(model, own_task, behavior)
-        own = task == index
-        total += float(np.log(np.asarray(agents.policy)[states[own], actions[own]]).sum())
-        starts = np.bincount(states[first[task[first] == index]], minlength=grid.size).astype(np.float64)
+        agents = plan(model, own_task, behavior, options=options)
+        own = (task == index) & (weights > 0)
+        total += float(weights[own] @ np.log(np.asarray(agents.policy)[states[own], actions[own]]))
+        begins = first[task[first] == index]
+        starts = np.bincount(states[begins], weights[begins], minlength=grid.size)
         visits += _expected_visits(model, agents, starts)
     return visits, total
 

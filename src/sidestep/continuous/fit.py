@@ -149,6 +149,7 @@ def fit_dynamics(
         check_function(report, "report")
     demonstrations, prior = moves_that_count(demonstrations), Normal() if prior is None else prior
     problem = FitProblem(agent, demonstrations, prior, planner, schedule, terms, estimator)
+    prior.check_parameters(dynamics.parameters)
     saver = Saver(checkpoint, problem_fingerprint((problem, seed)) if checkpoint is not None else "")
     warmup_key, key = jax.random.split(jax.random.key(seed))
     initial_key, warmup_key = jax.random.split(warmup_key)

@@ -6,29 +6,38 @@ terminal reward once. `features` are the input of a policy that serves many task
 
 import abc
 from collections.abc import Sequence
-from typing import ClassVar, TypeVar
+from functools import partial
+from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Shaped
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
-from sidestep._arguments import to_finite, to_integers
+from sidestep._arguments import to_finite, to_floats, to_integers
 from sidestep._repr import short_repr
 from sidestep.continuous.dynamics import Action, Real, State, check_finite
-from sidestep.errors import InputError, check, check_instance, check_positive, to_list
+from sidestep.errors import InputError, Limit, check, check_instance, check_positive, to_list
+from sidestep.tabular.arrays import to_jax
 from sidestep.tabular.tasks import Task, check_discount
 
 States = Shaped[Array, "states *state"]
 _Task = TypeVar("_Task", bound="ContinuousTask")
 
 
+def _to_array(
+    value: Shaped[ArrayLike, "..."] | Sequence[Any], field: str, above: Limit = -np.inf
+) -> Float[Array, "..."]:
+    return to_jax(to_finite(value, field, above=above))
+
+
 @short_repr()
 class ContinuousTask(eqx.Module):
     """One task, or several with a leading `tasks` axis on every array (see `batch_tasks`).
 
-    A new kind of task is a subclass with `reward` and `features`, and with the other two methods if tasks end.
+    A new kind of task is a subclass with `reward` and `features`, and with the other two methods if tasks end. The
+    tasks of this module take numbers and lists too; under `jit` and `vmap` only their shapes are checked.
 
     Attributes:
         discount: γ in (0, 1].
@@ -37,6 +46,9 @@ class ContinuousTask(eqx.Module):
 
     discount: eqx.AbstractVar[Float[Array, "*tasks"]]
     smooth: ClassVar[bool] = False
+
+    def __check_init__(self) -> None:
+        to_finite(self.discount, "discount", above=0, most=1)
 
     @abc.abstractmethod
     def reward(self, state: State, action: Action) -> Real:
@@ -81,13 +93,19 @@ class ReachTask(ContinuousTask):
         step_cost: The cost of an action.
         goal_reward: The reward of arriving.
         discount: γ in (0, 1].
+
+    Raises:
+        InputError: For numbers that are not finite, out of range, or of other shapes.
     """
 
-    goal: Float[Array, "*tasks dimensions"]
-    radius: Float[Array, "*tasks"]
-    step_cost: Float[Array, "*tasks"]
-    goal_reward: Float[Array, "*tasks"]
-    discount: Float[Array, "*tasks"]
+    goal: Float[Array, "*tasks dimensions"] = eqx.field(converter=partial(_to_array, field="goal"))
+    radius: Float[Array, "*tasks"] = eqx.field(converter=partial(_to_array, field="radius", above=0))
+    step_cost: Float[Array, "*tasks"] = eqx.field(converter=partial(_to_array, field="step_cost"))
+    goal_reward: Float[Array, "*tasks"] = eqx.field(converter=partial(_to_array, field="goal_reward"))
+    discount: Float[Array, "*tasks"] = eqx.field(converter=partial(_to_array, field="discount"))
+
+    def __check_init__(self) -> None:
+        _check_shapes(self, goal=("dimensions",), radius=(), step_cost=(), goal_reward=())
 
     def reward(self, state: State, action: Action) -> Real:
         """Return minus the cost of a step.
@@ -162,17 +180,26 @@ class QuadraticTask(ContinuousTask):
         action_cost: D.
         discount: γ in (0, 1].
 
+    Raises:
+        InputError: For numbers that are not finite, out of range, or of other shapes.
+
     Example:
         >>> task = QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.eye(1), jnp.asarray(0.9))
         >>> float(task.reward(jnp.array([2.0]), jnp.array([1.0])))
         -5.0
     """
 
-    goal: Float[Array, "*tasks dimensions"]
-    state_cost: Float[Array, "*tasks dimensions dimensions"]
-    action_cost: Float[Array, "*tasks inputs inputs"]
-    discount: Float[Array, "*tasks"]
+    goal: Float[Array, "*tasks dimensions"] = eqx.field(converter=partial(_to_array, field="goal"))
+    state_cost: Float[Array, "*tasks dimensions dimensions"] = eqx.field(
+        converter=partial(_to_array, field="state_cost")
+    )
+    action_cost: Float[Array, "*tasks inputs inputs"] = eqx.field(converter=partial(_to_array, field="action_cost"))
+    discount: Float[Array, "*tasks"] = eqx.field(converter=partial(_to_array, field="discount"))
     smooth: ClassVar[bool] = True
+
+    def __check_init__(self) -> None:
+        _check_shapes(self, goal=("dimensions",), action_cost=("inputs", "inputs"))
+        _check_shapes(self, state_cost=2 * self.goal.shape[-1:], action_cost=2 * self.action_cost.shape[-1:])
 
     def reward(self, state: State, action: Action) -> Real:
         """Return minus the quadratic costs.
@@ -202,15 +229,21 @@ class PendulumTask(ContinuousTask):
         goal: The goal angle g, in radians from upright.
         discount: γ in (0, 1].
 
+    Raises:
+        InputError: For numbers that are not finite, out of range, or of other shapes.
+
     Example:
         >>> task = PendulumTask(goal=jnp.zeros(()), discount=jnp.asarray(0.9))
         >>> round(float(task.reward(jnp.array([0.0, 1.0]), jnp.array([2.0]))), 3)
         -0.104
     """
 
-    goal: Float[Array, "*tasks"]
-    discount: Float[Array, "*tasks"]
+    goal: Float[Array, "*tasks"] = eqx.field(converter=partial(_to_array, field="goal"))
+    discount: Float[Array, "*tasks"] = eqx.field(converter=partial(_to_array, field="discount"))
     smooth: ClassVar[bool] = True
+
+    def __check_init__(self) -> None:
+        _check_shapes(self, goal=())
 
     def reward(self, state: State, action: Action) -> Real:
         """Return minus the costs of the angle, the speed and the torque.
@@ -240,11 +273,23 @@ class TableTask(ContinuousTask):
         task: The tabular task, with rewards for every state and action.
         index: A one-hot code of the task, so that a policy can tell tasks from one another.
         discount: γ in (0, 1].
+
+    Raises:
+        InputError: For a task of another type or with R(s, a, s′), and for numbers that are not finite, out of range,
+            or of other shapes.
     """
 
     task: Task
-    index: Float[Array, "*tasks indices"]
-    discount: Float[Array, "*tasks"]
+    index: Float[Array, "*tasks indices"] = eqx.field(converter=partial(_to_array, field="index"))
+    discount: Float[Array, "*tasks"] = eqx.field(converter=partial(_to_array, field="discount"))
+
+    def __check_init__(self) -> None:
+        check_instance(self.task, Task, "task")
+        _check_shapes(self, index=("indices",))
+        shape, expected = self.task.terminal.shape, (*self.discount.shape, "states")
+        fits = shape[:-1] == self.discount.shape
+        check(fits, f"expected terminal states of shape {expected}, found {shape}", field="task")
+        check(self.task.outcome_reward is None, "expected rewards R(s, a), found R(s, a, s′)", field="task")
 
     def reward(self, state: State, action: Action) -> Real:
         """Return R(s, a), from the table.
@@ -279,6 +324,12 @@ class TableTask(ContinuousTask):
         """
         states = jax.nn.one_hot(state, self.task.terminal.shape[-1], dtype=self.discount.dtype)
         return jnp.outer(self.index, states).ravel()
+
+
+def _check_shapes(task: ContinuousTask, **axes: tuple[int | str, ...]) -> None:
+    """Raise `InputError` unless each array has the axes of tasks that the discount has, and its own."""
+    for name, own in axes.items():
+        to_floats(getattr(task, name), name, (*np.shape(task.discount), *own))
 
 
 def batch_tasks(tasks: Sequence[_Task]) -> _Task:

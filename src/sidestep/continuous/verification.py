@@ -110,7 +110,7 @@ def verify(
     known = rollout_free_products(problem, dynamics.parameters, np.eye(len(exact)))
     if "actions" not in problem.terms:
         return _verification(exact, known, known, np.zeros((0, len(exact))), np.zeros(3), 0)
-    total_weight = np.sum(problem.demonstrations.weights, dtype=np.float64)
+    total_weight = float(np.asarray(problem.demonstrations.weights, np.float64).sum())
     total, scores, figures, rounds = np.zeros_like(known), np.zeros_like(exact), np.zeros(3), 0
     differences: list[np.ndarray] = []
     while True:

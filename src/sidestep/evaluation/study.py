@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Int
 
-from sidestep.errors import ImproperTask, NotConverged, check_function, check_instance
+from sidestep.errors import ImproperTask, NotConverged, check, check_function, check_instance
 from sidestep.evaluation.evaluate import Evaluation, evaluate
 from sidestep.evaluation.reliability import Reliability, map_reliability
 from sidestep.robots.planners import Planner
@@ -169,11 +169,13 @@ def run_method(
 
 
 def mean_log_likelihood(result: MethodResult, demonstrations: Demonstrations) -> float | None:
-    """Return the mean of log π(a | s) over moves in nats; None if the values of a task do not converge.
+    """Return the weighted mean of log π(a | s) over moves in nats; None if the values of a task do not converge.
 
     Args:
         result: What a method learned.
         demonstrations: Moves on the same map.
     """
-    mean = float(np.mean(result.log_policies(demonstrations)))
+    weights = np.asarray(demonstrations.weights)
+    check((weights > 0).any(), "expected at least one move that counts, found none", field="demonstrations")
+    mean = float(np.average(result.log_policies(demonstrations)[weights > 0], weights=weights[weights > 0]))
     return mean if np.isfinite(mean) else None

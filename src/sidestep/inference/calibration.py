@@ -14,6 +14,11 @@ vary by I too (the information matrix equality; White 1982). If they vary by J =
 
 is the ratio of effective to actual steps. A composite likelihood is adjusted by it to log L^κ (Varin, Reid & Firth
 2011). κ above 1 means that behavior is more regular than the model's.
+
+With weights w of moves, sums over t and ū are weighted, and the square of a trajectory's sum is divided by its weight,
+Σ w² / Σ w. So a trajectory of weight w counts in I and J as w copies of it would, a move of weight 0 is as if it were
+not there, and equal weights change nothing. For independent steps κ is 1 whatever the weights, if these do not depend
+on the information of the steps.
 """
 
 from collections.abc import Sequence
@@ -28,7 +33,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sidestep.errors import NotConverged, check, check_instance, to_list
 from sidestep.tabular.backups import Behavior
 from sidestep.tabular.behavior_model import BehaviorModel
-from sidestep.tabular.demonstrations import Demonstrations
+from sidestep.tabular.demonstrations import Demonstrations, trajectory_weights
 from sidestep.tabular.likelihood import check_likelihood, padded_for, visited_advantages
 from sidestep.tabular.models import TransitionModel
 from sidestep.tabular.solve import SolveOptions, solve
@@ -42,10 +47,11 @@ class ScoreStatistics(NamedTuple):
         information: Σ_a π(a | s) u(s, a)².
         log_policy: log π(a | s), in nats.
         trajectory: The index of the move's trajectory.
+        weight: How much the move counts.
 
     Example:
-        >>> scores = ScoreStatistics(*(np.array(each) for each in ([1.0, -1.0], [0.5, 0.5], [-1.0, -1.0], [0, 1])))
-        >>> len(scores.score)
+        >>> numbers = [1.0, -1.0], [0.5, 0.5], [-1.0, -1.0], [0, 1], [1.0, 1.0]
+        >>> len(ScoreStatistics(*map(np.array, numbers)).score)
         2
     """
 
@@ -53,6 +59,7 @@ class ScoreStatistics(NamedTuple):
     information: Float[np.ndarray, " moves"]
     log_policy: Float[np.ndarray, " moves"]
     trajectory: Int[np.ndarray, " moves"]
+    weight: Float[np.ndarray, " moves"]
 
 
 def score_statistics(
@@ -97,7 +104,7 @@ def score_statistics(
     if not bool(converged):
         raise NotConverged("the values of a task did not converge: a smaller β may help")
     counts = np.asarray(padded.weights) > 0
-    return ScoreStatistics(*(np.asarray(each)[counts] for each in (*numbers, padded.trajectory)))
+    return ScoreStatistics(*(np.asarray(each)[counts] for each in (*numbers, padded.trajectory, padded.weights)))
 
 
 @eqx.filter_jit
@@ -134,13 +141,14 @@ def effective_sample_ratio(held_out: Sequence[ScoreStatistics]) -> float:
         κ, above 0.
 
     Example:
-        >>> scores = ScoreStatistics(*(np.array(each) for each in ([1.0, -1.0], [0.5, 0.5], [-1.0, -1.0], [0, 1])))
-        >>> effective_sample_ratio([scores])
+        >>> numbers = [1.0, -1.0], [0.5, 0.5], [-1.0, -1.0], [0, 1], [1.0, 1.0]
+        >>> effective_sample_ratio([ScoreStatistics(*map(np.array, numbers))])
         0.5
     """
     pieces = to_list(held_out, ScoreStatistics, "held_out")
-    score, information, _, trajectory = (np.concatenate(part) for part in zip(*pieces, strict=True))
-    check(len(score), "expected at least one move, found none", field="held_out")
-    by_trajectory = np.bincount(trajectory, score - score.mean())
-    variation = float(np.sum(by_trajectory**2))
-    return float(information.sum()) / variation if variation > 0 else float("inf")
+    score, information, _, trajectory, weight = (np.concatenate(part) for part in zip(*pieces, strict=True))
+    check((weight > 0).any(), "expected at least one move that counts, found none", field="held_out")
+    by_trajectory = np.bincount(trajectory, weight * (score - np.average(score, weights=weight)))
+    own = trajectory_weights(trajectory, weight)
+    variation = float(np.sum(by_trajectory[own > 0] ** 2 / own[own > 0]))
+    return float(weight @ information) / variation if variation > 0 else float("inf")

@@ -2,7 +2,8 @@
 
     AIC = 2 k − 2 log L,        BIC = k ln n − 2 log L,
 
-with k the number of learned parameters that the likelihood determines, and n the number of observations. Both are
+with k the number of learned parameters that the likelihood determines, and n the number of observations: the sum of the
+weights of walks or moves, so that one of weight 2 counts as two. Both are
 derived at the maximum of the likelihood. A fit has a prior and is at the maximum of the posterior, where log L is a
 little lower; with wide priors the difference is small.
 
@@ -19,7 +20,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
-from sidestep.errors import check, check_count
+from sidestep.errors import check, check_count, check_instance
 from sidestep.inference.fit import Fit
 from sidestep.inference.objective import Parameters
 from sidestep.inference.pointwise import Unit, moves_log_likelihood, pointwise_log_likelihood
@@ -38,7 +39,7 @@ class InformationCriteria(NamedTuple):
     Attributes:
         log_likelihood: log L in nats, of the terms that the fit has.
         parameters: k.
-        observations: n.
+        observations: n, the sum of the weights of walks or moves.
         aic: 2 k − 2 log L.
         bic: k ln n − 2 log L.
 
@@ -49,7 +50,7 @@ class InformationCriteria(NamedTuple):
 
     log_likelihood: float
     parameters: int
-    observations: int
+    observations: float
     aic: float
     bic: float
 
@@ -66,8 +67,8 @@ def information_criteria(fit: Fit[Any], *, unit: Unit = "walk", parameters: int 
         The criteria, with what they are made of.
 
     Raises:
-        InputError: For a fit that did not converge or with tempering, and, where k is not given, for too many
-            parameters, the fixed-policy gradient or a deadline.
+        InputError: For anything but a fit, for one that did not converge or with tempering, and, where k is not given,
+            for too many parameters, the fixed-policy gradient or a deadline.
 
     Example:
         >>> import sidestep as ss
@@ -81,6 +82,7 @@ def information_criteria(fit: Fit[Any], *, unit: Unit = "walk", parameters: int 
         Akaike, "A new look at the statistical model identification" (1974). Schwarz, "Estimating the dimension of a
         model" (1978).
     """
+    check_instance(fit, Fit, "fit")
     check(fit.converged, f"expected a fit that converged: {fit.message}", source="information_criteria", field="fit")
     tempering = float(fit.problem.tempering)
     message = f"expected a likelihood that counts in full, found {tempering}"
@@ -88,8 +90,8 @@ def information_criteria(fit: Fit[Any], *, unit: Unit = "walk", parameters: int 
     if parameters is None:
         parameters = identified_parameters(fit)
     check_count(parameters, 0, "parameters")
-    each = pointwise_log_likelihood(fit).of(unit)
-    log_likelihood, n = float(each.sum()), each.size
+    each = pointwise_log_likelihood(fit)
+    log_likelihood, n = float(each.of(unit).sum()), float(each.weights_of(unit).sum())
     aic, bic = (penalty * parameters - 2 * log_likelihood for penalty in (2.0, float(np.log(n))))
     return InformationCriteria(log_likelihood, parameters, n, aic, bic)
 

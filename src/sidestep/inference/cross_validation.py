@@ -19,14 +19,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from sklearn.model_selection import KFold
 
+from sidestep._arguments import to_integers
 from sidestep._repr import short_repr
-from sidestep.errors import check, check_count
+from sidestep.errors import check, check_count, check_instance, to_count
 from sidestep.inference.fit import Estimate, Fit, fit
 from sidestep.inference.optimizers import Optimizer
 from sidestep.inference.pointwise import PointwiseLogLikelihood, pointwise_log_likelihood
 from sidestep.tabular.arrays import to_jax
 
 _NO_FOLD = -1
+_LARGEST_SEED = 2**32 - 1
 
 
 @short_repr("mean", "fold", "converged", "held_out")
@@ -70,8 +72,9 @@ class CrossValidation(NamedTuple):
             other: Of the same demonstrations, with the same folds.
 
         Raises:
-            InputError: For other folds or moves.
+            InputError: For anything but a cross-validation, and for other folds or moves.
         """
+        check_instance(other, CrossValidation, "other")
         pairs = zip((self.fold, *self.held_out[2:]), (other.fold, *other.held_out[2:]), strict=True)
         same = all(np.array_equal(one, another) for one, another in pairs)
         check(same, "expected the same moves and folds (of the same seed)", field="other")
@@ -105,7 +108,8 @@ def cross_validate(
         typical person.
 
     Raises:
-        InputError: For fewer groups than folds, and groups that are not whole numbers.
+        InputError: For anything but a fit, for fewer groups than folds, and for folds, a seed and groups that are not
+            whole numbers.
         NotConverged: As `fit` does.
 
     Example:
@@ -121,7 +125,10 @@ def cross_validate(
         Vehtari, Gelman and Gabry, "Practical Bayesian model evaluation using leave-one-out cross-validation and WAIC"
         (2017). Cochran, "Sampling techniques" (1977).
     """
+    check_instance(fit, Fit, "fit")
     check_count(folds, 2, "folds")
+    to_count(seed, "seed", 0, _LARGEST_SEED)
+    check_instance(warm_start, bool, "warm_start")
     demos = fit.problem.demonstrations
     trajectory, weights = np.asarray(demos.trajectory), np.asarray(demos.weights)
     fold = _folds(demos.trajectories, trajectory[weights > 0], groups, folds, seed)
@@ -143,14 +150,10 @@ def _folds(
     seed: int,
 ) -> Int[np.ndarray, " trajectories"]:
     """Return the fold of each trajectory: −1 for those without a move in `counted`."""
-    groups = np.arange(trajectories) if groups is None else np.asarray(groups)
-    whole = groups.shape == (trajectories,) and groups.dtype.kind in "iu"
-    message = (
-        f"expected a whole number for each of the {trajectories} trajectories, found {groups.dtype} {groups.shape}"
-    )
-    check(whole, message, field="groups")
+    what = f"a whole number for each of the {trajectories} trajectories,"
+    own = np.arange(trajectories) if groups is None else to_integers(groups, "groups", (trajectories,), what=what)
     some = np.unique(counted)
-    distinct, which = np.unique(groups[some], return_inverse=True)
+    distinct, which = np.unique(own[some], return_inverse=True)
     check(
         len(distinct) >= folds, f"expected at most {len(distinct)}, the number of groups, found {folds}", field="folds"
     )

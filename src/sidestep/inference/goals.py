@@ -24,9 +24,18 @@ import numpy as np
 from jax.scipy.special import logsumexp
 from jaxtyping import Float
 
-from sidestep._arguments import to_finite
+from sidestep._arguments import to_floats
 from sidestep._repr import short_repr
-from sidestep.errors import InputError, NotConverged, check, check_count, check_function, to_list, to_number
+from sidestep.errors import (
+    InputError,
+    NotConverged,
+    check,
+    check_count,
+    check_function,
+    check_instance,
+    to_list,
+    to_number,
+)
 from sidestep.inference.arguments import check_tasks
 from sidestep.inference.fit import Fit, Model
 from sidestep.tabular.arrays import to_jax
@@ -34,8 +43,10 @@ from sidestep.tabular.backups import Behavior
 from sidestep.tabular.behavior_model import BehaviorModel
 from sidestep.tabular.checks import check_behavior
 from sidestep.tabular.demonstrations import Demonstrations, Trajectory, flatten, gather, to_trajectories
+from sidestep.tabular.distributions import check_distribution
 from sidestep.tabular.likelihood import log_policies
 from sidestep.tabular.models import TransitionModel
+from sidestep.tabular.solve import SolveOptions
 from sidestep.tabular.tasks import Task, stack_tasks
 
 
@@ -81,6 +92,8 @@ def goal_posterior(
     candidates: Sequence[Task],
     behavior: Behavior | BehaviorModel,
     goal_probabilities: Float[np.ndarray, " candidates"] | Sequence[float] | None = None,
+    *,
+    options: SolveOptions | None = None,
 ) -> tuple[Float[np.ndarray, "trajectories candidates"], float]:
     """Return the posterior of each trajectory's goal, and the actions' log-likelihood.
 
@@ -89,13 +102,15 @@ def goal_posterior(
         trajectories: Their tasks do not matter.
         candidates: The tasks that may be the goals.
         behavior: The behavior of the agents; a `BehaviorModel` must not distinguish persons.
-        goal_probabilities: p_g, by default equal.
+        goal_probabilities: p_g, which sum to 1; by default equal.
+        options: How values are computed; after a fit, `fit.problem.options`.
 
     Returns:
         P(g | trajectory), and Σ_i log Σ_g p_g Π_t π_g in nats.
 
     Raises:
-        InputError: For a trajectory that cannot have any of the goals, and as `gather` does.
+        InputError: For probabilities that are below 0 or do not sum to 1, for a trajectory that cannot have any of the
+            goals, and as `gather` does.
         NotConverged: If the values of a candidate do not converge.
 
     Example:
@@ -117,17 +132,17 @@ def goal_posterior(
     check(alike, "expected a behavior model that does not distinguish persons, found persons", field="behavior")
     if goal_probabilities is None:
         goal_probabilities = np.full(len(tasks), 1 / len(tasks))
-    probabilities = np.asarray(to_finite(goal_probabilities, "goal_probabilities", (len(tasks),), least=0, most=1))
-    log_likelihood = [_trajectory_log_likelihoods(task, model, walks, behavior) for task in tasks]
+    probabilities = np.asarray(to_floats(goal_probabilities, "goal_probabilities", (len(tasks),)))
+    check_distribution(probabilities, field="goal_probabilities")
+    check_instance(options, (SolveOptions, type(None)), "options")
+    log_likelihood = [_trajectory_log_likelihoods(task, model, walks, behavior, options) for task in tasks]
     with np.errstate(divide="ignore"):
         joint = np.log(probabilities) + np.stack(log_likelihood, axis=1)
     total = np.asarray(logsumexp(jnp.asarray(joint), axis=1))
     if not np.isfinite(total).all():
-        raise InputError(
-            "continues after the terminal states of all candidates: expected one that it may have as its goal",
-            source="trajectory",
-            row=int(np.argmin(np.isfinite(total))) + 1,
-        )
+        row = int(np.argmin(np.isfinite(total)))
+        possible = [task for task, probability in zip(tasks, probabilities, strict=True) if probability > 0]
+        raise InputError(_why_impossible(walks[row], possible), source="trajectory", row=row + 1)
     return np.exp(joint - total[:, None]), float(total.sum())
 
 
@@ -138,6 +153,7 @@ def fit_goals(
     behavior: Behavior | BehaviorModel,
     learn: Callable[[Model, Demonstrations], Fit[Model]],
     *,
+    options: SolveOptions | None = None,
     rounds: int = 40,
     tolerance: float = 1e-3,
 ) -> GoalFit[Model]:
@@ -152,6 +168,7 @@ def fit_goals(
         behavior: The behavior of the agents. Of a `BehaviorModel`, goals have the posterior under what the last fit has
             learned.
         learn: A fit of weighted demonstrations that starts at a model, with the same behavior.
+        options: How values are computed before the first fit; from then on, as each fit computes them.
         rounds: The largest number of rounds, at least 1.
         tolerance: The largest change of a posterior probability that counts as none.
 
@@ -159,7 +176,7 @@ def fit_goals(
         The model, and the posterior of each goal.
 
     Raises:
-        InputError: As `goal_posterior` does.
+        InputError: As `goal_posterior` does, and for a function that does not return a fit.
 
     Example:
         >>> from sidestep.inference.fit import fit
@@ -181,13 +198,16 @@ def fit_goals(
     to_number(tolerance, "tolerance", least=0)
     check_function(learn, "learn")
     trajectories, candidates = _checked(trajectories, model), check_tasks(model, candidates, "candidates")
-    posterior, log_likelihood = goal_posterior(model, trajectories, candidates, behavior)
+    posterior, log_likelihood = goal_posterior(model, trajectories, candidates, behavior, options=options)
     history = [log_likelihood]
     while True:
         result = learn(model, weighted_demonstrations(trajectories, candidates, posterior))
+        check_instance(result, Fit, "learn", source="the result of a function")
         model, goal_probabilities, before = result.model, posterior.mean(axis=0), posterior
         behavior = result.behavior if isinstance(behavior, BehaviorModel) else behavior
-        posterior, log_likelihood = goal_posterior(model, trajectories, candidates, behavior, goal_probabilities)
+        posterior, log_likelihood = goal_posterior(
+            model, trajectories, candidates, behavior, goal_probabilities, options=result.problem.options
+        )
         history.append(log_likelihood)
         change = float(np.abs(posterior - before).max())
         if change < tolerance or len(history) > rounds:
@@ -223,15 +243,37 @@ def _checked(trajectories: Sequence[Trajectory], model: TransitionModel) -> list
 
 
 def _trajectory_log_likelihoods(
-    task: Task, model: TransitionModel, trajectories: Sequence[Trajectory], behavior: Behavior | BehaviorModel
+    task: Task,
+    model: TransitionModel,
+    trajectories: Sequence[Trajectory],
+    behavior: Behavior | BehaviorModel,
+    options: SolveOptions | None,
 ) -> Float[np.ndarray, " trajectories"]:
     """Return Σ_t log π(a_t | s_t) of each trajectory for a task; −∞ if it continues after a terminal state."""
     moves = flatten([trajectory._replace(task=0) for trajectory in trajectories], stack_tasks([task]))
-    terminal, states = np.asarray(task.terminal), np.asarray(moves.states)
+    terminal, states, actions = (np.asarray(each) for each in (task.terminal, moves.states, moves.actions))
     # as many moves for every candidate, so that no function is compiled anew; those after the end count as −∞
-    ended = terminal[states]
-    moves = eqx.tree_at(lambda moves: moves.states, moves, to_jax(np.where(ended, np.argmin(terminal), states)))
-    log_policy = np.asarray(log_policies(model, moves, behavior))
+    ended, elsewhere = terminal[states], int(np.argmin(terminal))
+    if terminal[elsewhere]:
+        return np.full(len(trajectories), -np.inf)  # the task has ended wherever a trajectory begins
+    shape = model.graph.states, model.graph.actions
+    possible = int(np.argmax(np.broadcast_to(np.asarray(model.graph.available), shape)[elsewhere]))
+    others = to_jax(np.where(ended, elsewhere, states)), to_jax(np.where(ended, possible, actions))
+    moves = eqx.tree_at(lambda moves: (moves.states, moves.actions), moves, others)
+    log_policy = np.asarray(log_policies(model, moves, behavior, options=options))
     if np.isnan(log_policy).any():
         raise NotConverged("the values of a candidate's task did not converge: a smaller β may help")
     return np.bincount(np.asarray(moves.trajectory), np.where(ended, -np.inf, log_policy), minlength=len(trajectories))
+
+
+def _why_impossible(trajectory: Trajectory, candidates: Sequence[Task]) -> str:
+    """Return why a trajectory cannot have any of the candidates with a probability above 0 as its goal."""
+    passed = sum(bool(np.asarray(task.terminal)[trajectory.states[:-1]].any()) for task in candidates)
+    expected = "expected one that it may have as its goal"
+    if passed == len(candidates):
+        return f"continues after the terminal states of all candidates: {expected}"
+    after = f"; it continues after the terminal states of {passed} others" if passed else ""
+    return (
+        f"has an action of probability 0 for {len(candidates) - passed} of {len(candidates)} candidates, such as one "
+        f"into a state from which the goal is out of reach{after}: {expected}"
+    )

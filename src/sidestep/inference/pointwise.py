@@ -15,13 +15,13 @@ from jaxtyping import Array, Float, Int
 
 from sidestep._repr import short_repr
 from sidestep._typing import Tree
-from sidestep.errors import NotConverged, check
+from sidestep.errors import NotConverged, check, check_choice, check_instance
 from sidestep.inference.batching import Batch
 from sidestep.inference.fit import Fit
 from sidestep.inference.objective import Objective, Parameters, Problem, actions_log_likelihood
 from sidestep.inference.tabular_information import with_known_values
 from sidestep.tabular.arrays import to_jax
-from sidestep.tabular.demonstrations import Demonstrations
+from sidestep.tabular.demonstrations import Demonstrations, trajectory_weights
 from sidestep.tabular.likelihood import Arrivals, arrival_log_likelihood, move_times
 from sidestep.tabular.solve import SMALL_PROBLEM
 from sidestep.tabular.solvers.base import WarmStart
@@ -69,9 +69,18 @@ class PointwiseLogLikelihood(NamedTuple):
         Args:
             unit: "walk" or "move".
         """
-        check(unit in ("walk", "move"), f"expected 'walk' or 'move', found {unit!r}", field="unit")
+        check_choice(unit, ("walk", "move"), "unit")
         counts = self.weights > 0
         return np.unique(self.trajectory[counts]) if unit == "walk" else np.flatnonzero(counts)
+
+    def weights_of(self, unit: Unit) -> Float[np.ndarray, " units"]:
+        """Return how much each walk or move that counts does: for a walk, Σ w² / Σ w over its moves.
+
+        Args:
+            unit: "walk" or "move".
+        """
+        each = self.weights if unit == "move" else trajectory_weights(self.trajectory, self.weights)
+        return each[self.numbers_of(unit)]
 
     def of(self, unit: Unit) -> Float[np.ndarray, "*draws units"]:
         """Return the log-likelihood of each walk or move that counts: the weighted sum over its moves.
@@ -104,7 +113,7 @@ def pointwise_log_likelihood(fit: Fit[Any], parameters: Parameters | None = None
         Both terms, as far as the fit has them, with the leading axes of the parameters.
 
     Raises:
-        InputError: For parameters of another model or with different leading axes.
+        InputError: For anything but a fit, and parameters of another model or with different leading axes.
         NotConverged: If values do not converge.
 
     Example:
@@ -115,6 +124,7 @@ def pointwise_log_likelihood(fit: Fit[Any], parameters: Parameters | None = None
         >>> [f"{each:.2f}" for each in pointwise_log_likelihood(learned).transitions]  # P(blocked) is about a tenth
         ['-0.11', '-0.11']
     """
+    check_instance(fit, Fit, "fit")
     learned = Parameters(fit.model.parameters, fit.behavior.parameters)
     return moves_log_likelihood(fit.problem, learned if parameters is None else parameters)
 

@@ -110,7 +110,8 @@ class Normal(Prior):
         variance: σ², likewise, above 0.
 
     Raises:
-        InputError: For a mean that is not finite, or a variance that is not finite and above 0.
+        InputError: For a mean that is not finite, or a variance that is not finite and above 0; and where its density
+            is needed, for numbers that do not broadcast to the parameters.
 
     Example:
         >>> float(Normal(mean=-2.0, variance=2.0).log_density(jnp.array([0.0])))
@@ -124,8 +125,23 @@ class Normal(Prior):
         self.mean = _as_floats(to_finite(mean, "prior mean"))
         self.variance = _as_floats(to_finite(variance, "prior variance", above=0))
 
+    def check_parameters(self, parameters: FloatTree) -> None:
+        """Raise `InputError` unless mean and variance broadcast to the shape of all parameters.
+
+        Args:
+            parameters: The parameters of a model.
+        """
+        for leaf in jax.tree.leaves(parameters):
+            shape = np.shape(leaf)
+            for field, own in (("prior mean", self.mean.shape), ("prior variance", self.variance.shape)):
+                pairs = zip(reversed(own), reversed(shape), strict=False)
+                fits = len(own) <= len(shape) and all(size in (1, axis) for size, axis in pairs)
+                message = f"expected one number, or numbers that broadcast to parameters of shape {shape}"
+                check(fits, f"{message}, found shape {own}", field=field)
+
     def log_density(self, parameters: FloatTree) -> Float[Array, ""]:
         """Return −Σ (θ − b)²/(2σ²) over all parameters."""
+        self.check_parameters(parameters)
         penalties = [
             jnp.sum((leaf - self.mean.astype(leaf.dtype)) ** 2 / (2 * self.variance.astype(leaf.dtype)))
             for leaf in jax.tree.leaves(parameters)
@@ -134,6 +150,7 @@ class Normal(Prior):
 
     def scale(self, parameters: FloatTree) -> Tree:
         """Return the standard deviation where it is below 1."""
+        self.check_parameters(parameters)
         deviation = np.minimum(np.sqrt(np.asarray(self.variance, np.float64)), 1.0)
         return jax.tree.map(lambda leaf: np.broadcast_to(deviation, np.shape(leaf)).astype(leaf.dtype), parameters)
 

@@ -6,6 +6,7 @@ functions on a fixed list, by setting fields, so that no code of a description r
 
 import dataclasses
 import enum
+import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
@@ -90,6 +91,9 @@ class _Writer:
         if isinstance(value, float):
             return value if math.isfinite(value) else {"float": str(value)}
         if isinstance(value, _Plain):
+            # half of a pair of surrogates has no bytes, and a number of thousands of digits no text
+            with input_errors("expected texts and numbers that a file can hold", ValueError, source="save", field=path):
+                json.dumps(value, ensure_ascii=False).encode()
             return value
         if isinstance(value, Mapping):
             return {"dict": [[self.described(key, path), self.described(value[key], _at(path, key))] for key in value]}

@@ -38,7 +38,8 @@ def save(path: str | Path, result: Any) -> None:
 
     Raises:
         InputError: For arrays of other things than numbers and texts, with the field for sets, bytes, complex numbers,
-            paths and other objects that are no records, and if the file system refuses.
+            paths and other objects that are no records, and for texts that UTF-8 cannot hold; for a result that holds
+            itself; and if the file system refuses.
 
     Example:
         >>> import sidestep as ss
@@ -46,9 +47,10 @@ def save(path: str | Path, result: Any) -> None:
         >>> load("grid.result").shape
         (2, 3)
     """
-    tree, arrays = describe(result)
-    description = {"format": FORMAT, "version": VERSION, "library": __version__, "result": tree}
-    text = json.dumps(description, ensure_ascii=False, allow_nan=False).encode()
+    with input_errors("expected a result that does not hold itself", RecursionError, source="save"):
+        tree, arrays = describe(result)
+        description = {"format": FORMAT, "version": VERSION, "library": __version__, "result": tree}
+        text = json.dumps(description, ensure_ascii=False, allow_nan=False).encode()
 
     def write(file: BinaryIO) -> None:
         with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -93,7 +95,8 @@ def load(path: str | Path, *, template: Any = None) -> Any:
     message = f"expected version {VERSION} of the format, found {version} (by sidestep {description.get('library')})"
     check(version == VERSION, message, source=path)
     try:
-        with input_errors("the description is damaged", KeyError, IndexError, TypeError, ValueError, source=path):
+        kinds = KeyError, IndexError, TypeError, ValueError, RecursionError
+        with input_errors("the description is damaged", *kinds, source=path):
             return rebuild(description["result"], arrays, template)
     except InputError as error:
         raise InputError(error.message, source=path, field=error.field) from error

@@ -99,6 +99,15 @@ def behavior_model_of(config: MapConfig, person: Int[np.ndarray, " tasks"] | Non
     return behavior_model(behavior_of(config), learn, discount=discount, person=person)
 
 
+def solve_options_of(config: MapConfig) -> SolveOptions:
+    """Return how the values of the agents that a configuration describes are computed.
+
+    Args:
+        config: The configuration.
+    """
+    return SolveOptions(gradient=config.fit.gradient, horizon=config.behavior.horizon)
+
+
 class MapSize(NamedTuple):
     """The size of what is learned of a map.
 
@@ -326,7 +335,7 @@ def fit_map(
         prior=prior,
         tempering=config.agents.tempering,
         terms=ALL_TERMS if config.fit.terms == "both" else (config.fit.terms,),
-        options=SolveOptions(gradient=config.fit.gradient, horizon=config.behavior.horizon),
+        options=solve_options_of(config),
         optimizer=optimizer,
         memory=config.fit.memory * 2**30,
         large_map=config.fit.large_map,

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 
+from sidestep._arguments import to_finite
 from sidestep.errors import check
 
 if TYPE_CHECKING:
@@ -127,14 +128,15 @@ def places_of(network: "DiGraph", positions: Positions | None) -> Places:
         positions: The places, in any units; None for those that networkx chooses, wider than high.
 
     Raises:
-        InputError: Where a state has no place.
+        InputError: Where a state has no place, and for places that are not two finite numbers each.
     """
     if positions is None:
         return _turned(_apart(_chosen(network)))
-    places = positions if isinstance(positions, Mapping) else dict(enumerate(np.asarray(positions)))
+    is_mapping = isinstance(positions, Mapping)
+    places = positions if is_mapping else dict(enumerate(to_finite(positions, "positions", ("states", 2))))
     missing = [state for state in network if state not in places]
     check(not missing, f"expected a place of each state, found none of {missing[:5]}", field="positions")
-    result = np.array([[float(number) for number in places[state]] for state in network])
+    result = np.asarray(to_finite([places[state] for state in network], "positions", ("states", 2)), np.float64)
     extent = np.ptp(result, axis=0)
     skewed = extent.min() > 0 and extent.max() > _SKEWED * extent.min()
     return result / extent if skewed else result

@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch
 from matplotlib.transforms import offset_copy
 
-from sidestep.errors import check
+from sidestep.errors import check, check_instance
 from sidestep.plotting.graph_layout import (
     POINTS,
     Nodes,
@@ -110,7 +110,8 @@ def figure_graph(
         The figure; `figure.savefig("world.png")` writes it.
 
     Raises:
-        InputError: For too many states, a plan of another world, and too few labels or positions.
+        InputError: For arguments of other types, too many states, a plan of another world, and too few labels or
+            positions.
 
     Example:
         >>> import sidestep as ss
@@ -119,9 +120,10 @@ def figure_graph(
         >>> len(figure.axes)
         1
     """
+    check_instance(model, TransitionModel, "model")
     states = model.graph.states
     check(states <= MAX_STATES, f"expected at most {MAX_STATES} states, found {states}", field="model")
-    world = _world(model, plan, labels or Labels(), positions)
+    world = _world(model, plan, labels, positions)
     room = max((text_size(text, _SMALL)[0] for text in world.texts.values()), default=0.0)
     width, height = picture_size(world.places, world.nodes.diameter, room, world.margin)
     whole = max(width, _KEY_SIZE[0]), height + _KEY_SIZE[1]
@@ -145,13 +147,17 @@ def draw_graph(
         axes: Where to draw, of the size that they keep.
         model, plan, labels, positions: As for `figure_graph`.
     """
-    _draw(axes, _world(model, plan, labels or Labels(), positions))
+    _draw(axes, _world(model, plan, labels, positions))
 
 
-def _world(model: TransitionModel, plan: Plan | None, labels: Labels, positions: Positions | None) -> _World:
+def _world(model: TransitionModel, plan: Plan | None, labels: Labels | None, positions: Positions | None) -> _World:
     """Return what is drawn."""
     import networkx
 
+    check_instance(model, TransitionModel, "model")
+    check_instance(plan, (Plan, type(None)), "plan")
+    check_instance(labels, (Labels, type(None)), "labels")
+    labels = labels or Labels()
     probabilities = _transitions(model)
     states, actions = probabilities.shape[:2]
     available = np.broadcast_to(np.asarray(model.graph.available), (states, actions))

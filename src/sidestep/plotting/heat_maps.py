@@ -9,7 +9,7 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from sidestep.errors import check
+from sidestep.errors import check, check_instance
 from sidestep.plotting import palette
 from sidestep.plotting.graph_layout import POINTS, names_of, text_size
 from sidestep.plotting.layout import DOTS_PER_INCH
@@ -39,7 +39,7 @@ def figure_plan(plan: Plan, *, labels: Labels | None = None) -> Figure:
         The figure; `figure.savefig("plan.png")` writes it.
 
     Raises:
-        InputError: For too few labels, and for a plan with values of some states only.
+        InputError: For arguments of other types, for too few labels, and for a plan with values of some states only.
 
     Example:
         >>> import sidestep as ss
@@ -48,6 +48,8 @@ def figure_plan(plan: Plan, *, labels: Labels | None = None) -> Figure:
         >>> [axes.get_title() for axes in figure_plan(made, labels=ss.Labels(actions=("n", "s", "w", "e"))).axes[:2]]
         ['policy', 'action values']
     """
+    check_instance(plan, Plan, "plan")
+    check_instance(labels, (Labels, type(None)), "labels")
     policy, q = np.asarray(plan.policy, np.float64), np.asarray(plan.solution.action_values, np.float64)
     check(policy.shape == q.shape, f"expected values of {policy.shape}, found {q.shape}", field="plan")
     (states, actions), labels = policy.shape, labels or Labels()

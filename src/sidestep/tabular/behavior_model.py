@@ -194,7 +194,8 @@ def behavior_model(
     deviation ½. Where choices say little, the result is the start; two starts show that.
 
     Args:
-        behavior: The known behavior, and the start of a learned β and lapse (.05 if it has no lapse).
+        behavior: The known behavior, and the start of a learned β and lapse (.05 if it has no lapse); a lapse of 0
+            cannot be the start, because its logit is infinite.
         learn: Names out of `LEARNABLE`.
         discount: The start of a learned discount, between 0 and 1.
         person: The person of each task, 0…persons − 1; with it, each person's β is learned.
@@ -207,8 +208,8 @@ def behavior_model(
         The behavior model, with the learned numbers at their start.
 
     Raises:
-        InputError: For a name that is not in `LEARNABLE`, a learned discount that is not between 0 and 1, a discount
-            that is not learned, persons that are not numbered from 0, features or weights that are not finite,
+        InputError: For a name that is not in `LEARNABLE`, a learned discount or lapse that is not between 0 and 1, a
+            discount that is not learned, persons that are not numbered from 0, features or weights that are not finite,
             another number of weights than of features, weights without features, and aims that are not states.
 
     Example:
@@ -226,15 +227,15 @@ def behavior_model(
         person = to_jax(own, jnp.int32)
     log_beta = logit_lapse = logit_discount = weights = cost_parameters = None
     if "beta" in learn or person is not None:
+        to_finite(behavior.beta, "beta", (), above=0)
         log_beta = jnp.full(1 if person is None else int(np.max(person)) + 1, jnp.log(behavior.beta))
     if "lapse" in learn:
-        logit_lapse = logit(jnp.asarray(_INITIAL_LAPSE if behavior.lapse is None else behavior.lapse))
+        logit_lapse = _logit_of(_INITIAL_LAPSE if behavior.lapse is None else behavior.lapse, "lapse")
     learns_discount = "discount" in learn
     message = f"expected none unless it is learned (a task has its own), found {discount!r}"
     check(learns_discount or discount is None, message, field="discount")
     if learns_discount:
-        begin = to_number(discount, "discount", above=0, below=1)
-        logit_discount = logit(jnp.asarray(begin, jnp.result_type(float)))
+        logit_discount = _logit_of(to_number(discount, "discount", above=0, below=1), "discount")
     message = "expected none without features, found some"
     check(features is not None or reward_weights is None, message, field="reward_weights")
     if features is not None:
@@ -248,3 +249,10 @@ def behavior_model(
         cost_parameters, aimed_at = to_jax(np.full(states, _COST_MEAN)), to_jax(aims, jnp.int32)
     start = BehaviorParameters(log_beta, logit_lapse, logit_discount, weights, cost_parameters)
     return BehaviorModel(behavior, start, start, person, features, aimed_at)
+
+
+def _logit_of(start: float | Float[Array, ""], field: str) -> Float[Array, ""]:
+    """Return the logit of a number between 0 and 1, as JAX holds it: in 32 bits, .99999999 is 1."""
+    number = to_jax(start, jnp.result_type(float))
+    to_finite(number, field, (), above=0, below=1)
+    return logit(number)

@@ -365,6 +365,21 @@ def flatten(trajectories: Sequence[Trajectory], tasks: Task) -> Demonstrations[T
     return Demonstrations(states, flat_moves(actions), next_states, of_moves, number, tasks, truncated=stopped)
 
 
+def trajectory_weights(
+    trajectory: Int[np.ndarray, " moves"], weights: Float[np.ndarray, " moves"]
+) -> Float[np.ndarray, " trajectories"]:
+    """Return how much each trajectory counts: Σ w² / Σ w over its moves; 0 without a move that counts.
+
+    That is w where each of its moves has the weight w or 0: as if moves of weight 0 were not there.
+
+    Args:
+        trajectory: The trajectory of each move.
+        weights: How much each move counts, at least 0.
+    """
+    squares, sums = np.bincount(trajectory, weights**2), np.bincount(trajectory, weights)
+    return np.divide(squares, sums, out=np.zeros_like(sums), where=sums > 0)
+
+
 def flat_moves(parts: Sequence[np.ndarray]) -> Int[Array, " moves"]:
     """Return pieces of a flat array of integers, one after another.
 

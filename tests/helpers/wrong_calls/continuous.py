@@ -3,6 +3,7 @@
 # ruff: noqa: E501
 # pyright: basic, reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false, reportAbstractUsage=false
 
+from dataclasses import replace
 from functools import cache
 
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ BEHAVIOR = ss.Behavior(LogSumExp(), 2.0)
 WORLD = sc.LinearGaussian(jnp.eye(1), jnp.eye(1), jnp.full(1, 0.1))
 GOAL = sc.reach_region((1.0,), 0.1)
 LATTICE = sc.Lattice(-ONE, ONE, (5,))
+PAID = replace(ss.reach(ss.Grid.unknown(1, 2), 0), outcome_reward=jnp.ones((1, 1, 1)))
 STEPS = jnp.asarray([[-0.5], [0.5]])
 AGENT = sc.LatticePlanner(WORLD, STEPS, BEHAVIOR, LATTICE)
 WALK = ss.Trajectory(np.array([[0.0], [0.5], [1.0]]), np.array([1, 1]), 0)
@@ -80,6 +82,20 @@ CASES = [
         ("a goal of text", lambda: sc.reach_region("goal", 1.0), "goal"),
         ("a goal that is a number", lambda: sc.reach_region(1.0, 1.0), "goal"),
         ("a discount of 2", lambda: sc.reach_region((0.0,), 1.0, discount=2.0), "discount"),
+        ("a table of a number", lambda: sc.TableTask(3, None, 7), "index"),
+        ("a table for a table", lambda: sc.TableTask(3, [1.0], 0.9), "expected a Task, found 3"),
+        ("a table of another number of tasks", lambda: sc.TableTask(DEMOS.tasks, [1.0], 0.9), "task"),
+        ("a table with rewards of outcomes", lambda: sc.TableTask(PAID, [1.0], 0.9), "R(s, a, s′)"),
+        ("a quadratic discount of 1.7", lambda: sc.QuadraticTask([0.0], [[1.0]], [[1.0]], 1.7), "discount"),
+        ("quadratic costs of two dimensions", lambda: sc.QuadraticTask([0.0], jnp.eye(2), [[1.0]], 0.9), "state_cost"),
+        ("quadratic costs in a row", lambda: sc.QuadraticTask([0.0], [[1.0]], [[1.0, 1.0]], 0.9), "action_cost"),
+        ("quadratic costs of a number", lambda: sc.QuadraticTask([0.0], [[1.0]], 1.0, 0.9), "action_cost"),
+        ("a quadratic goal NaN", lambda: sc.QuadraticTask([NAN], [[1.0]], [[1.0]], 0.9), "goal"),
+        ("a quadratic goal of a number", lambda: sc.QuadraticTask(0.0, [[1.0]], [[1.0]], 0.9), "goal"),
+        ("an angle for two discounts", lambda: sc.PendulumTask(0.0, [0.9, 0.9]), "goal"),
+        ("an angle of text", lambda: sc.PendulumTask("up", 0.9), "goal"),
+        ("a goal with a radius of 0", lambda: sc.ReachTask([0.0], 0.0, 1.0, 0.0, 0.9), "radius"),
+        ("a goal with two costs", lambda: sc.ReachTask([0.0], 1.0, [1.0, 1.0], 0.0, 0.9), "step_cost"),
         ("a task for a list", lambda: sc.batch_tasks(GOAL), "tasks"),
         ("no task", lambda: sc.batch_tasks([]), "tasks"),
         ("tasks of two kinds", lambda: sc.batch_tasks([GOAL, sc.PendulumTask(jnp.zeros(()), jnp.ones(()))]), "kind"),
@@ -128,6 +144,7 @@ CASES = [
         ("demonstrations in a table", lambda: fitted(demonstrations=DEMOS), "tasks"),
         ("a name for a behavior", lambda: fitted(behavior="softmax"), "behavior"),
         ("a number for a prior", lambda: fitted(prior=1.0), "prior"),
+        ("a prior that counts thrice", lambda: fitted(prior=ss.Normal(np.zeros((3, 1, 1)))), "prior mean"),
         ("a number for a schedule", lambda: fitted(schedule=300), "schedule"),
         ("one term without a tuple", lambda: fitted(terms="actions"), "terms"),
         ("no term", lambda: fitted(terms=()), "terms"),

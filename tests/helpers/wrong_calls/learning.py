@@ -3,6 +3,7 @@
 # ruff: noqa: ARG005, E501
 # pyright: basic, reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -26,12 +27,13 @@ from helpers.wrong_calls.small import (
     WALK,
     WALKS,
     labeled,
+    small_fit,
     walk,
 )
 
-NORMAL = ss.Normal()
+NORMAL, SLACK = ss.Normal(), ss.Behavior("boltzmann", 2.0, lapse=0.0)
 CHANCES = np.full((4, 5), 0.5)
-SCORES = ss.ScoreStatistics(*(np.zeros(0) for _ in range(4)))
+SCORES = ss.ScoreStatistics(*(np.zeros(0) for _ in range(5)))
 CASES = [
     *labeled("fit", [
         ("walks", lambda: ss.fit(MODEL, WALKS, BEHAVIOR), "demonstrations"),
@@ -46,6 +48,10 @@ CASES = [
         ("the class of a prior", lambda: ss.fit(MODEL, DEMOS, BEHAVIOR, prior=ss.Normal), "prior"),
         ("a prior of barriers", lambda: ss.fit(MODEL, DEMOS, BEHAVIOR, prior=PRIOR), "prior"),
         ("a prior of other cells", lambda: ss.fit(MODEL, DEMOS, BEHAVIOR, prior=ss.Normal(np.zeros(3))), "prior"),
+        ("a prior of a column for a row", lambda: ss.fit(MODEL, DEMOS, BEHAVIOR, prior=ss.Normal(np.zeros((20, 1)))), "broadcast to parameters of shape (20,), found shape (20, 1)"),
+        ("a prior that counts thrice", lambda: ss.fit(MODEL, DEMOS, BEHAVIOR, prior=ss.Normal(np.zeros((3, 20)))), "prior mean"),
+        ("a variance of a column", lambda: ss.fit(MODEL, DEMOS, BEHAVIOR, prior=ss.Normal(0.0, np.ones((20, 1)))), "prior variance"),
+        ("walls with a column of means", lambda: ss.fit(MODEL, DEMOS, BEHAVIOR, prior=ss.WallPrior(ss.Normal(np.zeros((20, 1))), GRID.known, 1.0)), "prior mean"),
         ("a field beyond the cells", lambda: ss.fit(MODEL, DEMOS, BEHAVIOR, prior=ss.GaussianMRF(NORMAL, np.array([[0, 999]]), 1.0), optimizer=ss.LBFGS(2)), "999"),
         ("walls of another grid", lambda: ss.fit(MODEL, DEMOS, BEHAVIOR, prior=ss.WallPrior(NORMAL, [[-1, -1]], 1.0)), "prior"),
         ("the name of an optimizer", lambda: ss.fit(MODEL, DEMOS, BEHAVIOR, optimizer="adam"), "optimizer"),
@@ -143,6 +149,8 @@ CASES = [
     *labeled("goals", [
         ("fit_goals, no candidate", lambda: ss.fit_goals(MODEL, [WALK], [], BEHAVIOR, lambda m, d: None), "candidates"),
         ("fit_goals, a fit for a function", lambda: ss.fit_goals(MODEL, [WALK], [TASK], BEHAVIOR, None), "learn"),
+        ("fit_goals, a function that returns nothing", lambda: ss.fit_goals(MODEL, [WALK], [TASK], BEHAVIOR, lambda m, d: None), "expected a Fit, found None"),
+        ("fit_goals, options", lambda: ss.fit_goals(MODEL, [WALK], [TASK], BEHAVIOR, lambda m, d: None, options=1), "options"),
         ("fit_goals, no round", lambda: ss.fit_goals(MODEL, [WALK], [TASK], BEHAVIOR, lambda m, d: None, rounds=0), "rounds"),
         ("fit_goals, tolerance", lambda: ss.fit_goals(MODEL, [WALK], [TASK], BEHAVIOR, lambda m, d: None, tolerance=NAN), "tolerance"),
         ("goal_posterior, a task of another world", lambda: ss.goal_posterior(MODEL, [WALK], [OTHER_TASK], BEHAVIOR), "candidates"),
@@ -152,6 +160,8 @@ CASES = [
         ("goal_posterior, another action", lambda: ss.goal_posterior(MODEL, [walk([0, 1], [4])], [TASK], BEHAVIOR), "actions"),
         ("goal_posterior, probabilities", lambda: ss.goal_posterior(MODEL, [WALK], [TASK], BEHAVIOR, [0.5, 0.5]), "goal_probabilities"),
         ("goal_posterior, a probability below 0", lambda: ss.goal_posterior(MODEL, [WALK], [TASK], BEHAVIOR, [-1.0]), "goal_probabilities"),
+        ("goal_posterior, probabilities beyond 1", lambda: ss.goal_posterior(MODEL, [WALK], [TASK], BEHAVIOR, [2.0]), "sum to 1"),
+        ("goal_posterior, options of text", lambda: ss.goal_posterior(MODEL, [WALK], [TASK], BEHAVIOR, options="exact"), "options"),
         ("goal_posterior, no behavior", lambda: ss.goal_posterior(MODEL, [WALK], [TASK], None), "behavior"),
     ]),
     *labeled("posteriors", [
@@ -182,6 +192,23 @@ CASES = [
         ("effective_sample_ratio of nothing", lambda: ss.effective_sample_ratio([]), "held_out"),
         ("effective_sample_ratio without a list", lambda: ss.effective_sample_ratio(SCORES), "held_out"),
         ("effective_sample_ratio of no move", lambda: ss.effective_sample_ratio([SCORES]), "held_out"),
+        ("effective_sample_ratio of moves that do not count", lambda: ss.effective_sample_ratio([ss.ScoreStatistics(*np.zeros((3, 2)), np.zeros(2, int), np.zeros(2))]), "at least one move"),
+        ("information_criteria of nothing", lambda: ss.information_criteria(None), "expected a Fit"),
+        ("pointwise_log_likelihood of nothing", lambda: ss.pointwise_log_likelihood(None), "expected a Fit"),
+        ("pointwise_log_likelihood of a model", lambda: ss.pointwise_log_likelihood(MODEL), "expected a Fit"),
+        ("PointwiseLogLikelihood.of steps", lambda: ss.PointwiseLogLikelihood(np.zeros(1), np.zeros(1), np.zeros(1, int), np.ones(1)).of("step"), "unit"),
+        ("cross_validate of nothing", lambda: ss.cross_validate(None), "expected a Fit"),
+        ("cross_validate, a seed below 0", lambda: ss.cross_validate(small_fit(), folds=2, seed=-1), "seed"),
+        ("cross_validate, a seed of a fraction", lambda: ss.cross_validate(small_fit(), folds=2, seed=1.5), "seed"),
+        ("cross_validate, a seed of 33 bits", lambda: ss.cross_validate(small_fit(), folds=2, seed=2**32), "seed"),
+        ("cross_validate, groups of text", lambda: ss.cross_validate(small_fit(), folds=2, groups=["a", "b"]), "groups"),
+        ("cross_validate, groups of lists", lambda: ss.cross_validate(small_fit(), folds=2, groups=[[1], [1, 2]]), "groups"),
+        ("cross_validate, a start of text", lambda: ss.cross_validate(small_fit(), folds=2, warm_start="no"), "warm_start"),
+        ("CrossValidation.difference of a number", lambda: ss.CrossValidation(None, None, None).difference(3), "other"),
+        ("a learned lapse that starts at 0", lambda: ss.behavior_model(SLACK, ["lapse"]), "'lapse': expected a finite number above 0 and below 1"),
+        ("a learned lapse that starts at 1", lambda: ss.behavior_model(eqx.tree_at(lambda each: each.lapse, SLACK, jnp.ones(())), ["lapse"]), "lapse"),
+        ("a learned sharpness that starts at 0", lambda: ss.behavior_model(eqx.tree_at(lambda each: each.beta, SLACK, jnp.zeros(())), ["beta"]), "beta"),
+        ("a sharpness of persons that starts at infinity", lambda: ss.behavior_model(eqx.tree_at(lambda each: each.beta, SLACK, jnp.asarray(INF)), person=[0]), "beta"),
         ("tasks_mesh of no device", lambda: ss.tasks_mesh([]), "devices"),
         ("tasks_mesh of numbers", lambda: ss.tasks_mesh([0, 1]), "devices"),
         ("tasks_mesh of a number", lambda: ss.tasks_mesh(2), "devices"),

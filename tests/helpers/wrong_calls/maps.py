@@ -6,7 +6,20 @@
 import numpy as np
 
 import sidestep as ss
-from helpers.wrong_calls.small import BEHAVIOR, DEMOS, GRID, INF, MAP, MODEL, NAN, OTHER_GRID, TRUTH, WALKS, labeled
+from helpers.wrong_calls.small import (
+    BEHAVIOR,
+    DEMOS,
+    GRID,
+    INF,
+    MAP,
+    MODEL,
+    NAN,
+    OTHER_GRID,
+    TASK,
+    TRUTH,
+    WALKS,
+    labeled,
+)
 from sidestep.maps.learned_map import PlannedPath
 
 TENTHS = np.full((4, 5), 0.1)
@@ -101,6 +114,16 @@ CASES = [
         ("evaluate, another truth", lambda: MAP.evaluate(OTHER_GRID), "scored"),
         ("evaluate, an array", lambda: MAP.evaluate(TENTHS), "truth"),
         ("evaluate, a seed", lambda: MAP.evaluate(TRUTH, seed=0.5), "seed"),
+        ("save of a result to a number", lambda: ss.save(3, MODEL), "path"),
+        ("load of a number", lambda: ss.load(3), "path"),
+        ("figure_graph of a number", lambda: ss.figure_graph(3), "model"),
+        ("figure_graph, a model for a plan", lambda: ss.figure_graph(MODEL, MODEL), "plan"),
+        ("figure_graph, labels of texts", lambda: ss.figure_graph(MODEL, labels=["a"]), "labels"),
+        ("figure_graph, positions of text", lambda: ss.figure_graph(MODEL, positions="left"), "positions"),
+        ("figure_graph, one number a position", lambda: ss.figure_graph(MODEL, positions=np.zeros(20)), "positions"),
+        ("figure_graph, positions of text by state", lambda: ss.figure_graph(MODEL, positions=dict.fromkeys(range(20), "ab")), "positions"),
+        ("figure_plan of a number", lambda: ss.figure_plan(3), "plan"),
+        ("figure_plan, labels of a number", lambda: ss.figure_plan(ss.plan(MODEL, TASK), labels=3), "labels"),
         ("save to a number", lambda: MAP.save(3), "folder"),
         ("load_map of None", lambda: ss.load_map(None), "folder"),
         ("load_map of a map", lambda: ss.load_map(MAP), "folder"),

@@ -1,6 +1,7 @@
 """Small right arguments, of which a wrong call has all but one."""
 
 from collections.abc import Callable
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -36,6 +37,12 @@ PARAMETERS = ss.Parameters(jnp.zeros(2), BehaviorParameters())
 LAPLACE = ss.Laplace(PARAMETERS, np.ones(2), np.zeros((2, 0)), np.zeros(0), 0.0)
 MRF_FIT = ss.fit_mrf([ss.Grid(np.array([[0, 1, 0], [0, 0, 0]]))], ())
 EMPTY = np.zeros(0)
+
+
+@cache
+def small_fit() -> ss.Fit:
+    """A fit of two walks."""
+    return ss.fit(MODEL, DEMOS, BEHAVIOR, terms=("transitions",))
 
 
 def walk(states, actions, task=0) -> ss.Trajectory:

@@ -204,7 +204,7 @@ class Solver(eqx.Module):
 
     Attributes:
         tolerance: The relative change at which to stop, above 0; by default 1e-10 in 64-bit and 1e-5 in 32-bit numbers.
-        max_sweeps: When to stop without convergence.
+        max_sweeps: When to stop without convergence, at least 1.
 
     Example:
         >>> import sidestep as ss
@@ -216,10 +216,10 @@ class Solver(eqx.Module):
     max_sweeps: eqx.AbstractVar[int]
 
     def check_settings(self) -> None:
-        """Raise `InputError` for a tolerance or a number of sweeps below 0."""
+        """Raise `InputError` for a tolerance below 0, or fewer sweeps than 1."""
         if self.tolerance is not None:
             to_finite(self.tolerance, "tolerance", (), least=0)
-        to_count(self.max_sweeps, "max_sweeps", 0)
+        to_count(self.max_sweeps, "max_sweeps")
 
     @abc.abstractmethod
     def cold_start(self, states: int, dtype: jnp.dtype) -> WarmStart:

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sidestep.errors import InputError
+from sidestep.errors import InputError, to_count
 from sidestep.tabular.backups import Backup, BoltzmannAverage, Gradient, HardMax, LogSumExp, Mellowmax
 from sidestep.tabular.solvers import base, native
 from sidestep.tabular.solvers.base import BellmanEquation, Region, Values, WarmStart
@@ -49,12 +49,12 @@ class GaussSeidel(base.Solver):
     Attributes:
         tolerance: The relative change at which to stop, above 0; by default 1e-10 in 64-bit and 1e-5 in 32-bit numbers.
         max_sweeps: When to stop without convergence: the number of times that a state is solved on average, and of
-            rounds over all states.
+            rounds over all states; at least 1.
         max_region_sweeps: The same for an adjoint where states were left out of the values' solve: residuals may go
-            round in circles there for long.
+            round in circles there for long. At least 1.
 
     Raises:
-        InputError: When it solves, for a backup without native code.
+        InputError: For a tolerance below 0 and fewer sweeps than 1; when it solves, for a backup without native code.
 
     Example:
         >>> import sidestep as ss
@@ -74,6 +74,7 @@ class GaussSeidel(base.Solver):
 
     def __check_init__(self) -> None:
         self.check_settings()
+        to_count(self.max_region_sweeps, "max_region_sweeps")
 
     def cold_start(self, states: int, dtype: jnp.dtype) -> WarmStart:
         """Return a start without values, adjoint and order."""

@@ -51,7 +51,10 @@ class Jacobi(base.Solver):
 
     Attributes:
         tolerance: The relative change at which to stop, above 0; by default 1e-10 in 64-bit and 1e-5 in 32-bit numbers.
-        max_sweeps: When to stop without convergence.
+        max_sweeps: When to stop without convergence, at least 1.
+
+    Raises:
+        InputError: For a tolerance below 0 and fewer sweeps than 1.
 
     Example:
         >>> import sidestep as ss
