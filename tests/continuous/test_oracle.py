@@ -18,6 +18,7 @@ from sidestep.continuous.oracle import NoisyPlanner
 WAYS, NOISE, DISCOUNT, BETA, TRUTH, VARIANCE = np.array([-1.0, 0.0, 1.0]), 0.4, 0.6, 1.5, 0.3, 4.0
 TASK = sc.QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.eye(1), jnp.asarray(DISCOUNT))
 SOFT, LATTICE = ss.Behavior(ss.LogSumExp(), BETA), sc.Lattice(vector(-8), vector(8), (81,))
+COARSE = sc.Lattice(vector(-8), vector(8), (30,))
 PLACES = np.linspace(-9, 9, 721)
 
 
@@ -143,6 +144,13 @@ def test_compare_with_lattice_points_around_an_outcome_have_its_mean_and_varianc
 def test_compare_with_lattice_that_does_not_fit_is_refused(lattice, match):
     with pytest.raises(ss.InputError, match=match):
         sc.compare_with_lattice(made(), lattice)
+
+
+def test_compare_with_lattice_of_the_coarsest_spacing_is_near_a_fine_one():
+    """Its 30 points are 1.38 standard deviations of the noise apart."""
+    fine, coarse = (sc.compare_with_lattice(made(), each) for each in (LATTICE, COARSE))
+    assert coarse.log_likelihood == pytest.approx(fine.log_likelihood, abs=0.5)
+    assert coarse.distance == pytest.approx(fine.distance, rel=0.1)
 
 
 def test_compare_with_lattice_of_another_fit_is_refused():

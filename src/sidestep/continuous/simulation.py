@@ -83,7 +83,7 @@ def simulate_trajectories(
         if not solution.converged:
             raise NotConverged(f"values did not converge for task {index}: a finer lattice or a smaller β may help")
         parts = _simulate(agent, real, task, solution.values, to_jax(own), jax.random.fold_in(key, index), moves)
-        goes_on = parts[2][:, -1] & ~jax.vmap(task.terminal)(parts[0][:, -1])
+        goes_on = ~jax.vmap(task.terminal)(parts[0][:, -1])  # agents stay where their task ends
         for states, choices, acting, stopped in zip(*map(np.asarray, (*parts, goes_on)), strict=True):
             length = int(acting.sum())
             if length:
