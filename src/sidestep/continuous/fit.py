@@ -190,9 +190,11 @@ def moves_that_count(demonstrations: Demonstrations) -> Demonstrations:
     if counts.all() and len(counts):
         return demonstrations
     check(counts.any(), f"expected moves with a weight above 0, found none of {len(counts)}", field="demonstrations")
-    of_moves = ("states", "actions", "next_states", "task", "trajectory", "weights", "truncated")
+    of_moves = ("states", "actions", "next_states", "task", "trajectory", "weights", "truncated", "person")
+    arrays = {name: getattr(demonstrations, name) for name in of_moves}
     return replace(
-        demonstrations, **{name: to_jax(np.asarray(getattr(demonstrations, name))[counts]) for name in of_moves}
+        demonstrations,
+        **{name: to_jax(np.asarray(each)[counts]) for name, each in arrays.items() if each is not None},
     )
 
 
