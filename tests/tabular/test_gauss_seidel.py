@@ -118,19 +118,6 @@ def test_solve_gradient_after_an_earlier_adjoint_leaves_no_traces_of_it():
     np.testing.assert_array_equal(traces, cold)
 
 
-# Which states
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("solver", [SOLVER, Jacobi(tolerance=1e-11)], ids=["GaussSeidel", "Jacobi"])
-def test_solve_visited_outside_the_states_are_clipped(solver):
-    model, wanted = some_map(), reach(Grid.unknown(20, 21), 5, discount=0.99)
-    visited = jnp.asarray([3, -1, -420, 419, 1_000])
-    solution = solve_with(solver, model, wanted, agent("Boltzmann"), visited=visited)
-    every = solve_with(solver, model, wanted, agent("Boltzmann"))
-    np.testing.assert_array_equal(solution.action_values, every.action_values[jnp.asarray([3, 419, 0, 419, 419])])
-
-
 # Batches
 
 

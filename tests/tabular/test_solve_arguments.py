@@ -35,9 +35,14 @@ def test_solve_of_states_that_do_not_exist_is_refused(settings, match):
         solved(**settings)
 
 
-def test_solve_of_some_states_has_their_action_values():
-    every = solved()
-    np.testing.assert_array_equal(solved(visited=np.array([1, 0])).action_values, every.action_values[::-1])
+@pytest.mark.parametrize("solver", [ss.Jacobi(), ss.GaussSeidel()], ids=["Jacobi", "GaussSeidel"])
+def test_solve_of_some_states_has_their_action_values(solver):
+    options, some = ss.SolveOptions(solver=solver), np.array([1, 0, 0])
+    every = solved(options=options)
+    np.testing.assert_array_equal(solved(visited=some, options=options).action_values, every.action_values[some])
+
+
+def test_solve_of_some_states_at_their_times_has_the_action_values_then():
     late = solved(visited=np.array([0, 0]), times=np.array([0, 1]), options=DEADLINE)
     np.testing.assert_allclose(late.action_values, [[-1 - 0.9 / 2, -1], [-1, -1]], rtol=1e-12)
 
