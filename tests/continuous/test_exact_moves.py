@@ -5,6 +5,7 @@ Agents on a line look two moves ahead: Q(s, a) = −s² − γ (s + a + θ)², w
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -54,9 +55,10 @@ def state_of(problem: FitProblem) -> PlannerState:
 def uniform_policy(features=1):
     examples = jnp.ones((2, features))
     policy = sc.finite_policy(jax.random.key(1), jnp.asarray(WAYS)[:, None], examples, width=4, depth=0)
-    layer = policy.network.network.layers[0]
+    network: Any = policy.network.network
+    layer = network.layers[0]
     return eqx.tree_at(
-        lambda policy: (policy.network.network.layers[0].weight, policy.network.network.layers[0].bias),
+        lambda policy: tuple(getattr(policy.network.network.layers[0], name) for name in ("weight", "bias")),
         policy, (jnp.zeros_like(layer.weight), jnp.zeros_like(layer.bias)),
     )  # fmt: skip
 

@@ -1,5 +1,7 @@
 """The weights of ∇Q beside the likelihood's own derivative, and control variates beside dense sums."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -46,7 +48,8 @@ def test_log_probs_over_finite_actions_are_those_of_a_softmax():
 def test_log_probs_over_vectors_are_those_of_importance_sampling():
     """The density is exp βQ over its integral, the mean of exp βQ/π_λ of the choices that the policy drew."""
     likelihood, q = drawn_likelihood(), np.random.default_rng(1).normal(size=(2, 4))
-    means = np.asarray(jax.vmap(LINEAR.policy.network)(likelihood.drawn.states - LINEAR.tasks.goal))
+    policy: Any = LINEAR.policy
+    means = np.asarray(jax.vmap(policy.network)(likelihood.drawn.states - LINEAR.tasks.goal))
     drawn = np.asarray(likelihood.drawn.choices)[..., 0]
     integral = np.mean(np.exp(BETA * q[:, 1:]) / norm.pdf(drawn, means, SPREAD), axis=1)
     np.testing.assert_allclose(likelihood.log_probs(jnp.asarray(q)), BETA * q[:, 0] - np.log(integral), rtol=1e-10)

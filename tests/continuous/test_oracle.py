@@ -79,7 +79,8 @@ def made(terms=("actions",), at=0.45) -> sc.ContinuousFit:
     policy, planner = agents()
     agent = sc.Agent(Drift(vector(at), vector(NOISE)), policy, SOFT)
     problem = FitProblem(agent, demonstrations(), ss.Normal(0.0, VARIANCE), planner, sc.Schedule(2), terms, "score")
-    numbers = vector(GRADIENT), vector(ERROR), np.array([[COVARIANCE]]), vector(0.1), 0.1, 0.1, 0.0, 0.0, 0.0, 8
+    ones = np.ones(1)
+    numbers = GRADIENT * ones, ERROR * ones, np.array([[COVARIANCE]]), 0.1 * ones, 0.1, 0.1, 0.0, 0.0, 0.0, 8
     demos = demonstrations()
     state = planner.initialize(jax.random.key(0), agent, sc.task_at(demos.tasks, demos.task), demos.states)
     return sc.ContinuousFit(agent.dynamics, state, problem, (), sc.Verification(*numbers), True, "")

@@ -1,6 +1,7 @@
 """Scores by rollouts (eqs. 11 and 12) beside plain sums over the moves of the same rollouts, in a table."""
 
 from functools import cache
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -35,6 +36,11 @@ def critic() -> sc.Critic:
     layer = eqx.nn.Linear(count, 1, use_bias=False, key=jax.random.key(0))
     layer = eqx.tree_at(lambda layer: layer.weight, layer, jnp.append(jnp.asarray(VALUES), LEFT)[None])
     return sc.Critic(ScaledNetwork(layer, jnp.zeros(count), jnp.ones(count)), jnp.asarray(CENTER), jnp.asarray(SPREAD))
+
+
+def weight_of(module: Any) -> jax.Array:
+    """The weight of the only layer of a policy or critic."""
+    return module.network.network.weight
 
 
 def value(task, state, left):
@@ -156,7 +162,7 @@ def test_policy_gradient_is_a_sum_of_scores_of_choices():
             credit = counts * TASK.discount[own] ** move * beyond[index]
             expected[own, state] -= credit * (taken - PI[own, state]) / (2 * ACTIONS * 2 * HALF)
     found = eqx.filter_jit(policy_gradient)(AGENT.policy, critic(), halves()[1], jnp.asarray(PROBABILITIES))
-    np.testing.assert_allclose(found.network.network.weight.T, expected.reshape(-1, ACTIONS), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(weight_of(found).T, expected.reshape(-1, ACTIONS), rtol=1e-9, atol=1e-12)
 
 
 def test_fit_critic_steps_along_the_slope_of_each_minibatch():
@@ -174,7 +180,7 @@ def test_fit_critic_steps_along_the_slope_of_each_minibatch():
     for x, returns, acting in zip(*batches, strict=True):
         errors = np.where(acting, CENTER + SPREAD * x @ weight - returns, 0.0)
         weight = weight - 0.5 * rate * 2 * (errors @ x) / SPREAD / max(acting.sum(), 1)
-    np.testing.assert_allclose(found.network.network.weight[0], weight, rtol=1e-9)
+    np.testing.assert_allclose(weight_of(found)[0], weight, rtol=1e-9)
     assert (float(found.center), float(found.spread)) == (CENTER, SPREAD)
 
 
@@ -185,10 +191,10 @@ def test_update_first_step_has_the_rate_of_its_fraction():
     state = sc.PlannerState(AGENT.policy, critic(), *moments)
     rolled, pi = jax.tree.map(jnp.asarray, halves()[1]), jnp.asarray(PROBABILITIES)
     after, figures = eqx.filter_jit(planner.update)(state, AGENT.behavior, rolled, pi, jnp.asarray(0.25))
-    slope = policy_gradient(AGENT.policy, critic(), rolled, pi).network.network.weight
-    change = after.policy.network.network.weight - AGENT.policy.network.network.weight
+    slope = weight_of(policy_gradient(AGENT.policy, critic(), rolled, pi))
+    change = weight_of(after.policy) - weight_of(AGENT.policy)
     np.testing.assert_allclose(change, -0.25 * 0.02 * np.sign(slope) * (np.abs(slope) > 1e-9), atol=1e-6)
-    of_critic = np.abs(after.critic.network.network.weight - critic().network.network.weight)
+    of_critic = np.abs(weight_of(after.critic) - weight_of(critic()))
     assert of_critic.max() == pytest.approx(0.25 * 0.04, abs=1e-6)
     assert figures.gradient == pytest.approx(np.sqrt(np.sum(np.square(slope))))
     earned = np.sum(np.asarray(rolled.rewards) * TASK.discount[WHICH][:, None, None, None] ** np.arange(4), axis=-1)

@@ -18,7 +18,6 @@ from typing import Any, cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
 from sidestep._arguments import to_integers, to_mask
@@ -225,7 +224,8 @@ def _checked_states(
     if times is not None:
         message = "expected none without visited states and a deadline (`SolveOptions(horizon=…, deadline=True)`)"
         check(visited is not None and options.deadline, message, field="times")
-        times = to_jax(to_integers(times, "times", np.shape(visited), least=0, most=(options.horizon or 1) - 1))
+        shape = () if visited is None else visited.shape
+        times = to_jax(to_integers(times, "times", shape, least=0, most=(options.horizon or 1) - 1))
     return visited, times, None if region is None else to_jax(to_mask(region, "region", (*tasks, states)))
 
 
