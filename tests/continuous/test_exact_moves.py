@@ -77,11 +77,15 @@ BEYOND = SLOPES - np.sum(PI * SLOPES, axis=1, keepdims=True)
 SCORES = BETA * BEYOND[np.arange(7), CHOICES]
 
 
+def halves_of(problem: FitProblem, state: PlannerState, samples: int) -> Halves:
+    """Of all moves, which are one batch."""
+    (halves,) = gather_halves(problem, problem.agent.dynamics, state, samples, jax.random.key(2))
+    return halves
+
+
 @cache
 def finite_halves() -> Halves:
-    own, state = finite()
-    (halves,) = gather_halves(own, own.agent.dynamics, state, 4, jax.random.key(2))
-    return halves
+    return halves_of(*finite(), 4)
 
 
 def test_gather_halves_without_noise_has_the_score_of_each_move():
@@ -229,9 +233,7 @@ def vectors():
 
 @cache
 def vector_halves() -> Halves:
-    own, state = vectors()
-    (halves,) = gather_halves(own, own.agent.dynamics, state, 2, jax.random.key(2))
-    return halves
+    return halves_of(*vectors(), 2)
 
 
 def test_gather_halves_of_vectors_has_the_score_of_each_move():

@@ -196,7 +196,6 @@ def solve(
     """
     options = SolveOptions() if options is None else options
     check_instance(options, SolveOptions, "options")
-    check_instance(start, (base.WarmStart, type(None)), "start")
     check_model(model)
     check_task(task, model.graph)
     check_behavior(behavior, model.graph)
