@@ -1,14 +1,36 @@
-"""Minari datasets as others make them, by Minari alone."""
+"""Minari datasets as others make them, by Minari alone, and walks on a small grid to write."""
 
 import itertools
+import re
 import warnings
 
 import minari
 import numpy as np
-from gymnasium.spaces import Space
+import pytest
+from gymnasium.spaces import Discrete, Space
 from minari.data_collector import EpisodeBuffer
 
+from sidestep.errors import InputError
+from sidestep.io.minari.demonstrations import read_demonstrations
+from sidestep.tabular.demonstrations import Trajectory, gather
+from sidestep.tabular.grid import Grid
+from sidestep.tabular.tasks import reach
+
+SPACES = Discrete(6), Discrete(4)
+GRID = Grid.unknown(2, 3)
 _NUMBERS = itertools.count()
+
+
+def towards(*goals, discount=0.95):
+    """One walk from cell 0 along the top of the grid towards each goal, each of a task of its own."""
+    walks = [Trajectory(np.array([0, 1, 2]), np.array([3, 3]), index) for index in range(len(goals))]
+    return gather(walks, [reach(GRID, goal, discount=discount) for goal in goals])
+
+
+def refused(dataset, message, world=GRID, **arguments):
+    """Reading a dataset raises an error that begins with the dataset, and then says this."""
+    with pytest.raises(InputError, match=f"^{re.escape(str(dataset))}{message}"):
+        read_demonstrations(dataset, world, **arguments)
 
 
 def fresh(name: str = "others/seen") -> str:
