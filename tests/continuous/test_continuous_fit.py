@@ -1,10 +1,7 @@
-"""Fits in continuous worlds: closed forms, checkpoints, and refusals."""
+"""Fits in continuous worlds, beside closed forms and independent estimates."""
 
 from dataclasses import replace
-from functools import cache, partial
-from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,56 +11,29 @@ from scipy.stats import norm
 
 import sidestep as ss
 import sidestep.continuous as sc
-from helpers.families import Drift, Gusts, LaplaceDrift, vector
-from sidestep.continuous.fit import problem_fingerprint
-from sidestep.continuous.policies import ScaledNetwork
-
-# Agents on a line move by −1, 0 or 1 and look two moves ahead, to stay near 0: R(s, a) = −s². With the Boltzmann
-# average, Q(s, a) = −s² − γ E(s + a + θ + noise)², for every later choice.
-WAYS, DISCOUNT, NOISE, TRUTH, MOVES = np.array([-1.0, 0.0, 1.0]), 0.9, 0.4, 0.6, 90
-NEAR = sc.QuadraticTask(jnp.zeros(1), jnp.eye(1), jnp.zeros((1, 1)), jnp.asarray(DISCOUNT))
-BEHAVIOR, PRIOR = ss.Behavior(ss.BoltzmannAverage(), 1.5), ss.Normal(0.0, 50.0)
-POLICY = sc.finite_policy(jax.random.key(1), vector(*WAYS)[:, None], jnp.linspace(-2, 2, 9)[:, None], width=4, depth=1)
-PLANNER = sc.Planner(horizon=2, batch_size=8, samples=2, learning_rate=0.03, critic_width=4)
-INITIAL = Drift(vector(-0.5), vector(NOISE))
-
-
-def log_policy(drift, states):
-    """The log-probability of every action."""
-    values = -1.5 * DISCOUNT * (states[:, None] + WAYS + drift) ** 2
-    return values - np.log(np.exp(values).sum(axis=1, keepdims=True))
-
-
-def walks(seed=0):
-    """States, choices and next states of agents that know the drift."""
-    random = np.random.default_rng(seed)
-    states = random.uniform(-2, 2, MOVES)
-    choices = np.array([random.choice(3, p=np.exp(row)) for row in log_policy(TRUTH, states)])
-    return states, choices, states + WAYS[choices] + TRUTH + NOISE * random.normal(size=MOVES)
-
-
-def demonstrations_of(states, actions, following, tasks=(NEAR,)):
-    moves = zip(np.stack([states, following], axis=1).reshape(len(states), 2, -1), actions, strict=True)
-    return sc.gather_trajectories([ss.Trajectory(places, action[None], 0) for places, action in moves], tasks)
-
-
-STATES, CHOICES, FOLLOWING = walks()
-DEMONSTRATIONS = demonstrations_of(STATES, CHOICES, FOLLOWING)
-AGENTS = BEHAVIOR, POLICY, PLANNER
-learn = partial(sc.fit_dynamics, INITIAL, DEMONSTRATIONS, *AGENTS, prior=PRIOR)
-SHORT = sc.Schedule(iterations=16, policy_warmup=2, batch_size=30, learning_rate=0.2)
-LONG = sc.Schedule(iterations=100, policy_warmup=0, batch_size=MOVES, learning_rate=0.1)
-BOTH = partial(learn, estimator="pathwise", schedule=SHORT)
-
-
-@cache
-def fitted(seed=0):
-    """A short fit, and all its reports."""
-    reports = []
-    return BOTH(seed=seed, report=lambda *report: reports.append(report)), reports
-
-
-# Results
+from helpers.drift_fits import (
+    AGENTS,
+    BOTH,
+    CHOICES,
+    DEMONSTRATIONS,
+    FOLLOWING,
+    INITIAL,
+    LONG,
+    MOVES,
+    NOISE,
+    PLANNER,
+    POLICY,
+    PRIOR,
+    SHORT,
+    STATES,
+    TRUTH,
+    WAYS,
+    demonstrations_of,
+    fitted,
+    learn,
+    log_policy,
+)
+from helpers.families import Drift, LaplaceDrift, vector
 
 
 def test_fit_dynamics_transitions_alone_give_least_squares():
@@ -305,183 +275,3 @@ def test_fit_dynamics_repeats_by_seed():
     np.testing.assert_array_equal(again.dynamics.parameters, fitted()[0].dynamics.parameters)
     assert other.history[0] != again.history[0]
     assert not np.array_equal(other.dynamics.parameters, again.dynamics.parameters)
-
-
-# Checkpoints
-
-
-@pytest.fixture
-def checkpoint(tmp_path):
-    """A file that is saved at every iteration."""
-    return ss.Checkpoint(tmp_path / "fit.checkpoint", min_interval=0.0, max_fraction=1.0)
-
-
-def interrupted_at(iteration):
-    def report(progress: sc.FitProgress, _):
-        if progress.iteration == iteration:
-            raise KeyboardInterrupt
-
-    return report
-
-
-def leaves(result):
-    return [np.asarray(leaf) for leaf in jax.tree.leaves((result.dynamics, result.planner_state)) if eqx.is_array(leaf)]
-
-
-@pytest.mark.slow
-def test_fit_dynamics_resumed_is_identical(checkpoint):
-    whole = partial(BOTH, checkpoint=checkpoint)
-    expected = whole()
-    Path(checkpoint.path).unlink()
-    for iteration in (2, 3, 9):
-        with pytest.raises(KeyboardInterrupt):
-            whole(report=interrupted_at(iteration), resume=True)
-    went_on_at = []
-    result = whole(report=lambda progress, _: went_on_at.append(progress.iteration), resume=True)
-    assert went_on_at == list(range(10, 16))
-    assert result.history == expected.history
-    assert all(map(np.array_equal, leaves(result), leaves(expected)))
-    assert (result.message, result.converged) == (expected.message, expected.converged)
-
-
-def test_fit_dynamics_without_resume_starts_again(checkpoint):
-    iterations = []
-    with pytest.raises(KeyboardInterrupt):
-        BOTH(report=interrupted_at(2), checkpoint=checkpoint)
-    BOTH(report=lambda progress, _: iterations.append(progress.iteration), checkpoint=checkpoint)
-    assert iterations[0] == 0
-
-
-def test_fit_dynamics_checkpoint_of_another_problem_is_refused(checkpoint):
-    with pytest.raises(KeyboardInterrupt):
-        BOTH(report=interrupted_at(2), checkpoint=checkpoint)
-    before = Path(checkpoint.path).read_bytes()
-    others = {
-        "seed": partial(BOTH, seed=1),
-        "prior": partial(BOTH, prior=ss.Normal(0.0, 2.0)),
-        "terms": partial(BOTH, terms=("actions",)),
-        "data": partial(sc.fit_dynamics, INITIAL, demonstrations_of(*walks(1)), *AGENTS, schedule=SHORT),
-    }
-    for other in others.values():
-        with pytest.raises(ss.InputError, match="belongs to a fit of other data or with other settings"):
-            other(checkpoint=checkpoint, resume=True)
-    assert Path(checkpoint.path).read_bytes() == before
-    with pytest.raises(ss.InputError, match="'resume': expected a checkpoint to resume from"):
-        BOTH(resume=True)
-
-
-def test_problem_fingerprint_ignores_addresses_of_functions():
-    def policy(offset):
-        network = eqx.nn.MLP(1, 3, 4, 1, activation=lambda x: jnp.tanh(x + offset), key=jax.random.key(0))
-        return sc.FinitePolicy(ScaledNetwork(network, jnp.zeros(1), jnp.ones(1)), POLICY.actions)
-
-    first, second = policy(0), policy(0)
-    assert str(jax.tree.leaves(first)) != str(jax.tree.leaves(second))
-    assert problem_fingerprint(first) == problem_fingerprint(second)
-
-
-# Refusals
-
-
-def changed(**fields):
-    """The demonstrations with other arrays in them."""
-    names, values = fields.keys(), tuple(fields.values())
-    return eqx.tree_at(lambda demos: [getattr(demos, name) for name in names], DEMONSTRATIONS, list(values))
-
-
-def with_tasks(task):
-    return changed(tasks=sc.batch_tasks([task]))
-
-
-VECTORS = changed(actions=vector(*WAYS[CHOICES])[:, None])
-GAUSSIAN = sc.gaussian_policy(jax.random.key(0), 1, vector(0, 1)[:, None], width=2, depth=1)
-NAN = DEMONSTRATIONS.states.at[4, 0].set(jnp.nan)
-
-
-class Broken(Drift):
-    """A faulty family: the density of a step back is 0 or NaN."""
-
-    density: float = eqx.field(static=True, default=jnp.nan)
-
-    def log_prob(self, state, action, next_state):
-        return jnp.where(action[0] < 0, self.density, super().log_prob(state, action, next_state))
-
-
-def broken(density):
-    return Broken(vector(0), vector(NOISE), density)
-
-
-WALL = sc.Walls(low=jnp.ones((1, 1)), high=jnp.ones((1, 1)))
-FIRST_BACK = int(np.argmax(CHOICES == 0)) + 1
-
-
-@pytest.mark.parametrize(("change", "match"), [
-    ({"demonstrations": changed(actions=jnp.asarray(CHOICES).at[5].set(3))},
-     "trajectory 6, field 'actions': expected the index of an action, 0…2, found 3"),
-    ({"demonstrations": changed(actions=jnp.asarray(CHOICES).at[0].set(-1))},
-     "trajectory 1, field 'actions': expected the index of an action, 0…2, found -1"),
-    ({"demonstrations": VECTORS}, r"'actions': expected the index of an action, 0…2, found \["),
-    ({"demonstrations": changed(actions=vector(*CHOICES))}, r"expected the index of an action, 0…2, found \d\.0"),
-    ({"policy": GAUSSIAN}, "'actions': expected vectors, as the policy's actions are"),
-    ({"policy": GAUSSIAN, "demonstrations": changed(actions=jnp.zeros((MOVES, 2)))},
-     r"'actions': expected vectors of 1, found shape \(2,\)"),
-    ({"demonstrations": changed(states=NAN)}, "states, row 5: expected finite numbers"),
-    ({"demonstrations": changed(task=DEMONSTRATIONS.task.at[1].set(1))}, r"'task': expected tasks in 0…0"),
-    ({"demonstrations": with_tasks(eqx.tree_at(lambda task: task.discount, NEAR, jnp.asarray(0.0)))},
-     "'discount': expected a finite number above 0 and at most 1, found 0"),
-    ({"dynamics": broken(jnp.nan)}, f"trajectory {FIRST_BACK}, field 'log_prob': .* found the logarithm nan"),
-    ({"dynamics": broken(-jnp.inf)}, "'log_prob': expected a density above 0 .* found the logarithm -inf"),
-    ({"dynamics": Drift(vector(jnp.nan), vector(NOISE))}, "'parameters': expected finite numbers"),
-    ({"dynamics": sc.ObstacleMotion(WALL, vector(-9), vector(9), vector(1))},
-     "'dynamics': expected parameters to learn, found none"),
-    ({"terms": ()}, r"'terms': expected one or both of .*, found \(\)"),
-    ({"demonstrations": changed(next_states=NAN)}, "'next_states': expected finite numbers"),
-    ({"demonstrations": with_tasks(sc.reach_region((0.0,), 9.0))}, "states, row 1: .*has not ended"),
-    ({"dynamics": sc.LinearGaussian(jnp.eye(2), jnp.ones((2, 1)), vector(1, 1))},
-     r"'demonstrations': expected states and actions that the dynamics can take, found shapes \(1,\)"),
-    ({"estimator": "pathwise", "dynamics": Gusts(vector(0, 0, 0))},
-     "'estimator': these dynamics jump, .*: expected 'score'"),
-    ({"estimator": "pathwise", "demonstrations": with_tasks(sc.reach_region((9.0,), 0.1))},
-     "'estimator': the returns of these tasks jump, .*: expected 'score'"),
-    *(({"policy": GAUSSIAN, "demonstrations": VECTORS, "behavior": ss.Behavior(backup)},
-       "'behavior': over vectors of actions the policy is known for the log-sum-exp only")
-      for backup in (ss.BoltzmannAverage(), ss.HardMax(), ss.Mellowmax())),
-])  # fmt: skip
-def test_fit_dynamics_bad_input_is_refused(change, match):
-    settings = {
-        "dynamics": INITIAL, "demonstrations": DEMONSTRATIONS, "behavior": BEHAVIOR, "policy": POLICY,
-        "planner": PLANNER, "schedule": SHORT,
-    }  # fmt: skip
-    with pytest.raises(ss.InputError, match=match):
-        sc.fit_dynamics(**{**settings, **change})
-
-
-@pytest.mark.parametrize(("setting", "expected"), [
-    ({"iterations": 1}, "at least 2, found 1"),
-    ({"policy_warmup": -1}, "at least 0, found -1"),
-    ({"batch_size": 0}, "at least 1, found 0"),
-    ({"policy_steps": 0}, "at least 1, found 0"),
-    ({"learning_rate": 0.0}, "a finite number above 0, found 0"),
-    ({"distance_tolerance": np.nan}, "a finite number above 0, found nan"),
-    ({"verification_samples": 7}, "at least 8, found 7"),
-    ({"policy_gap_tolerance": np.inf}, "a finite number above 0, found inf"),
-])  # fmt: skip
-def test_schedule_refuses_settings_out_of_range(setting, expected):
-    with pytest.raises(ss.InputError, match=f"'{next(iter(setting))}': expected {expected}"):
-        sc.Schedule(**setting)
-
-
-def test_fit_dynamics_no_moves_are_refused():
-    nothing = jax.tree.map(lambda leaf: leaf[:0], eqx.tree_at(lambda demos: demos.tasks, DEMONSTRATIONS, None))
-    nothing = eqx.tree_at(lambda demos: demos.tasks, nothing, DEMONSTRATIONS.tasks, is_leaf=lambda leaf: leaf is None)
-    for demos, count in ((nothing, 0), (DEMONSTRATIONS.with_only(np.zeros(MOVES, bool)), MOVES)):
-        with pytest.raises(ss.InputError, match=f"expected moves with a weight above 0, found none of {count}"):
-            sc.fit_dynamics(INITIAL, demos, *AGENTS)
-
-
-def test_fit_dynamics_infinite_rewards_raise():
-    demos = with_tasks(eqx.tree_at(lambda task: task.state_cost, NEAR, 1e308 * jnp.eye(1)))
-    with pytest.raises(
-        ss.NotConverged, match="ceased to be finite at step 0: the first rollouts have features or returns"
-    ):
-        sc.fit_dynamics(INITIAL, demos, *AGENTS, prior=PRIOR, terms=("actions",), schedule=LONG)
