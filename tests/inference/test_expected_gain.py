@@ -21,13 +21,17 @@ def test_expected_gain_of_lbfgs_becomes_that_of_the_quadratic():
         assert after is not None
         x, state = after
     value, gradient = loss(x)
-    assert optimizer.expected_gain(x, gradient, state) == pytest.approx(value, rel=0.3)
+    assert optimizer.expected_gain(x, gradient, state, 1e-9) == pytest.approx(value, rel=0.3)
+    # of a step that is too short, the change of the gradient is rounding
+    noise = np.array([1e-3, -2e-3])
+    assert optimizer.expected_gain(x + 1e-6, gradient + noise, state, 1e-6) == pytest.approx(value, rel=0.3)
+    assert optimizer.expected_gain(x, gradient, state, 1e3) == np.inf
 
 
 @pytest.mark.parametrize("optimizer", [Adam(), Rprop()])
 def test_expected_gain_without_curvature_is_infinite(optimizer):
     x = np.array([1.0, -2.0])
-    assert optimizer.expected_gain(x, loss(x)[1], optimizer.init(x)) == np.inf
+    assert optimizer.expected_gain(x, loss(x)[1], optimizer.init(x), 1e-9) == np.inf
 
 
 def test_expected_gain_of_lbfgs_where_the_loss_is_concave_is_infinite():
@@ -41,5 +45,5 @@ def test_expected_gain_of_lbfgs_where_the_loss_is_concave_is_infinite():
     after = optimizer.step(concave, x, *concave(x), optimizer.init(x))
     assert after is not None
     x, state = after
-    assert optimizer.expected_gain(x, concave(x)[1], state) == np.inf
-    assert optimizer.expected_gain(x, np.zeros(1), state) == 0
+    assert optimizer.expected_gain(x, concave(x)[1], state, 1e-9) == np.inf
+    assert optimizer.expected_gain(x, np.zeros(1), state, 1e-9) == 0

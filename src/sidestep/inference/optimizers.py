@@ -106,18 +106,19 @@ class Optimizer(eqx.Module):
         del state
         return float(np.abs(gradient).max(initial=0.0))
 
-    def expected_gain(self, x: Vector, gradient: Vector, state: Tree) -> float:
+    def expected_gain(self, x: Vector, gradient: Vector, state: Tree, resolution: float) -> float:
         """Return how much lower the least loss is than that at x, as far as the optimizer knows its curvature.
 
         Args:
             x: The present point.
             gradient: The gradient of the loss there.
             state: The present state.
+            resolution: The smallest change of the loss that is not rounding, in nats.
 
         Returns:
             Nats; infinite where the optimizer knows no curvature, or not that of a minimum.
         """
-        del x, gradient, state
+        del x, gradient, state, resolution
         return float("inf")
 
     def terminate(self, gradient: Vector, state: Tree) -> bool:
@@ -173,12 +174,25 @@ class LBFGS(Optimizer):
                 return best, updated
         return None
 
-    def expected_gain(self, x: Vector, gradient: Vector, state: Tree) -> float:
-        """Return the gain of a Newton step with the estimated curvature, half its first-order gain."""
-        direction, _ = _lbfgs_direction(self.memory_size, gradient, state, x)
-        gain = float(np.asarray(direction, np.float64) @ np.asarray(gradient, np.float64)) / 2
-        # negative where the loss is concave between the points of the memory
-        return gain if gain > 0 or not gradient.any() else float("inf")
+    def expected_gain(self, x: Vector, gradient: Vector, state: Tree, resolution: float) -> float:
+        """Return the gain of a Newton step with the curvature of the steps along which it is more than rounding."""
+        from scipy.optimize import LbfgsInvHessProduct
+
+        if not gradient.any():
+            return 0.0
+        _, memory = _lbfgs_direction(self.memory_size, gradient, state, x)
+        count, _, _, steps, changes, _ = (np.asarray(leaf, np.float64) for leaf in memory)
+        # oldest first, as the newest of them sets the scale
+        steps, changes = (np.roll(each, 1 - int(count), axis=0) for each in (steps, changes))
+        curvature = (steps * changes).sum(axis=1)
+        certain = np.flatnonzero(np.abs(curvature) > resolution)
+        if not certain.size or curvature[certain[-1]] < 0:
+            return float("inf")
+        convex = certain[curvature[certain] > 0]
+        steps, changes, curvature = steps[convex], changes[convex], curvature[convex]
+        scale = np.sqrt(curvature[-1] / (changes[-1] @ changes[-1]))
+        slope = scale * np.asarray(gradient, np.float64)
+        return float(slope @ LbfgsInvHessProduct(steps / scale, changes * scale).matvec(slope)) / 2
 
 
 class Adam(Optimizer):
