@@ -252,6 +252,19 @@ def test_method_of_weighted_walks_is_that_of_copies(method):
     np.testing.assert_allclose(weighted.log_policies(once), copies.log_policies(once), rtol=1e-3)
 
 
+@pytest.mark.parametrize("method", [visit_counts, constraint_inference])
+def test_method_leaves_out_walks_of_weight_zero(method):
+    shown, ends = [walk(0, 1, 2, 7), walk(0, 5, 6, 7)], [reach(BLANK, 7)]
+    weighted = method(BLANK, with_weights(gather(shown, ends), [1, 1, 1, 0, 0, 0]), MapConfig())
+    np.testing.assert_allclose(weighted.ranking, method(BLANK, gather(shown[:1], ends), MapConfig()).ranking)
+
+
+def test_visit_counts_counts_by_weights():
+    walks, ends = [walk(0, 1, 2, 7), walk(0, 5, 6, 7)], [reach(BLANK, 7)]
+    weighted = visit_counts(BLANK, with_weights(gather(walks, ends), [2, 2, 2, 1, 1, 1]), MapConfig())
+    assert [weighted.ranking.flat[cell] for cell in (0, 1, 5, 7, 8)] == [-3, -2, -1, -3, 0]
+
+
 def test_constraint_inference_of_agents_with_a_horizon_has_the_policies_of_their_horizon(walks):
     """Agents who look one move ahead see no wall that their goal is behind, so that none explains their walks."""
     learned = [constraint_inference(BLANK, walks, MapConfig(behavior=BehaviorConfig(horizon=far))) for far in (None, 1)]

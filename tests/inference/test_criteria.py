@@ -150,6 +150,13 @@ def test_information_criteria_of_weight_two_are_those_of_all_walks_twice(unit):
     np.testing.assert_allclose(weighted, joined, rtol=1e-6)
 
 
+def test_information_criteria_of_less_than_one_walk_raise():
+    shown = walks_of_coin()
+    tenth = eqx.tree_at(lambda each: each.weights, shown, shown.weights / 10)
+    with pytest.raises(InputError, match=r"'weights': expected weights that sum to at least one move, found 0\.8"):
+        ss.information_criteria(fit_of_coin(shown=tenth), unit="move")
+
+
 def test_weights_of_units_are_those_of_their_moves():
     weights = np.array([2.0, 2.0, 0.0, 0.5, 0.0, 1.0, 3.0])
     zeros = np.zeros(7)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sidestep.baselines.interface import ModelResult, check_arguments, model_result, with_normal_prior
+from sidestep.baselines.interface import ModelResult, check_arguments, model_result, visited_states, with_normal_prior
 from sidestep.evaluation.metrics import visit_ranking
 from sidestep.maps.config import MapConfig
 from sidestep.maps.fit import infer_map
@@ -68,6 +68,7 @@ def visit_counts(grid: Grid, demonstrations: Demonstrations, config: MapConfig) 
         The map, ranked by minus the number of visits.
     """
     check_arguments(grid, demonstrations, config)
-    ranking = visit_ranking(np.concatenate(demonstrations.paths()), grid)
+    states, weights = visited_states(demonstrations)
+    ranking = visit_ranking(states, grid, weights)
     blocked = np.clip(1 / (1 - ranking), None, _UNVISITED).ravel()
     return model_result(ObstacleGrid(grid, np.log(blocked) - np.log1p(-blocked)), demonstrations, config, ranking)

@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sidestep.baselines.interface import ModelResult, check_arguments, model_result
+from sidestep.baselines.interface import ModelResult, check_arguments, model_result, visited_states
 from sidestep.maps.config import MapConfig
 from sidestep.maps.fit import behavior_of, solve_options_of
 from sidestep.tabular.demonstrations import Demonstrations
@@ -45,7 +45,7 @@ def constraint_inference(grid: Grid, demonstrations: Demonstrations, config: Map
     """
     check_arguments(grid, demonstrations, config)
     visited = np.zeros(grid.size, dtype=bool)
-    visited[np.concatenate(demonstrations.paths())] = True
+    visited[visited_states(demonstrations)[0]] = True
     candidates = ~visited & (grid.known.ravel() == Cell.UNKNOWN)
     forbidden: list[int] = []
     visits, log_likelihood = _predict(grid, forbidden, demonstrations, config)

@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from sidestep.errors import check, check_instance
 from sidestep.evaluation.study import MethodResult
@@ -117,6 +117,21 @@ def with_normal_prior(config: MapConfig) -> MapConfig:
     return replace(config.completed(), prior=prior, posterior=replace(config.posterior, method="mode"))
 
 
+def visited_states(
+    demonstrations: Demonstrations,
+) -> tuple[Int[np.ndarray, " visits"], Float[np.ndarray, " visits"]]:
+    """Return the states of all visits, final states included, and the weight of each; visits of weight 0 are left out.
+
+    Args:
+        demonstrations: The walks. A final state has the weight of the last move.
+    """
+    states, weights = np.asarray(demonstrations.states), np.asarray(demonstrations.weights, np.float64)
+    last = np.append(demonstrations.first_moves()[1:], len(states)) - 1
+    visited = np.concatenate([states, np.asarray(demonstrations.next_states)[last]])
+    weights = np.concatenate([weights, weights[last]])
+    return visited[weights > 0], weights[weights > 0]
+
+
 def model_result(
     model: ObstacleGrid, demonstrations: Demonstrations, config: MapConfig, ranking: _Cells | None = None
 ) -> ModelResult:
@@ -129,6 +144,6 @@ def model_result(
         ranking: The ranking of cells; by default P(blocked).
     """
     ranking = np.asarray(model.blocked, dtype=np.float64) if ranking is None else ranking
-    planner = risk_averse_robot(model, np.concatenate(demonstrations.paths()))
+    planner = risk_averse_robot(model, visited_states(demonstrations)[0])
     behavior, options = behavior_of(config), SolveOptions(horizon=config.behavior.horizon)
     return ModelResult(model, config.reward, behavior, ranking, planner, converged=True, options=options)

@@ -212,19 +212,25 @@ def shortest_lengths(
     return shortest
 
 
-def visit_ranking(visited: Integer[np.ndarray, " moves"], grid: Grid) -> Float[np.ndarray, "rows columns"]:
+def visit_ranking(
+    visited: Integer[np.ndarray, " visits"], grid: Grid, weights: Float[np.ndarray, " visits"] | None = None
+) -> Float[np.ndarray, "rows columns"]:
     """Return minus the number of visits of each cell: a baseline that ranks rarely visited cells highest.
 
     Args:
         visited: The visited states.
         grid: The map.
+        weights: How often each visit counts; by default once.
 
     Raises:
-        InputError: For numbers that are not states of the map.
+        InputError: For numbers that are not states of the map, and weights that are not finite numbers from 0, one for
+            each visit.
     """
     check_instance(grid, Grid, "grid")
     states = to_states(visited, grid.size, "visited")
-    return -np.bincount(states, minlength=grid.size).reshape(grid.shape).astype(np.float64)
+    if weights is not None:
+        weights = to_finite(weights, "weights", (len(states),), least=0)
+    return -np.bincount(states, weights, minlength=grid.size).reshape(grid.shape).astype(np.float64)
 
 
 def _mean(values: np.ndarray) -> float | None:

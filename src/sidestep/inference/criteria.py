@@ -67,8 +67,9 @@ def information_criteria(fit: Fit[Any], *, unit: Unit = "walk", parameters: int 
         The criteria, with what they are made of.
 
     Raises:
-        InputError: For anything but a fit, for one that did not converge or with tempering, and, where k is not given,
-            for too many parameters, the fixed-policy gradient or a deadline.
+        InputError: For anything but a fit, for one that did not converge or with tempering, for weights that sum to
+            less than one walk or move, and, where k is not given, for too many parameters, the fixed-policy gradient or
+            a deadline.
 
     Example:
         >>> import sidestep as ss
@@ -92,6 +93,8 @@ def information_criteria(fit: Fit[Any], *, unit: Unit = "walk", parameters: int 
     check_count(parameters, 0, "parameters")
     each = pointwise_log_likelihood(fit)
     log_likelihood, n = float(each.of(unit).sum()), float(each.weights_of(unit).sum())
+    message = f"expected weights that sum to at least one {unit}, found {n:.3g}"
+    check(n >= 1, message, source="information_criteria", field="weights")
     aic, bic = (penalty * parameters - 2 * log_likelihood for penalty in (2.0, float(np.log(n))))
     return InformationCriteria(log_likelihood, parameters, n, aic, bic)
 

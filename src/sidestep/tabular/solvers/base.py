@@ -203,7 +203,7 @@ class Solver(eqx.Module):
     """A method that solves for values and adjoints by sweeps over the states.
 
     Attributes:
-        tolerance: The relative change at which to stop, above 0; by default 1e-10 in 64-bit and 1e-5 in 32-bit numbers.
+        tolerance: The relative change at which to stop, from 0; by default 1e-10 in 64-bit and 1e-5 in 32-bit numbers.
         max_sweeps: When to stop without convergence, at least 1.
 
     Example:

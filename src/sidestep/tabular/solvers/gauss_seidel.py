@@ -47,7 +47,7 @@ class GaussSeidel(base.Solver):
     """Gauss–Seidel value iteration in order of distance, on the CPU, for the backups in `KERNELS`.
 
     Attributes:
-        tolerance: The relative change at which to stop, above 0; by default 1e-10 in 64-bit and 1e-5 in 32-bit numbers.
+        tolerance: The relative change at which to stop, from 0; by default 1e-10 in 64-bit and 1e-5 in 32-bit numbers.
         max_sweeps: When to stop without convergence: the number of times that a state is solved on average, and of
             rounds over all states; at least 1.
         max_region_sweeps: The same for an adjoint where states were left out of the values' solve: residuals may go
