@@ -189,13 +189,15 @@ def measure(options: Options) -> Iterator[Record]:
 
 
 def fit(walks: ss.Demonstrations, seed: int, iterations: int = 0) -> sc.ContinuousFit[Wind, sc.FinitePolicy]:
-    """Return a fit with the default settings, but for a number of iterations that is not 0."""
-    features = sc.task_features(sc.task_at(walks.tasks, walks.task), walks.states)
-    policy = sc.finite_policy(jax.random.key(seed), jnp.asarray(ACTIONS), features)
+    """Return a fit with the default settings, JAX's 32-bit numbers too, but for iterations that are not 0."""
     few = {"iterations": iterations, "policy_warmup": iterations, "verification_samples": 8}
     schedule = sc.Schedule(**few) if iterations else sc.Schedule()
-    settings = {"prior": ss.Normal(0.0, VARIANCE), "terms": ("actions",), "schedule": schedule, "seed": seed}
-    return sc.fit_dynamics(wind(np.zeros(2)), walks, BEHAVIOR, policy, sc.Planner(HORIZON), **settings)
+    with jax.enable_x64(False):
+        walks, behavior = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), (walks, BEHAVIOR))
+        features = sc.task_features(sc.task_at(walks.tasks, walks.task), walks.states)
+        policy = sc.finite_policy(jax.random.key(seed), jnp.asarray(ACTIONS), features)
+        settings = {"prior": ss.Normal(0.0, VARIANCE), "terms": ("actions",), "schedule": schedule, "seed": seed}
+        return sc.fit_dynamics(wind(np.zeros(2)), walks, behavior, policy, sc.Planner(HORIZON), **settings)
 
 
 def show(records: Sequence[Record], _: Options) -> None:

@@ -1,6 +1,6 @@
 """Dynamics: samples have the stated density, and each family follows its equations."""
 
-from functools import cache
+from functools import cache, partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -16,6 +16,7 @@ import sidestep as ss
 import sidestep.continuous as sc
 from helpers import families
 from helpers.families import EVERY, GAUSSIAN, HIGH, LINEAR, LOW, NOISE, PLACE, STEP, TABLE, WALLS, vector
+from sidestep.continuous.control_variates import ValueFunction
 
 outcomes = eqx.filter_jit(lambda dynamics, state, action: dynamics.outcomes(state, action))
 log_prob = eqx.filter_jit(lambda dynamics, *move: dynamics.log_prob(*move))
@@ -60,9 +61,11 @@ def evaluate(name) -> Evaluation:
         log_probs = jax.vmap(dynamics.log_prob, (None, None, 0))(state, action, points)
         slope = jax.grad(lambda flat: at(flat).log_prob(state, action, samples[0]))(flat)
         beside = jax.vmap(lambda flat: at(flat).log_prob(state, action, samples[0]))(flat + steps)
-        variates = jax.vmap(dynamics.transition_control_variate, (None, None, None, 0))(curved, state, action, points)
-        linear = jax.vmap(dynamics.transition_control_variate, (None, None, None, 0))(straight, state, action, samples)
-        of_score = jax.grad(lambda flat, point: at(flat).score_control_variate(curved, state, action, point))
+        variate = partial(dynamics.transition_control_variate, key=keys[0])
+        variates = jax.vmap(variate, (None, None, None, 0))(ValueFunction(curved), state, action, points)
+        linear = jax.vmap(variate, (None, None, None, 0))(ValueFunction(straight), state, action, samples)
+        scored = ValueFunction(curved), state, action
+        of_score = jax.grad(lambda flat, point: at(flat).score_control_variate(*scored, point, keys[0]))
         of_scores = jax.vmap(of_score, (None, 0))(flat, points)
         moved = at(flat + 0.1).sample(keys[0], state, action) - samples[0]
         return samples, log_probs, slope, beside, variates, linear, of_scores, moved

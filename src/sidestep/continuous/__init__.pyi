@@ -2,6 +2,7 @@
 # ruff: noqa: I001
 
 # dynamics
+from .control_variates import ValueFunction as ValueFunction
 from .dynamics import (
     Dynamics as Dynamics,
     GaussianDynamics as GaussianDynamics,

@@ -14,19 +14,19 @@ With one outcome, s′ = m_θ(s, a) + noise · ε, and ε can be held fixed whil
 """
 
 import abc
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.stats import norm
 from jaxtyping import Array, Float, PRNGKeyArray, Scalar, Shaped
 
 from sidestep._arguments import to_finite, to_integers
 from sidestep._repr import short_repr
 from sidestep._typing import ArrayTree, FloatTree, Tree
+from sidestep.continuous.control_variates import Mixture, ValueFunction, score_variate, transition_variate
 from sidestep.errors import InputError, check, check_instance
 from sidestep.tabular.arrays import is_traced
 from sidestep.tabular.models import TransitionModel
@@ -38,7 +38,6 @@ Vector = Float[Array, " dimensions"]
 Rows = Float[Array, "dimensions _"]
 PerCandidate = Float[Array, "starts candidates"]
 PerSample = Float[Array, "starts candidates samples"]
-ValueFunction = Callable[[State], Real]
 
 _Family = TypeVar("_Family", bound="Dynamics")
 
@@ -84,7 +83,9 @@ class Dynamics(eqx.Module):
             next_state: The next state s′.
         """
 
-    def transition_control_variate(self, value: ValueFunction, state: State, action: Action, next_state: State) -> Real:
+    def transition_control_variate(
+        self, value: ValueFunction, state: State, action: Action, next_state: State, key: PRNGKeyArray
+    ) -> Real:
         """Return v(s′) − E[v(s′)] for a function v close to `value`; its mean over next states is 0.
 
         Rollouts subtract it to reduce their variance. It is 0 unless a family defines it.
@@ -94,10 +95,13 @@ class Dynamics(eqx.Module):
             state: The state s.
             action: The action a.
             next_state: The next state s′.
+            key: Draws everything random.
         """
         return jnp.zeros((), jnp.result_type(float))
 
-    def score_control_variate(self, value: ValueFunction, state: State, action: Action, next_state: State) -> Real:
+    def score_control_variate(
+        self, value: ValueFunction, state: State, action: Action, next_state: State, key: PRNGKeyArray
+    ) -> Real:
         """Return a number with the derivative ∇ ln T(s, a, s′) v(s′) − ∇E[v(s′)] by θ, which has mean 0.
 
         Score estimates subtract it; v is a function close to `value`. It is 0 unless a family defines it.
@@ -107,6 +111,7 @@ class Dynamics(eqx.Module):
             state: The state s.
             action: The action a.
             next_state: The next state s′.
+            key: Draws everything random.
         """
         return jnp.zeros((), jnp.result_type(float))
 
@@ -200,52 +205,40 @@ class GaussianDynamics(Dynamics):
         Returns:
             ln T_θ(s, a, s′), in nats.
         """
-        return jax.nn.logsumexp(self._joint_log_probs(self.outcomes(state, action), next_state))
+        return jax.nn.logsumexp(self._mixture(state, action).log_joint(next_state))
 
-    def transition_control_variate(self, value: ValueFunction, state: State, action: Action, next_state: State) -> Real:
-        """Return Σ_k P(k | s′) v_k(s′) − Σ_k p_k v(m_k), with v_k(s′) = v(m_k) + ∇v(m_k)·(s′ − m_k).
-
-        v_k is the value function made linear around outcome k; its mean is known.
+    def transition_control_variate(
+        self, value: ValueFunction, state: State, action: Action, next_state: State, key: PRNGKeyArray
+    ) -> Real:
+        """Return Σ_k P(k | s′) v_k(s′) − Σ_k p_k E[v_k], with v_k near v around outcome k (`control_variates`).
 
         Args:
             value: A function of the state, in units of reward.
             state: The state s.
             action: The action a.
             next_state: The next state s′.
+            key: Draws everything random.
         """
-        outcomes = self.outcomes(state, action)
-        values, linear, _ = _linear_values(value, outcomes, next_state)
-        posterior = jax.nn.softmax(self._joint_log_probs(outcomes, next_state))
-        return posterior @ linear - jnp.exp(outcomes.log_probabilities) @ values
+        return transition_variate(value, self._mixture(state, action), next_state, key)
 
-    def score_control_variate(self, value: ValueFunction, state: State, action: Action, next_state: State) -> Real:
-        """Return a number with the derivative Σ_k P(k | s′) ∇ ln (p_k N_k(s′)) v_k(s′) − ∇ Σ_k p_k v(m_k).
+    def score_control_variate(
+        self, value: ValueFunction, state: State, action: Action, next_state: State, key: PRNGKeyArray
+    ) -> Real:
+        """Return a number with the derivative Σ_k P(k | s′) ∇ ln (p_k N_k(s′)) v_k(s′) − ∇ Σ_k p_k E[v_k].
 
-        N_k(s′) is the density of outcome k, and v_k is linear as in `transition_control_variate`.
+        N_k(s′) is the density of outcome k, and v_k is near v around it, as in `transition_control_variate`.
 
         Args:
             value: A function of the state, in units of reward; gradients by θ do not pass through it.
             state: The state s.
             action: The action a.
             next_state: The next state s′.
+            key: Draws everything random.
         """
-        outcomes, fixed = self.outcomes(state, action), jax.lax.stop_gradient
-        values, linear, slopes = map(fixed, _linear_values(value, fixed(outcomes), next_state))
-        joint, probabilities = self._joint_log_probs(outcomes, next_state), jnp.exp(outcomes.log_probabilities)
-        expected = probabilities @ values + jnp.sum(fixed(probabilities)[:, None] * slopes * outcomes.means)
-        return fixed(jax.nn.softmax(joint) * linear) @ joint - expected
+        return score_variate(value, self._mixture(state, action), next_state, key)
 
-    def _joint_log_probs(self, outcomes: Outcomes, next_state: State) -> Float[Array, " outcomes"]:
-        """Return ln p_k + ln N(s′; m_k, diag(noise²))."""
-        return outcomes.log_probabilities + norm.logpdf(next_state, outcomes.means, self.noise).sum(axis=-1)
-
-
-def _linear_values(
-    value: ValueFunction, outcomes: Outcomes, next_state: Vector
-) -> tuple[Float[Array, " outcomes"], Float[Array, " outcomes"], Float[Array, "outcomes dimensions"]]:
-    """Return v(m_k) of every outcome, v(m_k) + ∇v(m_k)·(s′ − m_k), and ∇v(m_k)."""
-    values, slopes = jax.vmap(jax.value_and_grad(value))(outcomes.means)
-    return values, values + jnp.sum(slopes * (next_state - outcomes.means), axis=-1), slopes
+    def _mixture(self, state: Vector, action: Float[Array, " inputs"]) -> Mixture:
+        return Mixture(*self.outcomes(state, action), self.noise)
 
 
 class LinearGaussian(GaussianDynamics):
@@ -360,7 +353,9 @@ class TableDynamics(Dynamics):
         possible = probability > 0
         return jnp.where(possible, jnp.log(jnp.where(possible, probability, 1.0)), -jnp.inf)
 
-    def transition_control_variate(self, value: ValueFunction, state: State, action: Action, next_state: State) -> Real:
+    def transition_control_variate(
+        self, value: ValueFunction, state: State, action: Action, next_state: State, key: PRNGKeyArray
+    ) -> Real:
         """Return v(s′) − E[v(s′)] of the value function itself.
 
         Args:
@@ -368,11 +363,14 @@ class TableDynamics(Dynamics):
             state: The state s.
             action: The action a.
             next_state: The next state s′.
+            key: Draws everything random.
         """
         successors = self.model.graph.successors[state, action].astype(next_state.dtype)
         return value(next_state) - self._probabilities(state, action) @ jax.vmap(value)(successors)
 
-    def score_control_variate(self, value: ValueFunction, state: State, action: Action, next_state: State) -> Real:
+    def score_control_variate(
+        self, value: ValueFunction, state: State, action: Action, next_state: State, key: PRNGKeyArray
+    ) -> Real:
         """Return a number with the derivative ∇ ln T(s, a, s′) v(s′) − ∇E[v(s′)] of the value function itself.
 
         Args:
@@ -380,6 +378,7 @@ class TableDynamics(Dynamics):
             state: The state s.
             action: The action a.
             next_state: The next state s′.
+            key: Draws everything random.
         """
         successors = self.model.graph.successors[state, action].astype(next_state.dtype)
         log_prob = self.log_prob(state, action, next_state)

@@ -13,8 +13,8 @@ It differs from eq. 11 as printed in four points.
 3. z_i is added back, because the credit of a transition is the effect of its own draw.
 4. The part of this effect that the critic knows has its mean in place of its draw: with the credit that the critic
    expects of s_{i+1}, u = R_i + γ V_w(s_{i+1}) − E_i, the number ∇ ln T_θ u − ∇E[u], which has mean 0, is subtracted
-   (`score_control_variate`). With an exact critic no noise of this draw is left. Gu et al. (2017) have the same control
-   variate for draws of actions.
+   (`score_control_variate`). With an exact critic hardly any noise of this draw is left. Gu et al. (2017) have the same
+   control variate for draws of actions.
 
 The **pathwise** estimate (Kingma and Welling 2014) is the derivative of Q̂_0 along the path, with the random numbers
 held fixed. It requires reparameterized dynamics and smooth rewards; its variance is then far lower on stable systems.
@@ -35,7 +35,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from sidestep._typing import FloatTree
-from sidestep.continuous.dynamics import Dynamics, PerCandidate, PerSample, ValueFunction
+from sidestep.continuous.control_variates import ValueFunction
+from sidestep.continuous.dynamics import Dynamics, PerCandidate, PerSample
 from sidestep.continuous.policies import Agent, Critic, Starts
 from sidestep.continuous.rollouts import Rollout, q_estimates, sample_rollouts
 from sidestep.continuous.tasks import ContinuousTask
@@ -59,12 +60,14 @@ def with_control_variates(agent: Agent[Any], rollouts: Rollout, critic: Critic) 
         The same rollouts with other `transition_control_variates`.
     """
 
-    def variate(task: ContinuousTask, state: Array, choice: Array, following: Array, left: Array) -> Array:
+    def variate(task: ContinuousTask, state: Array, choice: Array, following: Array, seed: Array, left: Array) -> Array:
         action, value = agent.policy.action(choice), _value_after(task, critic, left, one_move)
-        return task.discount * agent.dynamics.transition_control_variate(value, state, action, following)
+        return task.discount * agent.dynamics.transition_control_variate(
+            value, state, action, following, jax.random.key(seed)
+        )
 
-    one_move = 1 / rollouts.acting.shape[-1]
-    variates = rollouts.at_every_move(variate, rollouts.choices, rollouts.following, rollouts.fraction_left)
+    one_move, moves = 1 / rollouts.acting.shape[-1], (rollouts.choices, rollouts.following, rollouts.seeds)
+    variates = rollouts.at_every_move(variate, *moves, rollouts.fraction_left)
     variates = jax.lax.stop_gradient(jnp.where(rollouts.acting, variates, 0.0)).astype(rollouts.rewards.dtype)
     return eqx.tree_at(lambda rollouts: rollouts.transition_control_variates, rollouts, variates)
 
@@ -72,12 +75,13 @@ def with_control_variates(agent: Agent[Any], rollouts: Rollout, critic: Critic) 
 def _value_after(task: ContinuousTask, critic: Critic, left: Array, one_move: float) -> ValueFunction:
     """Return the value of a next state by a critic, when the fraction `left` of the horizon is left before the move."""
 
-    def value(state: Array) -> Array:
-        after = left - one_move
-        going_on = jnp.where(after > 0.5 * one_move, critic(task.features(state), after), 0.0)
-        return jnp.where(task.terminal(state), task.terminal_reward(state), going_on)
+    after = left - one_move
 
-    return value
+    def going_on(state: Array) -> Array:
+        return jnp.where(after > 0.5 * one_move, critic(task.features(state), after), 0.0)
+
+    ends = None if type(task).terminal is ContinuousTask.terminal else task.terminal
+    return ValueFunction(going_on, ends, task.terminal_reward)
 
 
 def score_surrogate(agent: Agent[Any], rollouts: Rollout, critic: Critic | None = None) -> Float[Array, "*batch"]:
@@ -130,6 +134,7 @@ def _score_terms(agent: Agent[Any], rollouts: Rollout, critic: Critic | None) ->
         state: Array,
         choice: Array,
         following: Array,
+        seed: Array,
         left: Array,
         power: Array,
         credit: Array,
@@ -140,10 +145,11 @@ def _score_terms(agent: Agent[Any], rollouts: Rollout, critic: Critic | None) ->
         if critic is None:
             return total
         value = _value_after(task, critic, left, one_move)
-        return total - power * dynamics.score_control_variate(lambda at: known + task.discount * value(at), *move)
+        effect = value.times(task.discount, plus=known)
+        return total - power * dynamics.score_control_variate(effect, *move, jax.random.key(seed))
 
     fixed = jax.lax.stop_gradient((rollouts.fraction_left, powers, credit, known))
-    return term, (rollouts.choices, rollouts.following, *fixed)
+    return term, (rollouts.choices, rollouts.following, rollouts.seeds, *fixed)
 
 
 def pathwise_surrogate(agent: Agent[Any], rollouts: Rollout, critic: Critic | None = None) -> Float[Array, "*batch"]:

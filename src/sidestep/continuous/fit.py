@@ -267,11 +267,5 @@ def _followed(problem: FitProblem, parameters: FloatTree, state: Tree, key: PRNG
     """Return the policy and its critic after a twelfth of the iterations at one θ, with rates that fall."""
     steps = max(1, problem.schedule.iterations // 12)
     for step, fraction in enumerate(np.geomspace(_FOLLOWING_RATE, _FOLLOWING_RATE / 10, steps).astype(np.float32)):
-        state = _follow(problem, parameters, state, jax.random.fold_in(key, step), jnp.asarray(fraction))
+        state = problem.improve_policy(parameters, state, jax.random.fold_in(key, step), jnp.asarray(fraction))
     return state
-
-
-@eqx.filter_jit
-def _follow(problem: FitProblem, parameters: FloatTree, state: Tree, key: PRNGKeyArray, fraction: Array) -> Tree:
-    """Make one step of the policy and its critic."""
-    return problem.improve_policy(parameters, state, key, fraction)

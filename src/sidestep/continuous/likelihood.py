@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from sidestep._typing import Tree
 from sidestep.continuous.dynamics import Dynamics, PerCandidate, check_finite
 from sidestep.continuous.estimators import Estimator, check_estimator, value_gradient
-from sidestep.continuous.planner import Planner, PlannerState, PlanProgress, check_starts
+from sidestep.continuous.planner import Planner, PlannerState, PlanProgress, check_starts, plan_step
 from sidestep.continuous.policies import Agent, FinitePolicy, GaussianPolicy, Policy, Starts
 from sidestep.continuous.rollouts import q_estimates
 from sidestep.continuous.tasks import check_tasks, task_at, task_features
@@ -181,8 +181,10 @@ class FitProblem(eqx.Module):
         Returns:
             The next state of policy and critic.
         """
-        batch_key, rollout_key = jax.random.split(key)
-        return self._action_terms(parameters, state, self._draw_moves(batch_key), rollout_key, fraction)[0]
+        demos, agent = self.demonstrations, self.agent
+        agent = replace(agent, dynamics=agent.dynamics.with_parameters(parameters))
+        planner = replace(self.planner, batch_size=self.schedule.batch_size)
+        return plan_step(planner, agent, task_at(demos.tasks, demos.task), demos.states, state, key, fraction)[0]
 
     def objective_gradient(
         self, parameters: Tree, state: PlannerState[Any], key: PRNGKeyArray, fraction: Float[Array, ""]

@@ -303,10 +303,11 @@ def plan_policy(
     check_finite(agent.dynamics.parameters)
     check_count(steps, 1, "steps")
     initial_key, key = jax.random.split(jax.random.key(seed))
-    each_task, history = task_at(tasks, task), []
+    each_task, whole, history = task_at(tasks, task), jnp.asarray(1.0, jnp.float32), []
     state = warm_start or planner.initialize(initial_key, agent, each_task, states)
     for iteration in range(steps):
-        state, progress = _plan_step(planner, agent, each_task, states, state, jax.random.fold_in(key, iteration))
+        step_key = jax.random.fold_in(key, iteration)
+        state, progress = plan_step(planner, agent, each_task, states, state, step_key, whole)
         history.append(PlanProgress(iteration, *(float(number) for number in progress[1:])))
         if not np.isfinite(history[-1]).all():
             reason = "dynamics or rewards that return NaN, or too high a rate"
@@ -338,16 +339,37 @@ def _fresh_moments(planner: Planner, policy: Policy, critic: Critic) -> tuple[Tr
 
 
 @eqx.filter_jit
-def _plan_step(
-    planner: Planner, agent: Agent[Any], tasks: ContinuousTask, states: States, state: PlannerState, key: PRNGKeyArray
-) -> tuple[PlannerState, PlanProgress]:
+def plan_step(
+    planner: Planner,
+    agent: Agent[Any],
+    tasks: ContinuousTask,
+    states: States,
+    state: PlannerState[Any],
+    key: PRNGKeyArray,
+    fraction: Real,
+) -> tuple[PlannerState[Any], PlanProgress]:
+    """Make one step of a policy and its critic by rollouts from a batch of starts.
+
+    Args:
+        planner: Settings of rollouts and optimizers.
+        agent: T_θ, the backup and β.
+        tasks: The task of each start.
+        states: The starts.
+        state: The policy, its critic and their optimizers.
+        key: Draws everything random.
+        fraction: Of the learning rates of policy and critic, in (0, 1].
+
+    Returns:
+        The next state, and the figures of the policy before the step.
+    """
     start_key, choice_key, rollout_key = jax.random.split(key, 3)
     count, agent = len(states), replace(agent, policy=state.policy)
     batch = jax.random.choice(start_key, count, (planner.batch_size,), replace=count < planner.batch_size)
     tasks, states = task_at(tasks, batch), states[batch]
     choices, probabilities = planner.candidate_actions(choice_key, agent.policy, tasks, states)
     rollouts = sample_rollouts(agent, Starts(tasks, states, choices), rollout_key, planner.horizon, planner.samples)
-    return planner.update(state, agent.behavior, with_control_variates(agent, rollouts, state.critic), probabilities)
+    rollouts = with_control_variates(agent, rollouts, state.critic)
+    return planner.update(state, agent.behavior, rollouts, probabilities, fraction)
 
 
 def check_starts(

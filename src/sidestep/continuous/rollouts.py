@@ -26,7 +26,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, Shaped
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, Shaped, UInt32
 
 from sidestep._arguments import to_key
 from sidestep.continuous.dynamics import State
@@ -47,6 +47,7 @@ class Rollout(eqx.Module):
         bonuses: The bonuses b_0…b_{τ−1}, 0 after the end.
         transition_control_variates: The control variates z_0…z_{τ−1}, 0 until they are set.
         acting: Whether an action was taken in s_i.
+        seeds: The seed of each move for what its control variates draw.
     """
 
     task: ContinuousTask
@@ -56,6 +57,7 @@ class Rollout(eqx.Module):
     bonuses: Float[Array, "*batch moves"]
     transition_control_variates: Float[Array, "*batch moves"]
     acting: Bool[Array, "*batch moves"]
+    seeds: UInt32[Array, "*batch moves"]
 
     @property
     def leaving(self) -> Shaped[Array, "..."]:
@@ -176,7 +178,7 @@ def sample_rollout(
 
     def move(carry: tuple, step: tuple[Array, PRNGKeyArray]) -> tuple[tuple, tuple]:
         (state, over), (index, key) = carry, step
-        transition_key, choice_key = jax.random.split(key)
+        transition_key, choice_key, variate_key = jax.random.split(key, 3)
         terminal, features = task.terminal(state), task.features(state)
         acting = ~(over | terminal)
         # the policy is evaluated once for the draw, its probability and the entropy
@@ -187,15 +189,22 @@ def sample_rollout(
         expected = agent.temperature * (policy.log_prob(features, chosen) + entropy)
         bonus = jnp.where(acting, behavior.backup.bonus(entropy, actions, behavior.beta) - expected, 0.0)
         following = agent.dynamics.sample(transition_key, state, action)
-        return (following, over | terminal), (state, chosen, reward, bonus, acting)
+        return (following, over | terminal), (
+            state,
+            chosen,
+            reward,
+            bonus,
+            acting,
+            jax.random.bits(variate_key, dtype=jnp.uint32),
+        )
 
     steps = jnp.arange(horizon), jax.random.split(key, horizon)
     (end, over), moves = jax.lax.scan(move, (state, jnp.zeros((), bool)), steps)
-    states, choices, rewards, bonuses, acting = moves
+    states, choices, rewards, bonuses, acting, seeds = moves
     final = jnp.where(task.terminal(end) & ~over, task.terminal_reward(end), 0.0).astype(rewards.dtype)
     states, rewards = jnp.concatenate([states, end[None]]), jnp.append(rewards, final)
     bonuses = bonuses.astype(rewards.dtype)
-    return Rollout(task, states, choices, rewards, bonuses, jnp.zeros_like(bonuses), acting)
+    return Rollout(task, states, choices, rewards, bonuses, jnp.zeros_like(bonuses), acting, seeds)
 
 
 def sample_rollouts(agent: Agent[Any], starts: Starts, key: PRNGKeyArray, horizon: int, samples: int) -> Rollout:
