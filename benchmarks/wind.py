@@ -7,6 +7,7 @@ reference imports neither rollouts nor lattices of the library. It has V on a gr
 the walks. The mean of V over next states is a convolution with a normal density, exact by Fourier transforms. The
 objective's gradient and Hessian follow by automatic differentiation, its maximum by Newton's method. The error of the
 grid is seen by `--side`: with twice the points the maximum moves by less than a fiftieth of a standard deviation.
+The fits have JAX's default 32-bit numbers, the walks and the reference have 64.
 
 Records: `seed`, `wind` (learned), `exact` (the maximum), `deviation` (the standard deviations of the exact posterior,
 normal around its maximum), `distance` (of the learned wind from the maximum, the largest component in such standard
@@ -189,7 +190,7 @@ def measure(options: Options) -> Iterator[Record]:
 
 
 def fit(walks: ss.Demonstrations, seed: int, iterations: int = 0) -> sc.ContinuousFit[Wind, sc.FinitePolicy]:
-    """Return a fit with the default settings, JAX's 32-bit numbers too, but for iterations that are not 0."""
+    """Return a fit in 32-bit numbers with the default settings; iterations other than 0 make a short one."""
     few = {"iterations": iterations, "policy_warmup": iterations, "verification_samples": 8}
     schedule = sc.Schedule(**few) if iterations else sc.Schedule()
     with jax.enable_x64(False):

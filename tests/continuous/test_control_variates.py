@@ -6,78 +6,133 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from sidestep.continuous.control_variates import Mixture, ValueFunction, score_variate, transition_variate
+import sidestep as ss
+import sidestep.continuous as sc
+from helpers.families import Drift, vector
+from sidestep.continuous.control_variates import Mixture, score_variate, transition_variate
 
-EDGE, PAYMENT, NOISE = 0.3, 2.0, 0.5
+EDGE, NOISE = 0.3, 0.5
 POINTS = np.linspace(-5.0, 5.0, 2001)
-JUMP = ValueFunction(lambda s: -1.0 + 0.5 * s[0], lambda s: s[0] > EDGE, lambda s: PAYMENT + 0.0 * s[0])
-MEANS = {"goes on": [0.1], "has ended": [0.4], "either": [0.1, 0.4]}
-KEYS = jax.random.split(jax.random.key(0), 4000)
+NEXT = jnp.asarray(POINTS)[:, None]
+JUMP = sc.ValueFunction(lambda s: -1.0 + 0.5 * s[0], lambda s: s[0] > EDGE, lambda s: 2.0 + jnp.sin(s[0]))
+VALUE = np.where(POINTS > EDGE, 2 + np.sin(POINTS), -1 + 0.5 * POINTS)
+KEYS = jax.random.split(jax.random.key(0), 20_000)
+OUTCOMES = pytest.mark.parametrize(("means", "chances"), [((0.1,), (1.0,)), ((0.4,), (1.0,)), ((0.1, 0.4), (0.3, 0.7))])
 
 
-def mixture(shift=0.0, means=(0.1,)) -> Mixture:
-    """Outcomes that are equally probable; all means are shifted."""
-    return Mixture(jnp.full(len(means), -jnp.log(len(means))), jnp.asarray(means)[:, None] + shift, jnp.full(1, NOISE))
+def mixture(means, chances, shift=0.0) -> Mixture:
+    """The outcomes; `shift` moves all means, and the logit of the last outcome."""
+    logits = jnp.log(jnp.asarray(chances)) + shift * (jnp.arange(len(means)) == len(means) - 1)
+    return Mixture(jax.nn.log_softmax(logits), jnp.asarray(means)[:, None] + shift, jnp.full(1, NOISE))
 
 
-def density(means):
-    return np.mean([norm.pdf(POINTS, mean, NOISE) for mean in means], axis=0) * (POINTS[1] - POINTS[0])
+def masses(means):
+    """The probability of each point, for each outcome."""
+    return np.stack([norm.pdf(POINTS, mean, NOISE) for mean in means]) * (POINTS[1] - POINTS[0])
 
 
 def over_keys(function):
-    """The mean over keys at every point, and the standard deviation over keys: all of one jitted program."""
-    values = np.asarray(jax.jit(lambda: jax.vmap(lambda s: jax.vmap(lambda key: function(s, key))(KEYS[:200]))(NEXT))())
-    return values.mean(axis=1), values.std(axis=1)
+    """The mean over keys at every point, the standard deviation, and the error of the mean.
 
-
-NEXT = jnp.asarray(POINTS)[:, None]
+    What keys change is the same at every point.
+    """
+    at_points = jax.jit(jax.vmap(lambda state: function(state, KEYS[0])))(NEXT)
+    of_keys = np.asarray(jax.jit(jax.vmap(lambda key: function(NEXT[0], key)))(KEYS))
+    spread = of_keys.std()
+    return np.asarray(at_points) + of_keys.mean() - of_keys[0], spread, spread / np.sqrt(len(KEYS))
 
 
 def test_value_function_of_a_state_where_the_task_ends_is_that_at_the_end():
-    assert [float(JUMP(jnp.full(1, s))) for s in (0.2, 0.4)] == pytest.approx([-0.9, PAYMENT])
-    shifted = JUMP.times(jnp.asarray(0.5), plus=jnp.asarray(3.0))
-    assert [float(shifted(jnp.full(1, s))) for s in (0.2, 0.4)] == pytest.approx([2.55, 4.0])
-    assert float(ValueFunction(lambda s: s[0])(jnp.full(1, 7.0))) == 7
+    assert [float(JUMP(jnp.full(1, s))) for s in (0.2, 0.4)] == pytest.approx([-0.9, 2 + np.sin(0.4)])
+    half = JUMP.times(jnp.asarray(0.5), plus=jnp.asarray(3.0))
+    assert [float(half(jnp.full(1, s))) for s in (0.2, 0.4)] == pytest.approx([2.55, 4 + np.sin(0.4) / 2])
+    assert float(sc.ValueFunction(lambda s: s[0])(jnp.full(1, 7.0))) == 7
 
 
-@pytest.mark.parametrize("name", MEANS)
-def test_transition_variate_of_a_jump_has_mean_0_and_leaves_no_noise_of_the_value(name):
-    """The value is linear but for its jump: with one outcome, the rest is the noise of 16 draws of the jump."""
-    means = MEANS[name]
-    each, spread = over_keys(lambda s, key: transition_variate(JUMP, mixture(means=means), s, key))
-    masses, value = density(means), np.where(POINTS > EDGE, PAYMENT, -1 + 0.5 * POINTS)
-    error = spread.mean() / np.sqrt(200)  # all points share the keys
-    assert masses @ each == pytest.approx(0, abs=4 * error)
-    if len(means) == 1:
-        np.testing.assert_allclose(each, value - masses @ value, atol=4 * error)
-    jump = PAYMENT - (-1 + 0.5 * POINTS)
-    mean = np.asarray(means)[:, None]
-    weights = np.stack([norm.pdf(POINTS, one, NOISE) for one in means]) * (POINTS[1] - POINTS[0])
-    differs = np.where((POINTS > EDGE) == (mean > EDGE), 0.0, np.sign(POINTS - EDGE) * jump)
-    variances = (weights * differs**2).sum(axis=1) - (weights * differs).sum(axis=1) ** 2
-    expected = np.sqrt(variances.sum() / 16) / len(means)
-    assert spread[0] == pytest.approx(expected, rel=0.25)
+@OUTCOMES
+def test_transition_variate_of_a_jump_has_mean_0_and_the_noise_of_16_draws(means, chances):
+    each, spread, error = over_keys(lambda s, key: transition_variate(JUMP, mixture(means, chances), s, key))
+    of_outcomes = masses(means)
+    total = np.asarray(chances) @ of_outcomes
+    assert total @ each == pytest.approx(0, abs=4 * error)
+    if len(means) == 1:  # the value is linear but for its end: nothing else is left
+        np.testing.assert_allclose(each, VALUE - total @ VALUE, atol=4 * error)
+    ended = [mean > EDGE for mean in means]
+    tangents = [
+        2 + np.sin(mean) + np.cos(mean) * (POINTS - mean) if over else -1 + 0.5 * POINTS
+        for mean, over in zip(means, ended, strict=True)
+    ]
+    jumps = VALUE - np.stack(tangents)
+    variances = (of_outcomes * jumps**2).sum(axis=1) - (of_outcomes * jumps).sum(axis=1) ** 2
+    assert spread == pytest.approx(np.sqrt(np.asarray(chances) ** 2 @ variances / 16), rel=0.05)
 
 
-@pytest.mark.parametrize("name", MEANS)
-def test_score_variate_of_a_jump_has_mean_0_and_the_score_of_the_value(name):
-    means = MEANS[name]
-
+@OUTCOMES
+def test_score_variate_of_a_jump_has_mean_0_and_the_score_of_the_value(means, chances):
     def slope(state, key):
-        return jax.grad(lambda shift: score_variate(JUMP, mixture(shift, means), state, key))(0.0)
+        return jax.grad(lambda shift: score_variate(JUMP, mixture(means, chances, shift), state, key))(0.0)
 
-    each, spread = over_keys(slope)
-    masses, error = density(means), spread.mean() / np.sqrt(200)
-    assert masses @ each == pytest.approx(0, abs=4 * error)
+    each, _, error = over_keys(slope)
+    total = np.asarray(chances) @ masses(means)
+    assert total @ each == pytest.approx(0, abs=4 * error)
     if len(means) == 1:
-        value = np.where(POINTS > EDGE, PAYMENT, -1 + 0.5 * POINTS)
         score = (POINTS - means[0]) / NOISE**2
-        np.testing.assert_allclose(each, score * value - masses @ (score * value), atol=4 * error)
+        np.testing.assert_allclose(each, score * VALUE - total @ (score * VALUE), atol=4 * error)
 
 
 def test_variates_of_a_value_without_an_end_draw_nothing():
-    smooth = ValueFunction(lambda s: jnp.sin(s[0]))
+    smooth, one = sc.ValueFunction(lambda s: jnp.sin(s[0])), mixture((0.1,), (1.0,))
     for function in (transition_variate, score_variate):
-        first, second = (float(function(smooth, mixture(), jnp.full(1, 0.7), key)) for key in KEYS[:2])
+        first, second = (float(function(smooth, one, jnp.full(1, 0.7), key)) for key in KEYS[:2])
         assert first == second
-    assert float(transition_variate(smooth, mixture(), jnp.full(1, 0.7), KEYS[0])) == pytest.approx(0.6 * np.cos(0.1))
+    assert float(transition_variate(smooth, one, jnp.full(1, 0.7), KEYS[0])) == pytest.approx(0.6 * np.cos(0.1))
+
+
+# Estimates by rollouts: s′ = s + a + θ + noise · ε, to a goal around 0; two moves, and a critic that is wrong
+
+WAYS, SPEED, START, DISCOUNT, RADIUS = jnp.array([[-1.0], [1.0]]), 0.2, 1.3, 0.9, 0.6
+GOAL = sc.ReachTask((0.0,), RADIUS, step_cost=1.0, goal_reward=2.0, discount=DISCOUNT)
+EXAMPLES = jax.vmap(GOAL.features)(jnp.linspace(-2, 2, 9)[:, None])
+POLICY = sc.finite_policy(jax.random.key(3), WAYS, EXAMPLES, width=4)
+
+
+def arrives(places, speed):
+    """The probability that a move from these places, the action added, ends at the goal."""
+    above, below = (RADIUS - places - speed) / NOISE, (-RADIUS - places - speed) / NOISE
+    return jax.scipy.stats.norm.cdf(above) - jax.scipy.stats.norm.cdf(below)
+
+
+def action_values(speed):
+    """Q of both actions of agents that look two moves ahead, by a sum over next states."""
+    step = POINTS[1] - POINTS[0]
+    later = jnp.exp(jax.vmap(lambda s: POLICY.log_probs(GOAL.features(s)))(NEXT))
+    after = jnp.sum(later * (-1 + DISCOUNT * 2 * arrives(NEXT + WAYS.T, speed)), axis=1)
+    worth = jnp.where(jnp.abs(NEXT[:, 0]) <= RADIUS, 0.0, after)
+    means = START + WAYS[:, 0, None] + speed
+    goes_on = jax.scipy.stats.norm.pdf(POINTS, means, NOISE) @ worth * step
+    return -1 + DISCOUNT * (2 * arrives(START + WAYS[:, 0], speed) + goes_on)
+
+
+def test_value_gradient_near_a_goal_with_a_wrong_critic_is_that_of_a_sum():
+    agent = sc.Agent(Drift(vector(SPEED), vector(NOISE)), POLICY, ss.Behavior(ss.HardMax()))
+    critic = sc.make_critic(jax.random.key(5), EXAMPLES, jnp.ones(9), jnp.ones(9))
+    starts = sc.Starts(sc.batch_tasks([GOAL]), jnp.full((1, 1), START), jnp.arange(2)[None])
+
+    @jax.jit
+    @jax.vmap
+    def estimate(key):
+        size = {"horizon": 2, "samples": 500}
+        gradient, rollouts = sc.value_gradient(agent, starts, key, jnp.ones_like, critic=critic, **size)
+        return gradient, sc.q_estimates(rollouts)[0, :, :, 0].mean(axis=-1), rollouts.seeds
+
+    gradient, q, seeds = map(np.asarray, estimate(jax.random.split(jax.random.key(1), 40)))
+    for found, expected in (
+        (q, np.asarray(action_values(SPEED))),
+        (gradient, jax.jacfwd(action_values)(SPEED).sum()),
+    ):
+        error = found.std(axis=0) / np.sqrt(len(found))
+        assert (np.abs(found.mean(axis=0) - expected) <= 4 * error + 1e-3).all()
+        assert error.max() < 0.05
+    # candidates share their draws, other moves have draws of their own
+    assert (seeds[:, :, 0] == seeds[:, :, 1]).all()
+    assert len(np.unique(seeds)) > 0.999 * seeds[:, :, 0].size

@@ -150,11 +150,13 @@ def test_information_criteria_of_weight_two_are_those_of_all_walks_twice(unit):
     np.testing.assert_allclose(weighted, joined, rtol=1e-6)
 
 
-def test_information_criteria_of_less_than_one_walk_raise():
+@pytest.mark.parametrize(("unit", "found"), [("walk", "0.3"), ("move", "0.8")])
+def test_information_criteria_of_less_than_one_observation_raise(unit, found):
     shown = walks_of_coin()
     tenth = eqx.tree_at(lambda each: each.weights, shown, shown.weights / 10)
-    with pytest.raises(InputError, match=r"'weights': expected weights that sum to at least one move, found 0\.8"):
-        ss.information_criteria(fit_of_coin(shown=tenth), unit="move")
+    message = rf"'weights': expected weights that sum to at least one {unit}, found {found}"
+    with pytest.raises(InputError, match=message):
+        ss.information_criteria(fit_of_coin(shown=tenth), unit=unit)
 
 
 def test_weights_of_units_are_those_of_their_moves():

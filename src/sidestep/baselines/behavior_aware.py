@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sidestep.baselines.interface import ModelResult, check_arguments, model_result, visited_states, with_normal_prior
+from sidestep.baselines.interface import ModelResult, check_arguments, model_result, with_normal_prior
 from sidestep.evaluation.metrics import visit_ranking
 from sidestep.maps.config import MapConfig
 from sidestep.maps.fit import infer_map
@@ -57,7 +57,9 @@ def transitions_only(grid: Grid, demonstrations: Demonstrations, config: MapConf
 
 
 def visit_counts(grid: Grid, demonstrations: Demonstrations, config: MapConfig) -> ModelResult:
-    """Count visits: P(blocked) = 1/(n + 1) of a cell with n > 0 visits and .98 of one without.
+    """Count visits: P(blocked) = 1/(n + 1) of a cell with n > 0 visits, and at most .98.
+
+    A visit counts by the weight of its move, the last one by that of the move that led to it.
 
     Args:
         grid: The known map.
@@ -68,7 +70,9 @@ def visit_counts(grid: Grid, demonstrations: Demonstrations, config: MapConfig) 
         The map, ranked by minus the number of visits.
     """
     check_arguments(grid, demonstrations, config)
-    states, weights = visited_states(demonstrations)
-    ranking = visit_ranking(states, grid, weights)
+    last = np.append(demonstrations.first_moves()[1:], len(demonstrations)) - 1
+    states, ends = np.asarray(demonstrations.states), np.asarray(demonstrations.next_states)[last]
+    weights = np.asarray(demonstrations.weights, np.float64)
+    ranking = visit_ranking(np.append(states, ends), grid, np.append(weights, weights[last]))
     blocked = np.clip(1 / (1 - ranking), None, _UNVISITED).ravel()
     return model_result(ObstacleGrid(grid, np.log(blocked) - np.log1p(-blocked)), demonstrations, config, ranking)

@@ -45,7 +45,7 @@ def constraint_inference(grid: Grid, demonstrations: Demonstrations, config: Map
     """
     check_arguments(grid, demonstrations, config)
     visited = np.zeros(grid.size, dtype=bool)
-    visited[visited_states(demonstrations)[0]] = True
+    visited[visited_states(demonstrations)] = True
     candidates = ~visited & (grid.known.ravel() == Cell.UNKNOWN)
     forbidden: list[int] = []
     visits, log_likelihood = _predict(grid, forbidden, demonstrations, config)

@@ -117,19 +117,14 @@ def with_normal_prior(config: MapConfig) -> MapConfig:
     return replace(config.completed(), prior=prior, posterior=replace(config.posterior, method="mode"))
 
 
-def visited_states(
-    demonstrations: Demonstrations,
-) -> tuple[Int[np.ndarray, " visits"], Float[np.ndarray, " visits"]]:
-    """Return the states of all visits, final states included, and the weight of each; visits of weight 0 are left out.
+def visited_states(demonstrations: Demonstrations) -> Int[np.ndarray, " visited"]:
+    """Return the distinct states that moves of a weight above 0 leave or lead to.
 
     Args:
-        demonstrations: The walks. A final state has the weight of the last move.
+        demonstrations: The walks.
     """
-    states, weights = np.asarray(demonstrations.states), np.asarray(demonstrations.weights, np.float64)
-    last = np.append(demonstrations.first_moves()[1:], len(states)) - 1
-    visited = np.concatenate([states, np.asarray(demonstrations.next_states)[last]])
-    weights = np.concatenate([weights, weights[last]])
-    return visited[weights > 0], weights[weights > 0]
+    counts = np.asarray(demonstrations.weights) > 0
+    return np.unique([np.asarray(demonstrations.states)[counts], np.asarray(demonstrations.next_states)[counts]])
 
 
 def model_result(
@@ -144,6 +139,6 @@ def model_result(
         ranking: The ranking of cells; by default P(blocked).
     """
     ranking = np.asarray(model.blocked, dtype=np.float64) if ranking is None else ranking
-    planner = risk_averse_robot(model, visited_states(demonstrations)[0])
+    planner = risk_averse_robot(model, visited_states(demonstrations))
     behavior, options = behavior_of(config), SolveOptions(horizon=config.behavior.horizon)
     return ModelResult(model, config.reward, behavior, ranking, planner, converged=True, options=options)

@@ -21,20 +21,25 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, Scalar, Shaped
+from jaxtyping import Array, Float, PRNGKeyArray, Shaped
 
 from sidestep._arguments import to_finite, to_integers
 from sidestep._repr import short_repr
 from sidestep._typing import ArrayTree, FloatTree, Tree
-from sidestep.continuous.control_variates import Mixture, ValueFunction, score_variate, transition_variate
+from sidestep.continuous.control_variates import (
+    Mixture,
+    Real,
+    State,
+    ValueFunction,
+    Vector,
+    score_variate,
+    transition_variate,
+)
 from sidestep.errors import InputError, check, check_instance
 from sidestep.tabular.arrays import is_traced
 from sidestep.tabular.models import TransitionModel
 
-State = Shaped[Array, "*state"]
 Action = Shaped[Array, "*action"]
-Real = Float[Scalar, ""]
-Vector = Float[Array, " dimensions"]
 Rows = Float[Array, "dimensions _"]
 PerCandidate = Float[Array, "starts candidates"]
 PerSample = Float[Array, "starts candidates samples"]
@@ -91,7 +96,7 @@ class Dynamics(eqx.Module):
         Rollouts subtract it to reduce their variance. It is 0 unless a family defines it.
 
         Args:
-            value: A function of the state, in units of reward.
+            value: The value of next states, in units of reward.
             state: The state s.
             action: The action a.
             next_state: The next state s′.
@@ -107,7 +112,7 @@ class Dynamics(eqx.Module):
         Score estimates subtract it; v is a function close to `value`. It is 0 unless a family defines it.
 
         Args:
-            value: A function of the state, in units of reward; gradients by θ do not pass through it.
+            value: The value of next states, in units of reward; gradients by θ do not pass through it.
             state: The state s.
             action: The action a.
             next_state: The next state s′.
@@ -213,7 +218,7 @@ class GaussianDynamics(Dynamics):
         """Return Σ_k P(k | s′) v_k(s′) − Σ_k p_k E[v_k], with v_k near v around outcome k (`control_variates`).
 
         Args:
-            value: A function of the state, in units of reward.
+            value: The value of next states, in units of reward.
             state: The state s.
             action: The action a.
             next_state: The next state s′.
@@ -229,7 +234,7 @@ class GaussianDynamics(Dynamics):
         N_k(s′) is the density of outcome k, and v_k is near v around it, as in `transition_control_variate`.
 
         Args:
-            value: A function of the state, in units of reward; gradients by θ do not pass through it.
+            value: The value of next states, in units of reward; gradients by θ do not pass through it.
             state: The state s.
             action: The action a.
             next_state: The next state s′.
@@ -359,7 +364,7 @@ class TableDynamics(Dynamics):
         """Return v(s′) − E[v(s′)] of the value function itself.
 
         Args:
-            value: A function of the state, in units of reward.
+            value: The value of next states, in units of reward.
             state: The state s.
             action: The action a.
             next_state: The next state s′.
@@ -374,7 +379,7 @@ class TableDynamics(Dynamics):
         """Return a number with the derivative ∇ ln T(s, a, s′) v(s′) − ∇E[v(s′)] of the value function itself.
 
         Args:
-            value: A function of the state, in units of reward; gradients by θ do not pass through it.
+            value: The value of next states, in units of reward; gradients by θ do not pass through it.
             state: The state s.
             action: The action a.
             next_state: The next state s′.

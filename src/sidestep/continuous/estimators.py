@@ -80,8 +80,10 @@ def _value_after(task: ContinuousTask, critic: Critic, left: Array, one_move: fl
     def going_on(state: Array) -> Array:
         return jnp.where(after > 0.5 * one_move, critic(task.features(state), after), 0.0)
 
-    ends = None if type(task).terminal is ContinuousTask.terminal else task.terminal
-    return ValueFunction(going_on, ends, task.terminal_reward)
+    def at_end(state: Array) -> Array:
+        return jnp.asarray(task.terminal_reward(state), jnp.result_type(left))  # whole numbers have no gradient
+
+    return ValueFunction(going_on, task.terminal if task.can_end else None, at_end)
 
 
 def score_surrogate(agent: Agent[Any], rollouts: Rollout, critic: Critic | None = None) -> Float[Array, "*batch"]:

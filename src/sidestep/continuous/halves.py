@@ -157,12 +157,11 @@ def _ends(agent: Agent[Any], rollouts: Rollout, critic: Critic, key: PRNGKeyArra
 
     def end(task: ContinuousTask, state: Array, acting: Array, key: PRNGKeyArray) -> tuple[Real, Real]:
         going_on = task.discount**moves * (acting & ~task.terminal(state))
-        ending = type(task).terminal is not ContinuousTask.terminal
         if moves == 1:
             value = returns_to_go(sample_rollout(agent, task, key, state, 1))[0]
         else:  # the critic is fitted from the second move on
             value = critic(task.features(state), jnp.asarray(1 - 1 / moves))
-        return going_on * value, going_on * ending
+        return going_on * value, going_on * task.can_end
 
     of_samples = jax.vmap(end)
     of_candidates = jax.vmap(of_samples, (0, 0, 0, None))

@@ -183,7 +183,7 @@ class FitProblem(eqx.Module):
         """
         demos, agent = self.demonstrations, self.agent
         agent = replace(agent, dynamics=agent.dynamics.with_parameters(parameters))
-        planner = replace(self.planner, batch_size=self.schedule.batch_size)
+        planner = replace(self.planner, batch_size=min(self.schedule.batch_size, len(demos)))
         return plan_step(planner, agent, task_at(demos.tasks, demos.task), demos.states, state, key, fraction)[0]
 
     def objective_gradient(

@@ -127,7 +127,7 @@ def _rows(
 
 def _deal(acting: Array, task: ContinuousTask) -> _Chunks | None:
     """Return the chunks, or None where they would save nothing: for few moves, and tasks that never end."""
-    if acting.size <= _FEW or type(task).terminal is ContinuousTask.terminal:
+    if acting.size <= _FEW or not task.can_end:
         return None
     flat, size = acting.ravel(), acting.size
     total = flat.sum()

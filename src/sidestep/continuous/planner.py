@@ -303,7 +303,8 @@ def plan_policy(
     check_finite(agent.dynamics.parameters)
     check_count(steps, 1, "steps")
     initial_key, key = jax.random.split(jax.random.key(seed))
-    each_task, whole, history = task_at(tasks, task), jnp.asarray(1.0, jnp.float32), []
+    each_task, history = task_at(tasks, task), []
+    whole = jnp.asarray(1.0, jnp.float32)  # the type that fits pass, so that both use one compiled program
     state = warm_start or planner.initialize(initial_key, agent, each_task, states)
     for iteration in range(steps):
         step_key = jax.random.fold_in(key, iteration)

@@ -83,6 +83,11 @@ class ContinuousTask(eqx.Module):
         """
         return jnp.zeros((), bool)
 
+    @property
+    def can_end(self) -> bool:
+        """Whether there are terminal states: whether the task has a `terminal` of its own."""
+        return type(self).terminal is not ContinuousTask.terminal
+
 
 class ReachTask(ContinuousTask):
     """The task of coming within a radius of a goal.

@@ -94,7 +94,7 @@ def information_criteria(fit: Fit[Any], *, unit: Unit = "walk", parameters: int 
     each = pointwise_log_likelihood(fit)
     log_likelihood, n = float(each.of(unit).sum()), float(each.weights_of(unit).sum())
     message = f"expected weights that sum to at least one {unit}, found {n:.3g}"
-    check(n >= 1, message, source="information_criteria", field="weights")
+    check(n >= 1 - 1e-6, message, source="information_criteria", field="weights")
     aic, bic = (penalty * parameters - 2 * log_likelihood for penalty in (2.0, float(np.log(n))))
     return InformationCriteria(log_likelihood, parameters, n, aic, bic)
 

@@ -188,15 +188,12 @@ def maximize(
         elif evaluator.tighten():
             history.pop()
         else:
-            measure, limit = (
-                optimizer.measure.format(optimizer.convergence(point.gradient, state)),
-                evaluator.resolution,
-            )
+            measure = optimizer.measure.format(optimizer.convergence(point.gradient, state))
+            limit = min(evaluator.resolution, _MOST_LEFT)
             if status is None and not evaluator.nearest.usable:
                 status = Status.NO_VALUES
-            left = optimizer.expected_gain(x, point.gradient, state, limit)
-            limit = min(limit, _MOST_LEFT)
-            if status is None and left <= limit:
+            known = x, point.gradient, state, evaluator.resolution
+            if status is None and optimizer.expected_gain(*known) <= limit:
                 status = Status.CONVERGED
                 measure += f", and no more than {limit:.1g} nats are left to gain, the precision of the objective"
                 measure += "" if x.dtype == np.float64 else " in 32-bit numbers (see jax_enable_x64)"

@@ -175,14 +175,18 @@ class LBFGS(Optimizer):
         return None
 
     def expected_gain(self, x: Vector, gradient: Vector, state: Tree, resolution: float) -> float:
-        """Return the gain of a Newton step with the curvature of the steps along which it is more than rounding."""
+        """Return the gain of a Newton step with the curvature of the steps along which it is more than rounding.
+
+        Older steps along which the loss is concave are left out. The gain is infinite where no step is left, and where
+        the loss is concave along the last one.
+        """
         from scipy.optimize import LbfgsInvHessProduct
 
         if not gradient.any():
             return 0.0
         _, memory = _lbfgs_direction(self.memory_size, gradient, state, x)
         count, _, _, steps, changes, _ = (np.asarray(leaf, np.float64) for leaf in memory)
-        # oldest first, as the newest of them sets the scale
+        # oldest first, as the newest of those that are kept sets the scale
         steps, changes = (np.roll(each, 1 - int(count), axis=0) for each in (steps, changes))
         curvature = (steps * changes).sum(axis=1)
         certain = np.flatnonzero(np.abs(curvature) > resolution)
