@@ -95,7 +95,7 @@ def test_difference_of_other_folds_raises():
 
 @pytest.mark.parametrize(("options", "message"), [
     ({"folds": 1}, "field 'folds': expected at least 2, found 1"),
-    ({"folds": 7}, "field 'folds': expected at most 6, the number of groups, found 7"),
+    ({"folds": 7}, "field 'folds': expected at most 6, the number of groups with moves that count, found 7"),
     ({"folds": 3, "groups": np.array([0, 0, 0, 1, 1, 1])}, "expected at most 2, the number of groups"),
     ({"groups": np.zeros(5, int)}, r"field 'groups': expected a whole number for each of the 6 trajectories"),
 ])  # fmt: skip

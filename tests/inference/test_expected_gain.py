@@ -21,8 +21,7 @@ def test_expected_gain_of_lbfgs_becomes_that_of_the_quadratic():
         assert after is not None
         x, state = after
     value, gradient = loss(x)
-    assert optimizer.expected_gain(x, gradient, state, 1e-9) == pytest.approx(value, rel=0.3)
-    assert optimizer.expected_gain(x, gradient, state, 1e3) == np.inf
+    assert optimizer.expected_gain(x, gradient, state) == pytest.approx(value, rel=0.3)
 
 
 def test_expected_gain_of_lbfgs_after_a_step_of_rounding_leaves_it_out():
@@ -34,13 +33,12 @@ def test_expected_gain_of_lbfgs_after_a_step_of_rounding_leaves_it_out():
     _, state = optimizer.step(loss, x, *loss(x), state) or (x, state)  # the memory goes up to x
     value, gradient = loss(x)
     noisy = x + 1e-6, gradient + np.array([1e-4, -2e-4]), state
-    assert optimizer.expected_gain(*noisy, 1e-8) == pytest.approx(value, rel=0.3)
-    assert optimizer.expected_gain(*noisy, 0.0) == np.inf
+    assert optimizer.expected_gain(*noisy) == pytest.approx(value, rel=0.3)
 
 
 def test_expected_gain_of_lbfgs_with_a_full_memory_is_that_of_its_last_steps():
     """Two updates of the inverse Hessian (BFGS) beside, from the scale of the last step."""
-    curvature, optimizer = np.array([1.0, 3.0, 10.0, 30.0, 100.0]), LBFGS(memory_size=2)
+    curvature, optimizer = np.array([1.0, 1.05, 1.1, 1.15, 1.2]), LBFGS(memory_size=2)
 
     def many(x, *, approximate=False):
         del approximate
@@ -48,7 +46,7 @@ def test_expected_gain_of_lbfgs_with_a_full_memory_is_that_of_its_last_steps():
 
     places = [np.full(5, 2.0)]
     state = optimizer.init(places[0])
-    for _ in range(5):
+    for _ in range(4):
         x, state = optimizer.step(many, places[-1], *many(places[-1]), state) or (places[-1], state)
         places.append(x)
     steps = np.diff(places, axis=0)[-2:]
@@ -58,14 +56,16 @@ def test_expected_gain_of_lbfgs_with_a_full_memory_is_that_of_its_last_steps():
         project = np.eye(5) - np.outer(step, change) / (step @ change)
         inverse = project @ inverse @ project.T + np.outer(step, step) / (step @ change)
     gradient = curvature * places[-1]
+    lengths = np.linalg.norm(steps, axis=1)
+    assert ((steps * changes).sum(axis=1) > 4 * np.linalg.norm(gradient) * lengths).all()  # both steps count
     expected = gradient @ inverse @ gradient / 2
-    assert optimizer.expected_gain(places[-1], gradient, state, 0.0) == pytest.approx(expected, rel=1e-6)
+    assert optimizer.expected_gain(places[-1], gradient, state) == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize("optimizer", [Adam(), Rprop()])
 def test_expected_gain_without_curvature_is_infinite(optimizer):
     x = np.array([1.0, -2.0])
-    assert optimizer.expected_gain(x, loss(x)[1], optimizer.init(x), 1e-9) == np.inf
+    assert optimizer.expected_gain(x, loss(x)[1], optimizer.init(x)) == np.inf
 
 
 def test_expected_gain_of_lbfgs_where_the_loss_is_concave_is_infinite():
@@ -79,5 +79,5 @@ def test_expected_gain_of_lbfgs_where_the_loss_is_concave_is_infinite():
     after = optimizer.step(concave, x, *concave(x), optimizer.init(x))
     assert after is not None
     x, state = after
-    assert optimizer.expected_gain(x, concave(x)[1], state, 1e-9) == np.inf
-    assert optimizer.expected_gain(x, np.zeros(1), state, 1e-9) == 0
+    assert optimizer.expected_gain(x, concave(x)[1], state) == np.inf
+    assert optimizer.expected_gain(x, np.zeros(1), state) == 0

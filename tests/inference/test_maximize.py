@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import sidestep as ss
 from helpers.walled import BLANK, walks
 from sidestep.inference.batching import BatchPlan
 from sidestep.inference.fit import fit
@@ -108,6 +109,34 @@ def test_fit_in_32_bits_converges_to_their_precision_and_says_so():
     exact = fit(ObstacleGrid(BLANK, -2.0), walks(BLANK), Behavior(BoltzmannAverage()))
     assert exact.converged
     assert abs(result.final.objective - exact.final.objective) < 1e-4 * abs(exact.final.objective)
+
+
+@pytest.mark.parametrize("seed", [0, 3, 10])
+def test_fit_in_32_bits_of_thousands_of_moves_converges_to_the_right_place(seed):
+    """Two actions that end or stay, and the learned β: the last steps of the optimizer are rounding."""
+    random = np.random.default_rng(seed + 100)
+    chances, ends = random.dirichlet(np.ones(2), (2, 2)), np.array([False, True])
+    reward = -random.uniform(0.5, 1.5, (2, 2)) * ~ends[:, None]
+    with jax.enable_x64(False):
+        made = ss.from_dense(chances, reward, discount=0.95, terminal=ends)
+        agents = ss.Behavior(BoltzmannAverage(), 2.0)
+        shown = ss.simulate(jax.random.key(seed), made.model, [made.task], [np.zeros(3000, int)], agents)
+        start = ss.TabularModel(made.model.graph, jnp.zeros(made.model.probabilities().shape))
+        learn = ss.behavior_model(agents, ["beta"])
+        result = fit(start, ss.gather(shown, [made.task]), learn, prior=Normal(0.0, 10.0))
+    assert result.converged, result.message
+    np.testing.assert_allclose(result.model.probabilities()[0], chances[0], atol=0.03)
+    assert float(result.behavior.behavior_of().beta) == pytest.approx(2.0, abs=0.3)
+
+
+def test_fit_of_a_choice_that_may_lead_into_a_trap_is_refused_with_the_move():
+    """State 0 leads to the goal 1 or to the trap 2; at γ = 1 the action that may lead there is worth −∞."""
+    model = ss.tabular_model(ss.graph([[[1, 1], [1, 2]], [[1, 1]] * 2, [[2, 2]] * 2]), np.full((3, 2, 2), 0.5))
+    task = ss.task(np.array([[-1.0, -1.0], [0.0, 0.0], [-1.0, -1.0]]), 1.0, [False, True, False])
+    walks = [ss.Trajectory(np.array([0, 1]), np.array([action]), 0) for action in (0, 1)]
+    message = r"trajectory 2: agents choose action 1 in state 0 with probability 0: its value is −∞.* a lapse"
+    with pytest.raises(ss.InputError, match=message):
+        fit(model, ss.gather(walks, [task]), Behavior(BoltzmannAverage(), 2.0))
 
 
 def test_fit_in_32_bits_with_many_nats_to_gain_is_not_converged():

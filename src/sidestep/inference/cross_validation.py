@@ -155,7 +155,9 @@ def _folds(
     some = np.unique(counted)
     distinct, which = np.unique(own[some], return_inverse=True)
     check(
-        len(distinct) >= folds, f"expected at most {len(distinct)}, the number of groups, found {folds}", field="folds"
+        len(distinct) >= folds,
+        f"expected at most {len(distinct)}, the number of groups with moves that count, found {folds}",
+        field="folds",
     )
     of_group = np.zeros(len(distinct), np.int64)
     for at, (_, chosen) in enumerate(KFold(folds, shuffle=True, random_state=seed).split(distinct)):

@@ -22,7 +22,7 @@ from sidestep.inference.batching import LARGE_MAP
 from sidestep.inference.checkpoints import Saver
 from sidestep.inference.objective import Contribution, Objective, Parameters, Problem, SolveSummary, joined
 from sidestep.inference.optimizers import Optimizer, Vector
-from sidestep.tabular.likelihood import choices_of, transition_probabilities
+from sidestep.tabular.likelihood import choices_of, log_policies, transition_probabilities
 from sidestep.tabular.solvers.base import WarmStart
 
 
@@ -192,8 +192,7 @@ def maximize(
             limit = min(evaluator.resolution, _MOST_LEFT)
             if status is None and not evaluator.nearest.usable:
                 status = Status.NO_VALUES
-            known = x, point.gradient, state, evaluator.resolution
-            if status is None and optimizer.expected_gain(*known) <= limit:
+            if status is None and optimizer.expected_gain(x, point.gradient, state) <= limit:
                 status = Status.CONVERGED
                 measure += f", and no more than {limit:.1g} nats are left to gain, the precision of the objective"
                 measure += "" if x.dtype == np.float64 else " in 32-bit numbers (see jax_enable_x64)"
@@ -351,6 +350,15 @@ def _check_start(problem: Problem, progress: Progress, solves: list[SolveSummary
         raise InputError(
             f"action {int(demos.actions[move])} in state {int(demos.states[move])} led to state "
             f"{int(demos.next_states[move])}, to which the model gives probability 0 (on a map: a known obstacle)",
+            source=f"trajectory {int(demos.trajectory[move]) + 1}",
+        )
+    if progress.actions == -np.inf:
+        chosen = np.asarray(log_policies(problem.model, demos, problem.behavior, options=problem.options))
+        move = np.flatnonzero((chosen == -np.inf) & (np.asarray(demos.weights) > 0))[0]
+        raise InputError(
+            f"agents choose action {int(demos.actions[move])} in state {int(demos.states[move])} with probability 0: "
+            "its value is −∞, as where it may lead to states from which the task never ends; a lapse, a discount below "
+            "1 or a horizon makes it possible",
             source=f"trajectory {int(demos.trajectory[move]) + 1}",
         )
     if not solves:

@@ -106,19 +106,18 @@ class Optimizer(eqx.Module):
         del state
         return float(np.abs(gradient).max(initial=0.0))
 
-    def expected_gain(self, x: Vector, gradient: Vector, state: Tree, resolution: float) -> float:
+    def expected_gain(self, x: Vector, gradient: Vector, state: Tree) -> float:
         """Return how much lower the least loss is than that at x, as far as the optimizer knows its curvature.
 
         Args:
             x: The present point.
             gradient: The gradient of the loss there.
             state: The present state.
-            resolution: The smallest change of the loss that is not rounding, in nats.
 
         Returns:
             Nats; infinite where the optimizer knows no curvature, or not that of a minimum.
         """
-        del x, gradient, state, resolution
+        del x, gradient, state
         return float("inf")
 
     def terminate(self, gradient: Vector, state: Tree) -> bool:
@@ -135,7 +134,8 @@ class LBFGS(Optimizer):
     """L-BFGS with a line search for the strong Wolfe conditions (Nocedal & Wright 2006, algorithms 7.4 and 3.5).
 
     It needs the exact gradient. It differs from the textbook in that 1. the best point of a line search counts even if
-    the search fails; 2. where no point is better, the memory is cleared and the search is repeated once.
+    the search fails; 2. where no point is better, the search is repeated once with a cleared memory, for a gain
+    above rounding.
 
     Attributes:
         max_iterations: The largest number of steps.
@@ -169,16 +169,19 @@ class LBFGS(Optimizer):
         for restart in (False, True):
             memory = _lbfgs_memory(self.memory_size, x) if restart else state
             direction, updated = _lbfgs_direction(self.memory_size, gradient, memory, x)
-            best = _line_search(-np.asarray(direction, dtype=x.dtype), loss, x, value, gradient)
+            # rounding is no reason to forget the curvature
+            least = _LEAST_GAIN * float(np.finfo(x.dtype).eps) * abs(value) if restart else 0.0
+            best = _line_search(-np.asarray(direction, dtype=x.dtype), loss, x, value, gradient, least)
             if best is not None:
                 return best, updated
         return None
 
-    def expected_gain(self, x: Vector, gradient: Vector, state: Tree, resolution: float) -> float:
-        """Return the gain of a Newton step with the curvature of the steps along which it is more than rounding.
+    def expected_gain(self, x: Vector, gradient: Vector, state: Tree) -> float:
+        """Return the gain of a Newton step with the curvature of the last steps.
 
-        Older steps along which the loss is concave are left out. The gain is infinite where no step is left, and where
-        the loss is concave along the last one.
+        Where numbers resolve no better point, the gradient that is left is rounding. Steps along which the slope
+        changed by less than a few times as much tell no curvature. They are left out, and older ones along which the
+        loss is concave. The gain is infinite where no step is left, and where the loss is concave along the last one.
         """
         from scipy.optimize import LbfgsInvHessProduct
 
@@ -189,7 +192,8 @@ class LBFGS(Optimizer):
         # oldest first, as the newest of those that are kept sets the scale
         steps, changes = (np.roll(each, 1 - int(count), axis=0) for each in (steps, changes))
         curvature = (steps * changes).sum(axis=1)
-        certain = np.flatnonzero(np.abs(curvature) > resolution)
+        rounding = np.linalg.norm(gradient) * np.linalg.norm(steps, axis=1)
+        certain = np.flatnonzero(np.abs(curvature) > _CERTAIN * rounding)
         if not certain.size or curvature[certain[-1]] < 0:
             return float("inf")
         convex = certain[curvature[certain] > 0]
@@ -197,6 +201,12 @@ class LBFGS(Optimizer):
         scale = np.sqrt(curvature[-1] / (changes[-1] @ changes[-1]))
         slope = scale * np.asarray(gradient, np.float64)
         return float(slope @ LbfgsInvHessProduct(steps / scale, changes * scale).matvec(slope)) / 2
+
+
+_LEAST_GAIN = 8.0
+"""The least gain of a search with a cleared memory, in units of the loss's last digit."""
+_CERTAIN = 4.0
+"""How many times the gradient that is left the slope has to change along a step that tells the curvature."""
 
 
 class Adam(Optimizer):
@@ -357,8 +367,10 @@ def _lbfgs_direction(memory_size: int, gradient: Vector | Array, memory: Tree, x
     return jnp.asarray(direction), jax.tree.leaves(state)
 
 
-def _line_search(direction: Vector, loss: Loss, x: Vector, value: float, gradient: Vector) -> Vector | None:
-    """Return the best point of a line search for the strong Wolfe conditions, or None if no point is better than x."""
+def _line_search(
+    direction: Vector, loss: Loss, x: Vector, value: float, gradient: Vector, least: float
+) -> Vector | None:
+    """Return the best point of a line search for the strong Wolfe conditions; None for no more gain than `least`."""
     from scipy.optimize import line_search
 
     points: dict[float, Vector] = {value: x}
@@ -378,4 +390,4 @@ def _line_search(direction: Vector, loss: Loss, x: Vector, value: float, gradien
         warnings.simplefilter("ignore", RuntimeWarning)
         line_search(value_at, gradient_at, x, direction, gfk=gradient, old_fval=value, maxiter=20)
     best = min(points)
-    return None if best >= value else points[best]
+    return points[best] if value - best > least else None

@@ -101,7 +101,10 @@ class BehaviorModel(eqx.Module):
         return None if self.parameters.cost_parameters is None else jax.nn.softplus(self.parameters.cost_parameters)
 
     def behavior_of(self, person: Int[Array, ""] | int | None = None) -> Behavior:
-        """Return the behavior of one person.
+        """Return the behavior of one person: backup, β and lapse.
+
+        A learned discount and learned rewards belong to the tasks, and are not in it. `plan`, `solve`, `simulate` and
+        `log_likelihood` take the behavior model itself, with all that was learned.
 
         Args:
             person: Its index; None for a typical person, of the mean log β.
