@@ -91,7 +91,13 @@ def test_variates_of_a_value_without_an_end_draw_nothing():
 # Estimates by rollouts: s′ = s + a + θ + noise · ε, to a goal around 0; two moves, and a critic that is wrong
 
 WAYS, SPEED, START, DISCOUNT, RADIUS = jnp.array([[-1.0], [1.0]]), 0.2, 1.3, 0.9, 0.6
-GOAL = sc.ReachTask((0.0,), RADIUS, step_cost=1.0, goal_reward=2.0, discount=DISCOUNT)
+GOAL = sc.ReachTask(
+    goal=jnp.zeros(1),
+    radius=jnp.asarray(RADIUS),
+    step_cost=jnp.asarray(1.0),
+    goal_reward=jnp.asarray(2.0),
+    discount=jnp.asarray(DISCOUNT),
+)
 EXAMPLES = jax.vmap(GOAL.features)(jnp.linspace(-2, 2, 9)[:, None])
 POLICY = sc.finite_policy(jax.random.key(3), WAYS, EXAMPLES, width=4)
 
@@ -121,8 +127,7 @@ def test_value_gradient_near_a_goal_with_a_wrong_critic_is_that_of_a_sum():
     @jax.jit
     @jax.vmap
     def estimate(key):
-        size = {"horizon": 2, "samples": 500}
-        gradient, rollouts = sc.value_gradient(agent, starts, key, jnp.ones_like, critic=critic, **size)
+        gradient, rollouts = sc.value_gradient(agent, starts, key, jnp.ones_like, horizon=2, samples=500, critic=critic)
         return gradient, sc.q_estimates(rollouts)[0, :, :, 0].mean(axis=-1), rollouts.seeds
 
     gradient, q, seeds = map(np.asarray, estimate(jax.random.split(jax.random.key(1), 40)))

@@ -151,8 +151,8 @@ class _NearMeans(NamedTuple):
 
 
 def _near_means(value: ValueFunction, mixture: Mixture, next_state: Vector, key: PRNGKeyArray) -> _NearMeans:
-    means = mixture.means
-    if value.ends is None:  # r_k is 0 everywhere
+    means, ends = mixture.means, value.ends
+    if ends is None:  # r_k is 0 everywhere
         values, slopes = jax.vmap(jax.value_and_grad(value.going_on))(means)
         of_next = values + jnp.sum(slopes * (next_state - means), axis=-1)
         return _NearMeans(values, slopes, of_next, means[:, None], jnp.zeros_like(means[:, :1]))
@@ -160,10 +160,10 @@ def _near_means(value: ValueFunction, mixture: Mixture, next_state: Vector, key:
 
     def of_outcome(mean: Vector, draws: Float[Array, "draws dimensions"]) -> tuple[Array, ...]:
         going_on, at_end = (jax.value_and_grad(part)(mean) for part in (value.going_on, value.at_end))
-        here = jax.tree.map(partial(jnp.where, value.ends(mean)), at_end, going_on)
+        here = jax.tree.map(partial(jnp.where, ends(mean)), at_end, going_on)
 
         def jump(state: Vector) -> Real:
-            along = jnp.where(value.ends(state), value.at_end(state), going_on[0] + going_on[1] @ (state - mean))
+            along = jnp.where(ends(state), value.at_end(state), going_on[0] + going_on[1] @ (state - mean))
             return along - here[0] - here[1] @ (state - mean)
 
         of_next = here[0] + here[1] @ (next_state - mean) + jump(next_state)
