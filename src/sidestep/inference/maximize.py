@@ -352,15 +352,6 @@ def _check_start(problem: Problem, progress: Progress, solves: list[SolveSummary
             f"{int(demos.next_states[move])}, to which the model gives probability 0 (on a map: a known obstacle)",
             source=f"trajectory {int(demos.trajectory[move]) + 1}",
         )
-    if progress.actions == -np.inf:
-        chosen = np.asarray(log_policies(problem.model, demos, problem.behavior, options=problem.options))
-        move = np.flatnonzero((chosen == -np.inf) & (np.asarray(demos.weights) > 0))[0]
-        raise InputError(
-            f"agents choose action {int(demos.actions[move])} in state {int(demos.states[move])} with probability 0: "
-            "its value is −∞, as where it may lead to states from which the task never ends; a lapse, a discount below "
-            "1 or a horizon makes it possible",
-            source=f"trajectory {int(demos.trajectory[move]) + 1}",
-        )
     if not solves:
         return
     _, residual, converged, unreachable = joined(solves)
@@ -376,5 +367,14 @@ def _check_start(problem: Problem, progress: Progress, solves: list[SolveSummary
         move = np.flatnonzero((np.asarray(demos.task) == task) & (np.asarray(demos.states) == state))[0]
         raise InputError(
             f"state {int(state)} is visited, but the goal cannot be reached from it",
+            source=f"trajectory {int(demos.trajectory[move]) + 1}",
+        )
+    if progress.actions == -np.inf:
+        chosen = np.asarray(log_policies(problem.model, demos, problem.behavior, options=problem.options))
+        move = np.flatnonzero((chosen == -np.inf) & (np.asarray(demos.weights) > 0))[0]
+        raise InputError(
+            f"agents choose action {int(demos.actions[move])} in state {int(demos.states[move])} with probability 0: "
+            "its value is −∞, as where it may lead to states from which the task never ends; a lapse, a discount below "
+            "1 or a horizon makes it possible",
             source=f"trajectory {int(demos.trajectory[move]) + 1}",
         )
