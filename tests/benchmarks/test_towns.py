@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from benchmarks.__main__ import main
 
-from benchmarks import changed, people, towns
+from benchmarks import changed, people, street_network, towns
 from sidestep.errors import InputError
 from sidestep.io.maps import write_map
 from sidestep.tabular.grid import Grid
@@ -151,7 +151,7 @@ TRIPS = [
 @pytest.fixture
 def city(tmp_path):
     """The small town as the learner knows it, and all trips."""
-    return towns.read_town(write_network(tmp_path, SHUT, TRIPS))
+    return street_network.read_town(write_network(tmp_path, SHUT, TRIPS))
 
 
 def test_both_ways_restores_links_and_turns(tmp_path):
@@ -162,12 +162,12 @@ def test_both_ways_restores_links_and_turns(tmp_path):
         ends = list(zip(nodes[roads.begins], nodes[roads.ends], strict=True))
         return {(ends[a], ends[b], int(way)) for (a, b), way in zip(roads.turns, roads.directions, strict=True)}
 
-    read = towns.read_roads
+    read = street_network.read_roads
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     for folder, shut in ((whole, set()), (cut, SHUT)):
         folder.mkdir()
         write_network(folder, shut)
-    results = towns.both_ways(read(cut / "links.csv", cut / "turns.csv"))
+    results = street_network.both_ways(read(cut / "links.csv", cut / "turns.csv"))
     assert described(results) == described(read(whole / "links.csv", whole / "turns.csv"))
     assert results.labels[-2:] == ["4-1 back", "7-4 back"]
 
@@ -176,7 +176,7 @@ def test_both_ways_refuses_a_one_way_street_with_a_reverse(tmp_path):
     links = write_network(tmp_path, SHUT) / "links.csv"
     links.write_text(links.read_text().replace("0-1,0,1,100,0", "0-1,0,1,100,1"))
     with pytest.raises(InputError, match="field 'oneway': link 0-1: expected 1 if no link"):
-        towns.read_town(tmp_path)
+        street_network.read_town(tmp_path)
 
 
 @pytest.mark.slow
@@ -224,7 +224,7 @@ def test_later_tells_a_good_ranking_from_a_bad_one():
 def test_layout_has_the_true_distances(city):
     """Distances between the places of nodes, for the map is known up to a rotation."""
     town, _ = city
-    places = towns.layout(town.roads)
+    places = street_network.layout(town.roads)
     true = 100 * np.array(PLACES)
     distances = [np.linalg.norm(each[:, None] - each, axis=-1) for each in (places, true)]
     assert distances[0] == pytest.approx(distances[1], abs=1.0)
@@ -238,4 +238,4 @@ def test_read_town_names_missing_tables(tmp_path):
     for name in ("trips.csv", "turns.csv", "links.csv"):
         (tmp_path / name).unlink()
         with pytest.raises(InputError, match=name):
-            towns.read_town(tmp_path)
+            street_network.read_town(tmp_path)
